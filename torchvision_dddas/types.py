@@ -1,0 +1,100 @@
+"""The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a clip.
+
+    number: 1-based position in the clip. time_s: seconds since the clip's first frame.
+    image: uint8, (H, W) grey or (H, W, 3) in OpenCV's BGR order.
+    """
+
+    number: int
+    time_s: float
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What the vehicle reports of itself, one row a sample, sorted by time.
+
+    time_s, altitude_m (above ground) and speed_m_s (over ground) are (N,) float64.
+    """
+
+    time_s: np.ndarray
+    altitude_m: np.ndarray
+    speed_m_s: np.ndarray
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How the background moved between a frame and a later one.
+
+    later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
+    tracked, inliers: keypoints tracked and those that agree with the homography.
+    error_px: median distance of the inliers from it. flow_px: median background displacement over the image.
+    reliable: whether anything may be concluded from it; otherwise `cause` says in words why not.
+    """
+
+    later_from_earlier: np.ndarray
+    tracked: int
+    inliers: int
+    error_px: float
+    flow_px: float
+    reliable: bool = True
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The moving targets of one frame, one row a target.
+
+    box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
+    area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion over the ground, image axes
+    (0 = right, pi/2 = down), NaN when unknown. speed_px: (N,) pixels a frame relative to the background, NaN when unknown.
+    kind: what it was found to be. Row i has value i + 1 in the frame's mask.
+    """
+
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    area_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    kind: str = "moving"
+
+    def __len__(self) -> int:
+        return len(self.box_px)
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A knob that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
+
+    frame: int
+    knob: str
+    old: float
+    new: float
+    cause: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that is known of one frame after its window was observed.
+
+    mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
+    reliable: False when registration could not be trusted: then the mask is empty and `cause` says why.
+    interval_frames: the detection interval in force. seconds: time spent per stage on this frame.
+    """
+
+    frame: Frame
+    mask: np.ndarray
+    detections: Detections
+    interval_frames: int
+    reliable: bool = True
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
