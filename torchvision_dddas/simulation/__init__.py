@@ -1,0 +1,1 @@
+"""Worlds whose truth is known: what the demo shows and what the tests measure against."""
