@@ -8,18 +8,18 @@ from importlib import import_module
 
 __version__ = "0.1.0"
 
-# Public name -> the module that holds it.
+# Public name -> the module that holds it, and its name there.
 _HOME = {
-    "Adjustment": "types",
-    "Detections": "types",
-    "Frame": "types",
-    "Registration": "types",
-    "Scene": "types",
-    "Telemetry": "types",
-    "InputError": "errors",
-    "Settings": "settings",
-    "load_settings": "settings",
-    "open_source": "sources",
+    "Adjustment": ("types", "Adjustment"),
+    "Detections": ("types", "Detections"),
+    "Frame": ("types", "Frame"),
+    "InputError": ("errors", "InputError"),
+    "Registration": ("types", "Registration"),
+    "Scene": ("types", "Scene"),
+    "Settings": ("settings", "Settings"),
+    "Telemetry": ("types", "Telemetry"),
+    "load_settings": ("settings", "load"),
+    "open_source": ("sources", "open_source"),
 }
 
 __all__ = ["__version__", *_HOME]
@@ -28,7 +28,8 @@ __all__ = ["__version__", *_HOME]
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    module, inside = _HOME[name]
+    value = getattr(import_module(f"{__name__}.{module}"), inside)
     globals()[name] = value
     return value
 

@@ -1,0 +1,17 @@
+"""Two threads are enough for tests, and keep them honest on a shared machine."""
+
+import os
+
+for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "2")
+
+import cv2  # noqa: E402 (after the limits, which the libraries read when they load)
+
+cv2.setNumThreads(2)
+
+try:
+    import torch
+except ModuleNotFoundError:  # the onboard install
+    pass
+else:
+    torch.set_num_threads(2)

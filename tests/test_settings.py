@@ -1,0 +1,152 @@
+"""Settings: every knob is described, every mistake gets one line, every shipped configuration loads."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+from pydantic import Field, ValidationError
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import (
+    Group,
+    Knob,
+    Settings,
+    all_knobs,
+    changes,
+    config_names,
+    knob,
+    load,
+    range_of,
+    with_knobs,
+)
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.toml"))
+KNOBS = {row.name: row for row in all_knobs()}
+
+
+@pytest.mark.parametrize("row", all_knobs(), ids=lambda row: row.name)
+def test_every_knob_has_unit_range_and_meaning(row: Knob) -> None:
+    assert row.unit
+    assert len(row.meaning.split()) >= 3
+    assert "None" not in row.range
+    assert " to " in row.range or " or " in row.range
+
+
+def test_every_knob_of_every_group_is_listed() -> None:
+    content = Settings().model_dump()
+    assert [f"{group}.{name}" for group, knobs in content.items() for name in knobs] == list(KNOBS)
+
+
+def test_every_default_lies_in_its_own_range() -> None:
+    assert with_knobs(Settings(), {name: row.default for name, row in KNOBS.items()}) == Settings()
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_a_shipped_configuration_loads_and_holds_only_what_differs_from_the_defaults(path: Path) -> None:
+    written = {f"{group}.{name}" for group, knobs in tomllib.loads(path.read_text()).items() for name in knobs}
+    assert written == set(changes(load(path.stem)))
+
+
+def test_source_and_fast_are_shipped() -> None:
+    assert {"source", "fast"} <= set(config_names())
+
+
+def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("[registration]\nkeypoints = 300\nlevels = 2\n")
+    settings = load(path, ["registration.keypoints=400", "registration.model=affine", "interval.rule=false"])
+    assert changes(settings) == {
+        "registration.model": "affine",
+        "registration.keypoints": 400,
+        "registration.levels": 2,
+        "interval.rule": False,
+    }
+
+
+def test_a_list_of_numbers_can_be_a_knob() -> None:
+    class Gaps(Group):
+        gaps: tuple[Annotated[int, Field(ge=1, le=30)], ...] = knob((1, 2), "frames", meaning="how far to look back")
+
+    assert range_of(Gaps.model_fields["gaps"]) == "a list of 1 to 30"
+    with pytest.raises(ValidationError):
+        Gaps(gaps=(1, 31))
+
+
+def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
+    assert load(None, ["registration.ransac_px=2"]).registration.ransac_px == 2.0
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        ("registration.keypoint=3", ["registration.keypoint'", "registration.keypoints"]),
+        ("keypoints=3", ["did you mean registration.keypoints"]),
+        ("nowhere.zzzz=3", ["unknown knob 'nowhere.zzzz'", "dddas settings"]),
+        ("registration=3", ["unknown knob 'registration'"]),
+        ("registration.keypoints=9000", ["registration.keypoints = 9000", "50 to 5000 points"]),
+        ("registration.keypoints=1.5", ["1.5", "a whole number"]),
+        ("registration.keypoints=many", ["'many'", "50 to 5000 points"]),
+        ("registration.keypoints=true", ["True", "a whole number"]),
+        ("registration.block_px=4", ["4", "odd"]),
+        ("registration.quality=nan", ["nan", "0.0001 to 0.5"]),
+        ("registration.model=plane", ["'plane'", "homography or affine"]),
+        ("interval.rule=1", ["true or false"]),
+        ("interval.minimum_frames=50", ["minimum_frames = 50", "above maximum_frames"]),
+        ("gates.min_size_m=90", ["min_size_m", "above max_size_m"]),
+        ("registration.keypoints", ["no override", "group.knob=value"]),
+        ("=3", ["no override"]),
+    ],
+)
+def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: str, wanted: list[str]) -> None:
+    with pytest.raises(InputError) as error:
+        load(None, [override])
+    line = str(error.value)
+    assert "\n" not in line
+    for part in wanted:
+        assert part in line
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("[registration]\nkeypoints = = 3\n", ["line 2", "not valid TOML"]),
+        ("[registration]\nkeypoints = [\n", ["line", "not valid TOML"]),
+        ("keypoints = 300\n", ["outside a [group]", "registration.keypoints"]),
+        ("[registration]\nkeypoint = 300\n", ["unknown knob", "registration.keypoints"]),
+        ("[registration]\nkeypoints = 1\n", ["registration.keypoints = 1", "50 to 5000 points"]),
+    ],
+)
+def test_a_mistake_in_a_file_names_the_file(tmp_path: Path, text: str, wanted: list[str]) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        load(path)
+    line = str(error.value)
+    assert "\n" not in line
+    for part in [str(path), *wanted]:
+        assert part in line
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="cannot be read as text"):
+        load(path)
+
+
+def test_an_unknown_configuration_lists_those_that_there_are(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'sauce'.*fast.*source"):
+        load("sauce")
+    with pytest.raises(InputError, match="no such configuration file"):
+        load(tmp_path / "absent.toml")
+
+
+def test_settings_cannot_be_changed_in_place() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Settings().registration.keypoints = 3
+
+
+def test_settings_survive_a_round_trip_through_plain_data() -> None:
+    settings = load("source")
+    assert Settings.model_validate_json(settings.model_dump_json()) == settings

@@ -1,0 +1,329 @@
+"""Every knob: its default, unit, range and meaning; read from TOML files and `group.knob=value` overrides."""
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
+
+from torchvision_dddas.errors import InputError
+
+# --------------------------------------------------------------------------------------------------------------------
+# The knobs. A new one is a line in a group: type, default, unit, lowest, highest, meaning.
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError("not odd")
+    return value
+
+
+Odd = Annotated[int, AfterValidator(_odd)]
+
+
+def knob(default: Any, unit: str, low: float | None = None, high: float | None = None, *, meaning: str) -> Any:
+    """A field of a group: default, unit (`-` for a bare number), inclusive range, and what it does."""
+    return Field(default, ge=low, le=high, description=meaning, json_schema_extra={"unit": unit})
+
+
+class Group(BaseModel):
+    """Knobs that belong together: frozen, no unknown names, no silent conversion ("5" is no number)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
+
+    @model_validator(mode="after")
+    def _lowest_below_highest(self) -> "Group":
+        for low in type(self).model_fields:
+            high = low.replace("minimum_", "maximum_").replace("min_", "max_").replace("_min", "_max")
+            if high != low and high in type(self).model_fields and getattr(self, low) > getattr(self, high):
+                raise ValueError(f"{low} = {getattr(self, low)} is above {high} = {getattr(self, high)}")
+        return self
+
+
+class RegistrationKnobs(Group):
+    """How the background's motion between two frames is found (METHOD section 1, S1 to S3)."""
+
+    model: Literal["homography", "affine"] = knob(
+        "homography", "-", meaning="the background's motion: homography, or the earlier affine baseline"
+    )
+    keypoints: int = knob(1000, "points", 50, 5000, meaning="budget of good features to track in a frame")
+    cell_px: int = knob(
+        16, "px", 4, 256, meaning="side of the grid cell that yields its best point, so that points spread out"
+    )
+    quality: float = knob(
+        0.01, "-", 1e-4, 0.5, meaning="smaller eigenvalue of a point, as a share of the frame's largest"
+    )
+    min_distance_px: float = knob(8.0, "px", 1, 100, meaning="distance that two points keep at least")
+    block_px: Odd = knob(3, "px", 3, 15, meaning="window over which the structure tensor is summed, odd")
+    window_px: Odd = knob(21, "px", 5, 51, meaning="Lucas-Kanade's window, odd")
+    levels: int = knob(3, "levels", 0, 6, meaning="pyramid levels above the full resolution")
+    iterations: int = knob(30, "steps", 1, 100, meaning="Lucas-Kanade steps a level at most")
+    epsilon_px: float = knob(0.01, "px", 1e-4, 1, meaning="a Lucas-Kanade step shorter than this ends the search")
+    forward_backward_px: float = knob(
+        1.0, "px", 0.05, 20, meaning="a point tracked there and back may miss its start by this"
+    )
+    ransac_px: float = knob(3.0, "px", 0.1, 20, meaning="a point this close to the model's prediction is an inlier")
+    hypotheses: int = knob(128, "models", 8, 4096, meaning="models drawn by RANSAC")
+    min_inliers: int = knob(20, "points", 4, 5000, meaning="fewer inliers make the registration unreliable")
+    min_inlier_share: float = knob(
+        0.4, "-", 0, 1, meaning="a smaller share of inliers makes the registration unreliable"
+    )
+
+
+class IntervalKnobs(Group):
+    """The detection interval and the rule that steers it (METHOD section 1; appendix B, eq. 2)."""
+
+    rule: bool = knob(True, "-", meaning="steer the interval by altitude, speed and rate; false keeps `frames`")
+    frames: int = knob(1, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
+    minimum_frames: int = knob(1, "frames", 1, 60, meaning="shortest interval that the rule may choose")
+    maximum_frames: int = knob(6, "frames", 1, 60, meaning="longest interval that the rule may choose")
+    reference_altitude_m: float = knob(
+        20.0, "m", 1, 1000, meaning="altitude above ground at which the interval is one frame"
+    )
+    reference_speed_m_s: float = knob(5.0, "m/s", 0.1, 100, meaning="ground speed at which the interval is one frame")
+    reference_rate_hz: float = knob(10.0, "1/s", 1, 240, meaning="frame rate at which the interval is one frame")
+    reference_flow_px: float = knob(
+        17.5, "px", 0.5, 200, meaning="without telemetry: background flow a frame at which the interval is one frame"
+    )
+    lowest_speed_m_s: float = knob(
+        0.5, "m/s", 0.01, 10, meaning="floor of the speed, so that hovering gives the longest interval"
+    )
+    cost: float = knob(1.0, "-", 0.1, 10, meaning="cost of one step relative to its reference (O in eq. 2)")
+
+
+class DifferenceKnobs(Group):
+    """What makes a pixel foreground (METHOD section 1, S4)."""
+
+    kind: Literal["to_reference", "between_later"] = knob(
+        "to_reference",
+        "-",
+        meaning="to_reference: min(|I(t) - W1|, |I(t) - W2|), once, at t; between_later: |W2 - W1|, the source's eq. 9",
+    )
+    threshold: float = knob(20.0, "grey levels", 1, 255, meaning="a larger difference is foreground")
+    blur_px: Odd = knob(5, "px", 1, 31, meaning="Gaussian kernel on the difference, odd; 1 is none")
+
+
+class MorphologyKnobs(Group):
+    """How the silhouette is cleaned (METHOD section 1, S5)."""
+
+    erode_px: int = knob(
+        3, "px", 1, 31, meaning="square that erodes the silhouette: precision up, recall down; 1 is none"
+    )
+    close_px: int = knob(15, "px", 1, 101, meaning="square that closes gaps between fragments of one target; 1 is none")
+
+
+class HistoryKnobs(Group):
+    """The motion history, its gradient and the segmentation by motion (METHOD section 1, S5)."""
+
+    duration_frames: float = knob(6.0, "frames", 1, 120, meaning="how long a silhouette stays in the history")
+    delta_min_frames: float = knob(
+        0.5, "frames", 0, 60, meaning="smallest difference of time stamps that makes a gradient"
+    )
+    delta_max_frames: float = knob(
+        4.0, "frames", 0, 120, meaning="largest difference of time stamps that makes a gradient"
+    )
+    segmentation_threshold_frames: float = knob(
+        1.0, "frames", 0, 60, meaning="neighbours whose stamps differ by more belong to different motions"
+    )
+
+
+class GateKnobs(Group):
+    """Which blobs can be targets; the bounds in metres hold when telemetry is given (METHOD section 1)."""
+
+    min_area_px: int = knob(100, "px", 1, 1_000_000, meaning="smallest foreground area of a target")
+    min_size_m: float = knob(0.2, "m", 0, 100, meaning="shortest longer side of a target on the ground")
+    max_size_m: float = knob(25.0, "m", 0.1, 1000, meaning="longest longer side of a target on the ground")
+    max_speed_m_s: float = knob(60.0, "m/s", 0.1, 500, meaning="fastest target over ground")
+    focal_px: float = knob(
+        1000.0, "px", 10, 100_000, meaning="focal length: px bounds are metric bounds x focal / altitude"
+    )
+
+
+class Settings(Group):
+    """All knobs, by group."""
+
+    registration: RegistrationKnobs = RegistrationKnobs()
+    interval: IntervalKnobs = IntervalKnobs()
+    difference: DifferenceKnobs = DifferenceKnobs()
+    morphology: MorphologyKnobs = MorphologyKnobs()
+    history: HistoryKnobs = HistoryKnobs()
+    gates: GateKnobs = GateKnobs()
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Describing them.
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One row of the table of knobs, ready to print."""
+
+    name: str
+    default: object
+    unit: str
+    range: str
+    meaning: str
+
+
+def all_knobs() -> list[Knob]:
+    """Every knob in the order of the groups, for `dddas settings` and the README."""
+    return [
+        Knob(name, field.default, _unit(field), range_of(field), field.description or "")
+        for name, field in _knob_fields()
+    ]
+
+
+def changes(settings: Settings) -> dict[str, object]:
+    """The knobs that differ from their defaults: `{"group.knob": value}`."""
+    now = {name: getattr(getattr(settings, name.split(".")[0]), name.split(".")[1]) for name, _ in _knob_fields()}
+    return {name: now[name] for name, field in _knob_fields() if now[name] != field.default}
+
+
+def _knob_fields() -> Iterator[tuple[str, FieldInfo]]:
+    for group, holder in Settings.model_fields.items():
+        for name, field in type(holder.default).model_fields.items():
+            yield f"{group}.{name}", field
+
+
+def _unit(field: FieldInfo) -> str:
+    extra = field.json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
+
+
+def range_of(field: FieldInfo) -> str:
+    """In words: `true or false`, `homography or affine`, `50 to 5000`, `3 to 15, odd`, `a list of 1 to 30`."""
+    kind, rules = field.annotation, list(field.metadata)
+    many = get_origin(kind) is tuple
+    if many:  # the rules of a list's elements hang on the elements
+        kind, *inner = get_args(get_args(kind)[0]) or get_args(kind)[:1]
+        rules += [rule for entry in inner for rule in (entry.metadata if isinstance(entry, FieldInfo) else [entry])]
+    if kind is bool:
+        return "true or false"
+    if get_origin(kind) is Literal:
+        return " or ".join(str(choice) for choice in get_args(kind))
+    low = next((rule.ge for rule in rules if getattr(rule, "ge", None) is not None), None)
+    high = next((rule.le for rule in rules if getattr(rule, "le", None) is not None), None)
+    words = f"{low} to {high}" + (", odd" if any(getattr(rule, "func", None) is _odd for rule in rules) else "")
+    return f"a list of {words}" if many else words
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Changing and loading them.
+
+
+def load(config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
+    """The defaults, changed by a TOML file and then by `group.knob=value` overrides.
+
+    config: the name of a shipped configuration (`source`, `fast`) or a TOML file.
+    Raises InputError with one line: no such file, bad TOML, unknown knob (with the nearest names), value out of range.
+    """
+    settings = Settings()
+    if config is not None:
+        path = _config_file(config)
+        settings = with_knobs(settings, _flat(_read_toml(path), str(path)), origin=str(path))
+    return with_knobs(settings, dict(_parse_override(text) for text in overrides))
+
+
+def with_knobs(settings: Settings, values: Mapping[str, object], origin: str = "") -> Settings:
+    """A copy of the settings with `{"group.knob": value}` changed and everything checked again.
+
+    origin: where the values come from, put before the message. Raises InputError for an unknown knob or a bad value.
+    """
+    before = f"{origin}: " if origin else ""
+    fields = dict(_knob_fields())
+    content = settings.model_dump()
+    for name, value in values.items():
+        if name not in fields:
+            raise InputError(f"{before}unknown knob '{name}'; {_nearest(name, list(fields))}")
+        group, key = name.split(".")
+        content[group][key] = tuple(value) if isinstance(value, list) else value
+    try:
+        return Settings.model_validate(content)
+    except ValidationError as error:
+        raise InputError(before + _explain(error, fields)) from None
+
+
+def config_names() -> list[str]:
+    """The shipped configurations that `--config` takes by name."""
+    return sorted(path.stem for path in _config_folder().glob("*.toml"))
+
+
+def _config_folder() -> Path:
+    """Inside the package when installed from a wheel; at the top of the tree in a checkout."""
+    package = Path(__file__).resolve().parent
+    return next((p for p in (package / "configs", package.parent / "configs") if p.is_dir()), package / "configs")
+
+
+def _config_file(config: str | Path) -> Path:
+    path = Path(config)
+    if path.is_file():
+        return path
+    if path.suffix == ".toml" or len(path.parts) > 1:
+        raise InputError(f"no such configuration file: {path}")
+    shipped = _config_folder() / f"{config}.toml"
+    if not shipped.is_file():
+        raise InputError(
+            f"no configuration is named '{config}'; give one of {', '.join(config_names())}, or a TOML file"
+        )
+    return shipped
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        found = re.search(r"line (\d+)", str(error))
+        line = found[1] if found else str(path.read_text(encoding="utf-8").count("\n") + 1)
+        raise InputError(f"{path}, line {line}: not valid TOML: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text: {error}") from None
+
+
+def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:
+    """`{group: {knob: value}}` → `{"group.knob": value}`."""
+    flat: dict[str, object] = {}
+    for group, knobs in content.items():
+        if not isinstance(knobs, dict):
+            hint = _nearest(group, [name for name, _ in _knob_fields()])
+            raise InputError(f"{origin}: '{group}' stands outside a [group]; {hint}")
+        flat |= {f"{group}.{name}": value for name, value in knobs.items()}
+    return flat
+
+
+def _parse_override(text: str) -> tuple[str, object]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not equals or not name or not value:
+        raise InputError(f"'{text}' is no override; wanted group.knob=value, such as registration.keypoints=500")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value  # a bare word: a choice such as affine
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    """Names that look like it, by their whole or by the knob alone; otherwise where to find the list."""
+    key = name.rpartition(".")[2]
+    same = [full for full in known if full.rpartition(".")[2] == key]
+    alike = get_close_matches(key, [full.rpartition(".")[2] for full in known], n=2)
+    near = same + get_close_matches(name, known, n=3) + [k for k in known if k.rpartition(".")[2] in alike]
+    near = list(dict.fromkeys(near))[:3]
+    return f"did you mean {' or '.join(near)}?" if near else "`dddas settings` lists them all"
+
+
+def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
+    """One line for the first thing that is wrong: knob, value, wanted range and unit."""
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"][:2])
+    if name not in fields:  # a rule across two knobs of one group
+        return f"{name}: {str(first['msg']).removeprefix('Value error, ')}"
+    field = fields[name]
+    unit = _unit(field)
+    whole = "a whole number, " if field.annotation is int else ""
+    return (
+        f"{name} = {first['input']!r} will not do; wanted {whole}{range_of(field)}{'' if unit == '-' else ' ' + unit}"
+    )
