@@ -1,0 +1,160 @@
+"""A run's output folder: claimed before any work, filled frame by frame, valid whenever it is closed."""
+
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Protocol
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.sinks import journal
+from torchvision_dddas.sinks.journal import Journal
+from torchvision_dddas.sinks.masks import NAME as MASK_NAME
+from torchvision_dddas.sinks.masks import Masks
+from torchvision_dddas.sinks.overlay import Overlay
+from torchvision_dddas.sinks.tables import Tables
+from torchvision_dddas.sinks.whole import cannot_write, remove, temporary
+from torchvision_dddas.types import Scene
+
+SAVED = ("masks", "overlay")
+"""What --save may name. The tables and run.json are always written."""
+
+
+class Sink(Protocol):
+    """A place where scenes go, one after another."""
+
+    def write(self, scene: Scene) -> None:
+        """Take a scene. Raises OSError if it cannot be kept."""
+
+    def close(self, complete: bool) -> None:
+        """Make the output valid and put it in its place; complete is False if the clip was cut short by the user."""
+
+    def discard(self) -> None:
+        """Leave nothing behind that looks whole and is not. Never raises."""
+
+
+def saved(names: str | None) -> tuple[str, ...]:
+    """What to save, from `masks,overlay`, `all` (or None) or `none`. Raises InputError on another name."""
+    chosen = [n.strip() for n in (names or "all").split(",") if n.strip()]
+    unknown = [n for n in chosen if n not in (*SAVED, "all", "none")]
+    if unknown:
+        raise InputError(f"--save does not know {unknown[0]!r}; there are {', '.join(SAVED)}, all and none")
+    return SAVED if "all" in chosen else tuple(n for n in SAVED if n in chosen)
+
+
+class Output:
+    """Everything that one run writes. A context manager: leaving it normally or by Ctrl-C keeps what there is.
+
+    Any other exception discards what is not whole. Files are begun with the first scene, so bad input changes nothing.
+    """
+
+    def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
+        """Claim a folder. Raises InputError if it cannot be written, or holds such files of someone else."""
+        self.folder = folder
+        self._save = tuple(save)
+        self._made = _claim(folder)
+        self._sinks: list[Sink] = []
+        self.journal: Journal | None = None
+
+    def begin(self, facts: dict[str, Any], rate_hz: float) -> None:
+        """Say what the run is, for run.json, and how fast the overlay plays."""
+        self.journal = Journal(self.folder, {**facts, "outputs": ["tables", *self._save]})
+        self._sinks = [self.journal, Tables(self.folder)]
+        if "masks" in self._save:
+            self._sinks.append(Masks(self.folder))
+        if "overlay" in self._save:
+            self._sinks.append(Overlay(self.folder, rate_hz))
+
+    def write(self, scene: Scene) -> None:
+        """Write a scene to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
+        with uninterrupted(), self._refusals():
+            for sink in self._sinks:
+                sink.write(scene)
+
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, run.json last. Raises InputError if the disk refuses."""
+        with uninterrupted(), self._refusals():
+            for sink in reversed(self._sinks):
+                sink.close(complete)
+
+    def discard(self) -> None:
+        """Leave only what is whole; and no folder, if it was made for a run that never began."""
+        with uninterrupted():
+            for sink in reversed(self._sinks):
+                sink.discard()
+            if self.journal is None or self.journal.frames == 0:
+                for folder in self._made:
+                    try:
+                        folder.rmdir()
+                    except OSError:  # not empty: someone else uses it
+                        break
+
+    def __enter__(self) -> "Output":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self.journal is not None and isinstance(error, InputError):
+            self.journal.problems = [*self.journal.problems, str(error)]
+        interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
+        begun = self.journal is not None and (self.journal.frames > 0 or kind is None)
+        if self.journal is not None and begun and (kind is None or interrupted):
+            try:
+                self.close(complete=not interrupted)
+            except InputError as refusal:
+                self.journal.problems = [*self.journal.problems, str(refusal)]
+                self.discard()
+                raise
+        else:
+            self.discard()
+
+    @contextmanager
+    def _refusals(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise cannot_write(Path(error.filename or self.folder), error) from error
+
+
+def _claim(folder: Path) -> list[Path]:
+    """Make the folder and try to write there. Returns the folders made, innermost first."""
+    made = []
+    for place in (folder, *folder.parents):
+        if place.exists():
+            break
+        made.append(place)
+    probe = temporary(folder / "probe")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        remove(probe)
+        raise InputError(
+            f"cannot write into {folder}: {error.strerror or error}. Choose another folder with --out"
+        ) from error
+    ours = ("detections.txt", "detections.csv", "overlay.mp4", journal.NAME)
+    foreign = [folder / name for name in ours if (folder / name).exists()]
+    foreign += [p for p in sorted((folder / "masks").glob("*.png")) if MASK_NAME.fullmatch(p.name)]
+    if foreign and journal.read(folder) is None:
+        raise InputError(
+            f"{foreign[0]} was not written by dddas and would be replaced. Choose another folder with --out"
+        )
+    return made
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back until the block is done, so that a frame is written to every file or to none."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[tuple[int, FrameType | None]] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held and callable(before):
+        before(*held[0])
