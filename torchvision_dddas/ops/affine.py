@@ -16,7 +16,7 @@ SAMPLE_SIZE = 3
 def three_point(
     p: Float[Tensor, "*batch 3 2"], q: Float[Tensor, "*batch 3 2"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
-    """The affine maps that take three points p exactly to q; valid is False when either triple is (nearly) on one line."""
+    """The affine maps that take three points p exactly to q; not valid when a triple is (nearly) on one line."""
     p_side = p[..., 1:, :] - p[..., :1, :]
     q_side = q[..., 1:, :] - q[..., :1, :]
     (a, b), (c, d) = p_side[..., 0, :].unbind(-1), p_side[..., 1, :].unbind(-1)

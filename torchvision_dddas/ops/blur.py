@@ -1,6 +1,6 @@
-"""Gaussian smoothing (METHOD S5).
+"""Gaussian smoothing (appendix B, step S5).
 
-kornia.filters.gaussian_blur2d needs 7.6x OpenCV's time on a CPU, weighted shifts about 3x (MEASURED).
+kornia.filters.gaussian_blur2d needs 7.6x OpenCV's time on a CPU, weighted shifts about 3x.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What pictures are taken to be outside their edges: OpenCV's default, mirrored without repeating the edge (reflect 101)."""
+"""What pictures are taken to be outside their edges: mirrored without repeating the edge, as OpenCV does."""
 
 import torch
 from jaxtyping import Float, Int64

@@ -38,7 +38,7 @@ def draw_samples(
 def transfer(
     later_from_earlier: Float[Tensor, "*batch 3 3"], points: Float[Tensor, "*points N 2"]
 ) -> Float[Tensor, "*both N 2"]:
-    """Where the points land under each matrix; leading axes broadcast. A point on the horizon lands far away, not at NaN."""
+    """Where the points land under each matrix; leading axes broadcast. On the horizon that is far away, not NaN."""
     mapped = points @ later_from_earlier[..., :2].mT + later_from_earlier[..., None, :, 2]
     depth = mapped[..., 2:]
     tiny = torch.finfo(mapped.dtype).eps
@@ -66,7 +66,7 @@ def ransac(
     minimal: Minimal,
     fit: Fit,
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
-    """Best of all hypotheses at once, then least squares on its inliers at ever smaller tolerances (METHOD S3).
+    """Best of all hypotheses at once, then least squares on its inliers at ever smaller tolerances (appendix B, step S3).
 
     Hypotheses are ranked by their truncated squared error, which tells apart two that have as many inliers.
     A refit counts only if twice the minimal number of points support it. When nothing fits: identity, valid False.

@@ -1,13 +1,11 @@
-"""What changed between registered frames, apart from the light (METHOD S4)."""
+"""What changed between registered frames, apart from the light (appendix B, step S4)."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def three_frame(
-    warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]
-) -> Float[Tensor, "B C H W"]:
+def three_frame(warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
     """|I(t+2dt -> t) - I(t+dt -> t)|: both warped frames, never one against the raw reference (appendix B, eq. 9)."""
     return (warped_2 - warped_1).abs()
 
@@ -15,7 +13,7 @@ def three_frame(
 def pair(
     reference: Float[Tensor, "B C H W"], warped_a: Float[Tensor, "B C H W"], warped_b: Float[Tensor, "B C H W"]
 ) -> Float[Tensor, "B C H W"]:
-    """min(|I - A|, |I - B|): marks a mover once, where it stands in the reference (departs from eq. 9, METHOD S5)."""
+    """min(|I - A|, |I - B|): marks a mover once, where it stands in the reference (departs from eq. 9)."""
     return torch.minimum((reference - warped_a).abs(), (reference - warped_b).abs())
 
 
@@ -27,7 +25,7 @@ def exposure(
     floor: float = 3 / 255,
     stride: int | None = None,
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
-    """gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
+    """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
     Each round keeps the pixels whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every
     `stride`-th pixel is looked at (default: about 80 rows of them). Without inside pixels, or on a frame of one single
@@ -51,7 +49,7 @@ def exposure(
         deviation = kept * (given - given_mean)
         spread = deviation.square().sum(1, keepdim=True) / count
         together = (deviation * (wanted - wanted_mean)).sum(1, keepdim=True) / count
-        fitted = spread > 1e-6
-        gain = torch.where(fitted, together / torch.where(fitted, spread, torch.ones_like(spread)), torch.ones_like(gain))
+        fitted, one = spread > 1e-6, torch.ones_like(spread)
+        gain = torch.where(fitted, together / torch.where(fitted, spread, one), one)
         offset = wanted_mean - gain * given_mean
     return gain[:, 0], offset[:, 0]

@@ -1,8 +1,8 @@
-"""Pyramidal Lucas-Kanade: where points of one frame are in another (METHOD S2; appendix B, S2).
+"""Pyramidal Lucas-Kanade: where points of one frame are in another (appendix B, step S2).
 
-Agrees with cv2.calcOpticalFlowPyrLK. kornia has no sparse tracker; sampling patches with `grid_sample` in every iteration
-costs 17-20x OpenCV's time on a CPU, a correlation table per point 8-12x, 1.4x when sparse and predicted (MEASURED): the sums
-that an iteration needs at a fractional displacement are bilinear mixes of the sums at whole displacements, made once.
+Agrees with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker; sampling patches with `grid_sample` in every iteration
+costs 17-20x OpenCV's time on a CPU, the correlation table per point that is used here 7-9x, 4-5x when sparse and predicted:
+the sums that an iteration needs at a fractional displacement are bilinear mixes of those at whole displacements, made once.
 """
 
 import torch
@@ -31,14 +31,14 @@ def track(
     iterations: int = 30,
     epsilon_px: float = 0.01,
     min_eigen: float = 1e-4,
-    reach_px: int = 3,
-    rounds: int = 3,
+    reach_px: int = 4,
+    rounds: int = 1,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
     """The points' places in the second frame, and which were found.
 
-    guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made anew up to
-    `rounds` times where a point left them; with a good guess reach 2 and one round do. Not found: too little texture (smaller
-    eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table or outside the second frame.
+    guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
+    anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little texture
+    (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the second frame.
     """
     place = points if guess is None else guess
     place = place / 2.0 ** (len(pyramid_from) - 1)
@@ -79,40 +79,44 @@ def forward_backward(
 
 
 class _FromPatch:
-    """What a level needs of the first frame around each point: grey, its gradients, and the inverse structure tensor."""
+    """What a level needs of the first frame around each point: gradients times the inverse structure tensor.
+
+    gradients: (B, N, 2, window^2), such that their product with a grey patch is the displacement that it asks for.
+    target: (B, N, 2), what the first frame's own patch asks for. textured: whether the tensor can be inverted.
+    """
 
     def __init__(self, image: Tensor, points: Tensor, window: int, min_eigen: float) -> None:
         self.window = window
         corner = points - (window - 1) / 2
         base = corner.detach().floor()
         # One pixel more on every side for the gradient, one more to the right and below for the interpolation.
-        grey, outside = _gather(image, base.long() - 1, window + 3)
+        grey, inside = _gather(image, base.long() - 1, window + 3)
         across = grey[..., 2:] - grey[..., :-2]
         down = grey[..., 2:, :] - grey[..., :-2, :]
-        along_u = torch.add((across[..., :-2, :] + across[..., 2:, :]) * 3.0, across[..., 1:-1, :], alpha=10.0) / 32.0
-        along_v = torch.add((down[..., :-2] + down[..., 2:]) * 3.0, down[..., 1:-1], alpha=10.0) / 32.0
-        inner = outside[..., 1:-1, 1:-1]
-        planes = torch.stack([grey[..., 1:-1, 1:-1], along_u.masked_fill(inner, 0.0), along_v.masked_fill(inner, 0.0)], 2)
+        along_u = torch.add((across[..., :-2, :] + across[..., 2:, :]) * 3.0, across[..., 1:-1, :], alpha=10.0)
+        along_v = torch.add((down[..., :-2] + down[..., 2:]) * 3.0, down[..., 1:-1], alpha=10.0)
+        # Like OpenCV: grey is mirrored outside the picture, gradients are zero there.
+        slopes = torch.stack([along_u, along_v], 2) * (inside[..., 1:-1, 1:-1] / 32.0)[:, :, None]
+        planes = torch.cat([slopes, grey[..., 1:-1, 1:-1][:, :, None]], 2)
         part = (corner - base)[..., None, None, None, :]
         planes = torch.lerp(planes[..., :-1], planes[..., 1:], part[..., 0])
-        planes = torch.lerp(planes[..., :-1, :], planes[..., 1:, :], part[..., 1])
-        flat = planes.flatten(3)
-        self.gradients = flat[:, :, 1:]
-        # Products of grey and both gradients with both gradients, in one go.
-        products = flat @ self.gradients.mT
-        uu, uv, vv = products[:, :, 1, 0], products[:, :, 1, 1], products[:, :, 2, 1]
-        smaller = 0.5 * (uu + vv - torch.sqrt(((uu - vv).square() + 4.0 * uv.square()).clamp(min=1e-24)))
+        planes = torch.lerp(planes[..., :-1, :], planes[..., 1:, :], part[..., 1]).flatten(3)
+        gradients = planes[:, :, :2]
+        products = gradients @ planes.mT
+        uu, uv, vv = products[..., 0, 0], products[..., 0, 1], products[..., 1, 1]
+        smaller = 0.5 * (uu + vv - torch.hypot(uu - vv, 2.0 * uv).detach())
         # OpenCV's unit: grey levels 0..255, Scharr sums 32 times the slope, scaled by 2^-20, per pixel.
         self.textured = smaller.detach() * (255.0**2 / 1024.0 / window**2) >= min_eigen
         determinant = torch.where(self.textured, uu * vv - uv * uv, torch.ones_like(uu))
-        self.inverse = torch.stack([torch.stack([vv, -uv], -1), torch.stack([-uv, uu], -1)], -2) / determinant[..., None, None]
-        self.target = products[:, :, :1] @ self.inverse
+        inverse = torch.stack([vv, -uv, -uv, uu], -1).unflatten(-1, (2, 2)) / determinant[..., None, None]
+        self.gradients = inverse @ gradients
+        self.target = (inverse @ products[..., 2:])[..., 0]
 
 
 def _descend(
     patch: _FromPatch, image: Tensor, start: Tensor, settled: Tensor, iterations: int, epsilon_px: float, reach: int
 ) -> tuple[Tensor, Tensor]:
-    """Newton steps from `start` inside one table: the places reached, and whether each came to rest within it."""
+    """Newton steps from `start` inside one table: the places reached, and whether each stayed within it."""
     corner = start - (patch.window - 1) / 2
     base = corner.detach().floor()
     span = 2 * reach + 2
@@ -120,59 +124,55 @@ def _descend(
     # Places are kept relative to the table's origin, where a table index is a whole displacement.
     origin = base - reach
     place = corner - origin
+    corners = torch.tensor([0, 1, span, span + 1], device=place.device)
     active = ~settled
     last = torch.zeros_like(place)
-    for number in range(iterations):
-        whole = place.detach().floor().clamp(0, span - 2)
+    for _ in range(iterations):
+        whole = place.detach().floor().clamp(max=span - 2)
         part = place - whole
-        index = (whole[..., 1] * span + whole[..., 0]).long()[..., None]
-        right, below = part[..., :1], part[..., 1:]
-        corners = torch.cat([index, index + 1, index + span, index + span + 1], -1)[..., None].expand(-1, -1, -1, 2)
-        across = torch.cat([1.0 - right, right], -1)
-        weights = torch.cat([across * (1.0 - below), across * below], -1)
-        seen = (weights[..., None] * table.gather(2, corners)).sum(2)
-        step = patch.target[:, :, 0] - seen
-        rest = step.detach().square().sum(-1) <= epsilon_px**2
-        if number:
-            # OpenCV's way out of a two-step oscillation: stop half-way.
-            swing = ((step + last).detach().abs() < 0.01).all(-1) & ~rest
-            step = torch.where(swing[..., None], 0.5 * step, step)
-            rest = rest | swing
-        place = torch.where(active[..., None], place + step, place)
-        last = step
-        # Beyond the table bilinear mixing would extrapolate: leave the rest to the next table, which is centred here.
-        lost = ((place < 0) | (place > span - 1)).any(-1).detach()
-        active = active & ~rest & ~lost
+        columns, rows = whole.long().unbind(-1)
+        index = (rows * span + columns)[..., None] + corners
+        (left, above), (right, below) = (1.0 - part).unbind(-1), part.unbind(-1)
+        weights = torch.stack([left * above, right * above, left * below, right * below], -1)
+        seen = (weights[..., None, :] * table.gather(3, index[..., None, :].expand(-1, -1, 2, -1))).sum(-1)
+        step = patch.target - seen
+        length = step.detach()
+        # At rest, or swinging between two places: then OpenCV stops half-way.
+        rest = length.square().sum(-1) <= epsilon_px**2
+        swing = ((length + last).abs().amax(-1) < 0.01) & ~rest
+        last = length
+        share = active * (1.0 - 0.5 * swing)
+        # Beyond the table mixing would extrapolate: a point waits at the edge, and the next table is centred there.
+        place = (place + share[..., None] * step).clamp(0, span - 1)
+        active = active & ~(rest | swing)
         if _all_true(~active):
             break
-    inside = ((place >= 0) & (place <= span - 1)).all(-1).detach()
-    place = place.clamp(0, span - 1)
-    return place + origin + (patch.window - 1) / 2, inside & ~active
+    inside = ((place > 0) & (place < span - 1)).all(-1)
+    return place + origin + (patch.window - 1) / 2, inside
 
 
-def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float[Tensor, "B N T 2"]:
-    """Step that the second frame asks for at every whole displacement: inverse tensor times sum of grey x gradient."""
+def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float[Tensor, "B N 2 T"]:
+    """The displacement that the second frame's patch asks for at each of span x span whole displacements."""
     window = patch.window
     grey, _ = _gather(image, corner, window + span - 1)
     batch, count, side = grey.shape[:3]
     # Columns unfolded, rows not: rows of one displacement lie together in memory, so each is one strided product.
     strips = grey.unfold(-1, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
-    weights = (patch.gradients.mT @ patch.inverse).flatten(0, 1)
+    gradients = patch.gradients.flatten(0, 1)
     area = window * window
-    rows = [strips[..., shift * window : shift * window + area] @ weights for shift in range(span)]
-    return torch.stack(rows, 1).reshape(batch, count, span * span, 2)
+    rows = [gradients @ strips[..., shift * window : shift * window + area].mT for shift in range(span)]
+    return torch.stack(rows, 2).reshape(batch, count, 2, span * span)
 
 
 def _gather(image: Tensor, corner: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """side x side pixels from each whole corner (u, v), mirrored outside the picture, and where they are outside."""
+    """Return side x side pixels from each whole corner (u, v), mirrored outside the picture, and where they are inside."""
     batch, _, height, width = image.shape
     steps = torch.arange(side, device=image.device)
     columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps
-    outside = ((rows < 0) | (rows >= height))[..., :, None] | ((columns < 0) | (columns >= width))[..., None, :]
+    inside = ((rows >= 0) & (rows < height))[..., :, None] & ((columns >= 0) & (columns < width))[..., None, :]
     columns, rows = reflected_index(columns, width), reflected_index(rows, height)
     frame = torch.arange(batch, device=image.device).reshape(-1, 1, 1) * (height * width)
-    index = (rows * width + frame)[..., :, None] + columns[..., None, :]
-    return image.reshape(-1)[index], outside
+    return image.take((rows * width + frame)[..., :, None] + columns[..., None, :]), inside
 
 
 def _halved(gray: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Motion history: when each place last moved, in the coordinates of the current reference frame (METHOD S5).
+"""Motion history: when each place last moved, in the coordinates of the current reference frame (appendix B, step S5).
 
 Stamps are seconds above 0; 0 means "not within the duration". The history moves with the camera (`carry`), which the
 source does not say.
@@ -17,7 +17,7 @@ Seconds = float | Float[Tensor, "B"]
 def update(
     history: Float[Tensor, "B 1 H W"], silhouette: Float[Tensor, "B 1 H W"], now_s: Seconds, duration_s: Seconds
 ) -> Float[Tensor, "B 1 H W"]:
-    """Now where the silhouette is set (above one half), 0 where the stamp is older than the duration, else unchanged."""
+    """Now where the silhouette is above one half, 0 where the stamp is older than the duration, else unchanged."""
     now, duration = _each(now_s, history), _each(duration_s, history)
     kept = torch.where(history < now - duration, torch.zeros_like(history), history)
     return torch.where(silhouette > 0.5, now.expand_as(history), kept)
@@ -26,7 +26,7 @@ def update(
 def carry(
     history: Float[Tensor, "B 1 H W"], reference_from_previous: Float[Tensor, "B 3 3"]
 ) -> Float[Tensor, "B 1 H W"]:
-    """The history in the new reference frame: stamps are taken from the nearest pixel, for a mean of times is no time."""
+    """The history in the new reference frame: stamps come from the nearest pixel, for a mean of times is no time."""
     return warp(history, reference_from_previous, nearest=True)[0]
 
 
@@ -35,8 +35,8 @@ def gradient(
 ) -> tuple[Float[Tensor, "B 1 H W"], Bool[Tensor, "B 1 H W"]]:
     """Direction of motion (radians, 0 = right, pi/2 = down) and where it may be believed.
 
-    A Sobel gradient over aperture x aperture pixels (odd), edges repeated; valid where the stamps under the aperture span at
-    least delta_min_s and at most delta_max_s. Source: OpenCV's calcMotionGradient, which the source used.
+    A Sobel gradient over aperture x aperture pixels (odd), edges repeated; valid where the stamps under the aperture
+    span at least delta_min_s and at most delta_max_s. Source: OpenCV's calcMotionGradient, which the source used.
     """
     smooth, slope = _sobel(aperture)
     along_u = _separable(history, smooth, slope)
@@ -55,7 +55,7 @@ def region_orientation(
     now_s: Seconds,
     duration_s: Seconds,
 ) -> tuple[Float[Tensor, "B R"], Bool[Tensor, "B R"]]:
-    """Mean direction of each region, in radians, and whether it has one: the weighted circular mean of its valid gradients.
+    """Mean direction of each region, in radians, and whether it has one: a weighted circular mean of valid gradients.
 
     A stamp weighs 1 when new and falls to 0 at the duration. Opposite directions that cancel give no direction.
     """

@@ -1,6 +1,6 @@
-"""Good features to track: where both eigenvalues of the structure tensor are large (METHOD S1; appendix B, S1).
+"""Good features to track: where both eigenvalues of the structure tensor are large (appendix B, step S1).
 
-kornia.feature.gftt_response needs 13x plain OpenCV's time on a CPU, shifts and additions 3.3x or less (MEASURED).
+kornia.feature.gftt_response needs 13x plain OpenCV's time on a CPU, shifts and additions 3.3x or less.
 """
 
 import torch
@@ -75,7 +75,7 @@ def grid_features(
     block: int = 3,
     allowed: Bool[Tensor, "B 1 H W"] | None = None,
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
-    """The best pixel of every cell_px x cell_px cell, row by row: spread over the frame, and faster than `good_features`.
+    """The best pixel of every cell_px x cell_px cell, row by row: spread over the frame, and faster.
 
     N is the number of cells; valid where the cell holds a pixel above quality times the frame's maximum.
     """

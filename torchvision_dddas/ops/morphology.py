@@ -1,6 +1,6 @@
-"""Erosion and dilation, bit-exact with OpenCV for rectangles and ellipses (METHOD S5).
+"""Erosion and dilation, bit-exact with OpenCV for rectangles and ellipses (appendix B, step S5).
 
-kornia.morphology needs 57x OpenCV's time on a CPU; a running maximum by doubling over flat shifts 1.1x (MEASURED).
+kornia.morphology needs 57x OpenCV's time on a CPU; a running maximum by doubling over flat shifts 1.1x.
 Integer and Boolean masks stay so; floats work too and pass gradients.
 """
 
@@ -28,12 +28,12 @@ def erode(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rectan
     return _extremum(mask, size_px, shape, torch.minimum, highest=True)
 
 
-def open(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rectangle") -> Shaped[Tensor, "B C H W"]:
+def opening(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rectangle") -> Shaped[Tensor, "B C H W"]:
     """Erosion, then dilation: takes away what is smaller than the element."""
     return dilate(erode(mask, size_px, shape), size_px, shape)
 
 
-def close(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rectangle") -> Shaped[Tensor, "B C H W"]:
+def closing(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rectangle") -> Shaped[Tensor, "B C H W"]:
     """Dilation, then erosion: fills what is smaller than the element."""
     return erode(dilate(mask, size_px, shape), size_px, shape)
 
@@ -58,7 +58,8 @@ def _extremum(mask: Tensor, size_px: Size, shape: Shape, better: Extremum, highe
         return _extremum(mask.to(torch.uint8), (width, height), shape, better, highest).bool()
     rows = element_rows(width, height, shape)
     left, above = width // 2, height // 2
-    padded = functional.pad(mask, (left, width - 1 - left, above, height - 1 - above), value=_neutral(mask.dtype, highest))
+    margins = (left, width - 1 - left, above, height - 1 - above)
+    padded = functional.pad(mask, margins, value=_neutral(mask.dtype, highest))
     pitch = padded.shape[-1]
     # One flat row of memory: a shift by k columns is a shift by k, one by a row a shift by `pitch`. What runs over a
     # row's end lands in the padding of the next, which is cut away.

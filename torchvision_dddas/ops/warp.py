@@ -1,6 +1,6 @@
-"""Seeing one frame from where another was taken (METHOD S3).
+"""Seeing one frame from where another was taken (appendix B, step S3).
 
-kornia.geometry.warp_perspective needs 9x OpenCV's time on a CPU, one `grid_sample` over a grid made by broadcasting 2-3x (MEASURED).
+kornia.geometry.warp_perspective needs 9x OpenCV's time on a CPU, one `grid_sample` over a broadcast grid 3-4x.
 """
 
 import torch
@@ -22,14 +22,14 @@ def warp(
     """The frame in reference coordinates, and where it was seen there; `fill` elsewhere.
 
     size: (height, width) of the result, by default the frame's. A pixel is inside when all four pixels that it is
-    interpolated from are (nearest: the one that it is taken from). subpixels: round positions to 1/subpixels px; 32 is what cv2.warpPerspective does,
-    at up to 3 grey levels on sharp edges; 0 does not round, and passes gradients.
+    interpolated from are (nearest: the one that it is taken from). subpixels: round positions to 1/subpixels px; 32 is
+    what cv2.warpPerspective does, at up to 3 grey levels on sharp edges; 0 does not round, and passes gradients.
     """
     height, width = image.shape[-2:]
     u, v, inside = source_positions(reference_from_frame, size or (height, width), (height, width), nearest)
     if subpixels:
         u, v = (u * subpixels).round() / subpixels, (v * subpixels).round() / subpixels
-    grid = torch.stack([torch.add(u * (2.0 / width), 1.0 / width - 1.0), torch.add(v * (2.0 / height), 1.0 / height - 1.0)], -1)
+    grid = torch.stack([u * (2.0 / width) + (1.0 / width - 1.0), v * (2.0 / height) + (1.0 / height - 1.0)], -1)
     mode = "nearest" if nearest else "bilinear"
     # Positions outside are masked, so the border's way of padding only has to keep the arithmetic finite.
     warped = functional.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=False)
