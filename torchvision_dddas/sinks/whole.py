@@ -1,10 +1,13 @@
 """Files that appear whole or not at all: written under a temporary name beside their place, then renamed."""
 
 import os
+import re
 from contextlib import suppress
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
+
+_PART = re.compile(r"^\.(.+)\.\d+\.part(\.\w+)$")
 
 
 def temporary(path: Path) -> Path:
@@ -31,7 +34,8 @@ def remove(path: Path) -> None:
 
 def cannot_write(path: Path, error: OSError) -> InputError:
     """The line a user reads when the disk refuses."""
+    place = path.with_name(_PART.sub(r"\1\2", path.name))
     return InputError(
-        f"cannot write {path}: {error.strerror or error}. Nothing half-written was kept; "
+        f"cannot write {place}: {error.strerror or error}. Nothing half-written was kept; "
         "free some space or choose another --out"
     )

@@ -1,0 +1,1 @@
+"""How good results are, by the source's measures and the field's."""

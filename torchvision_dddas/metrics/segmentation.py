@@ -1,0 +1,48 @@
+"""The source's six pixel measures, from counts that may be pooled over frames and clips."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Pixels(NamedTuple):
+    """True and false positives, false and true negatives."""
+
+    tp: int = 0
+    fp: int = 0
+    fn: int = 0
+    tn: int = 0
+
+    def plus(self, other: "Pixels") -> "Pixels":
+        """The counts of both."""
+        return Pixels(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
+    """Compare two masks of one shape; anything above 0 is foreground."""
+    f, t = found > 0, truth > 0
+    tp, positives, labelled = (int(np.count_nonzero(x)) for x in (f & t, f, t))
+    return Pixels(tp, positives - tp, labelled - tp, f.size - positives - labelled + tp)
+
+
+def measures(pixels: Pixels) -> dict[str, float]:
+    """Accuracy, specificity, precision, recall, F and Gmean; NaN where a measure is 0/0, as recall is if nothing moves.
+
+    Source: appendix B, section IV.
+    """
+    tp, fp, fn, tn = pixels
+    specificity, recall = ratio(tn, tn + fp), ratio(tp, tp + fn)
+    return {
+        "accuracy": ratio(tp + tn, tp + fp + fn + tn),
+        "specificity": specificity,
+        "precision": ratio(tp, tp + fp),
+        "recall": recall,
+        "f": ratio(2 * tp, 2 * tp + fp + fn),
+        "gmean": math.sqrt(specificity * recall),
+    }
+
+
+def ratio(part: float, whole: float) -> float:
+    """Part / whole, NaN for 0/0."""
+    return part / whole if whole else math.nan

@@ -1,0 +1,94 @@
+"""Reading what is true of a clip: masks, one labelled box a frame, or MOTChallenge boxes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each."""
+
+    kind: Literal["masks", "one target", "boxes"]
+    place: Path
+    masks: dict[int, Path]
+    boxes: dict[int, np.ndarray]
+
+    @property
+    def frames(self) -> list[int]:
+        """The labelled frames in order."""
+        return sorted(self.masks or self.boxes)
+
+
+def find(place: Path) -> Path | None:
+    """Where the truth of a clip lies: a file, a folder of PNGs, or what a clip's folder holds; None if it has none."""
+    if place.is_file() or _numbered(place):
+        return place
+    for inside in (place / "masks", place / "boxes_xywh.txt", place / "gt.txt", place / "gt" / "gt.txt"):
+        if inside.is_file() or _numbered(inside):
+            return inside
+    return None
+
+
+def load(place: Path, first_frame: int | None = None) -> Truth:
+    """Read the truth. first_frame is the number in a mask's name that is the clip's first frame.
+
+    By default it is 0 if there is a file of that number, else 1. Raises InputError if nothing usable is there.
+    """
+    if not place.exists():
+        raise InputError(f"no truth at {place}")
+    found = find(place)
+    if found is None:
+        raise InputError(f"{place} holds no truth: wanted numbered PNG masks, boxes_xywh.txt or a MOTChallenge gt.txt")
+    if found.is_dir():
+        numbers = _numbered(found)
+        first = first_frame if first_frame is not None else 0 if 0 in numbers else 1
+        early = [n for n in numbers if n < first]
+        if early:
+            raise InputError(f"{numbers[early[0]]} is numbered below the first frame, {first}: see --first-frame")
+        return Truth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
+    return _boxes(found)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f"{path} is no picture that can be read")
+    if image.ndim == 2:
+        return image.astype(np.int32)
+    blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
+    return blue + 256 * green + 65536 * red
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    if not folder.is_dir():
+        return {}
+    return {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdecimal()}
+
+
+def _boxes(path: Path) -> Truth:
+    try:
+        rows = [
+            line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()
+        ]
+        table = np.array([[float(v) for v in row[:7]] for row in rows])
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from error
+    if len(table) == 0:
+        raise InputError(f"{path} is empty: wanted one box a line")
+    if table.shape[1] == 4:
+        return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)})
+    if table.shape[1] < 6:
+        raise InputError(
+            f"{path} has {table.shape[1]} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
+        )
+    # MOTChallenge: a 0 in the seventh column marks a box that does not count.
+    kept = table[table[:, 6] != 0] if table.shape[1] > 6 else table
+    frames = {int(f): kept[kept[:, 0] == f, 2:6] for f in np.unique(table[:, 0])}
+    return Truth("boxes", path, {}, frames)
