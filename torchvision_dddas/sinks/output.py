@@ -58,14 +58,15 @@ class Output:
         self._sinks: list[Sink] = []
         self.journal: Journal | None = None
 
-    def begin(self, facts: dict[str, Any], rate_hz: float) -> None:
-        """Say what the run is, for run.json, and how fast the overlay plays."""
+    def begin(self, facts: dict[str, Any], rate_hz: float) -> Journal:
+        """Say what the run is, for run.json, and how fast the overlay plays. Returns the journal that keeps count."""
         self.journal = Journal(self.folder, {**facts, "outputs": ["tables", *self._save]})
         self._sinks = [self.journal, Tables(self.folder)]
         if "masks" in self._save:
             self._sinks.append(Masks(self.folder))
         if "overlay" in self._save:
             self._sinks.append(Overlay(self.folder, rate_hz))
+        return self.journal
 
     def write(self, scene: Scene) -> None:
         """Write a scene to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""

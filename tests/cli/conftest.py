@@ -1,0 +1,66 @@
+"""Stand-ins for the engine, so that these tests are about the command line alone."""
+
+import sys
+import types
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from torchvision_dddas.types import Detections, Scene
+
+
+def stub_engine(found=True, after=None):
+    """Modules `run` and `vision` that find one target in each frame; `after(scene)` runs once each scene is out."""
+
+    def run(source, vision, settings, telemetry=None):
+        for frame in source:
+            mask = np.zeros(frame.image.shape[:2], np.uint16)
+            mask[2:8, 3:9] = found
+            boxes = np.array([[3, 2, 6, 6.0]]) if found else np.zeros((0, 4))
+            n = len(boxes)
+            detections = Detections(boxes, np.ones(n), np.full(n, 36.0), np.full(n, np.nan), np.full(n, np.nan))
+            reliable = frame.number != 2
+            scene = Scene(frame, mask, detections, 1, reliable, "" if reliable else "blank", seconds={"all": 0.01})
+            yield scene
+            if after:
+                after(scene)
+
+    def load(backend, settings):
+        return types.SimpleNamespace(name=f"stub {backend}")
+
+    modules = {}
+    for name, content in {"run": {"run": run}, "vision": {"load": load}}.items():
+        modules[f"torchvision_dddas.{name}"] = types.ModuleType(f"torchvision_dddas.{name}")
+        modules[f"torchvision_dddas.{name}"].__dict__.update(content)
+    return modules
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    def install(**how):
+        for name, module in stub_engine(**how).items():
+            monkeypatch.setitem(sys.modules, name, module)
+
+    install()
+    return install
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """A folder of five small frames."""
+    folder = tmp_path / "walk" / "frames"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for k in range(5):
+        cv2.imwrite(str(folder / f"{k:05d}.png"), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    return folder
+
+
+@pytest.fixture
+def dddas():
+    """Call the command line: dddas("detect", path, ...) gives the result with exit_code, stdout and stderr."""
+    from torchvision_dddas.cli import app
+
+    return lambda *words: CliRunner().invoke(app, [str(w) for w in words])

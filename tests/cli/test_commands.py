@@ -1,0 +1,113 @@
+"""The commands beside detect, and what they import."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.cli import progress as progress_module
+from torchvision_dddas.demo import film_into
+
+
+def test_help_loads_nothing_heavy():
+    program = (
+        "import sys; from torchvision_dddas.cli import app; "
+        "print([m for m in ('numpy', 'cv2', 'torch', 'pydantic', 'scipy') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_version_and_help(dddas):
+    assert dddas("--version").stdout.startswith("dddas ")
+    for command in ("detect", "evaluate", "demo", "settings"):
+        assert dddas(command, "--help").exit_code == 0
+        assert command in dddas("--help").stdout
+
+
+def test_settings_lists_every_knob_on_its_line(dddas):
+    from torchvision_dddas.settings import all_knobs
+
+    lines = dddas("settings").stdout.splitlines()
+    for knob in all_knobs():
+        assert any(knob.name in line and str(knob.default) in line for line in lines), knob.name
+
+
+def test_evaluate_prints_a_table_and_writes_metrics(dddas, engine, clip, tmp_path):
+    (tmp_path / "truth").mkdir()
+    mask = np.zeros((48, 64), np.uint8)
+    mask[2:8, 3:12] = 1
+    cv2.imwrite(str(tmp_path / "truth/00001.png"), mask)
+    dddas("detect", clip, "--out", tmp_path / "out", "--quiet")
+    result = dddas("evaluate", tmp_path / "truth", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "0.800" in result.stdout  # F of a third missed
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["clips"]["out"]["pixels"]["n_fn"] == 18
+
+
+def test_evaluate_of_a_parent_folder_pools(dddas, engine, clip, tmp_path):
+    mask = np.zeros((48, 64), np.uint8)
+    mask[2:8, 3:9] = 1
+    for name in ("a", "b"):
+        (tmp_path / "truth" / name / "masks").mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "truth" / name / "masks/00000.png"), mask)
+        dddas("detect", clip, "--out", tmp_path / "out" / name, "--quiet")
+    result = dddas("evaluate", tmp_path / "truth", tmp_path / "out", "--out", tmp_path / "score")
+    assert result.exit_code == 0
+    assert "pooled" in result.stdout
+    assert json.loads((tmp_path / "score/metrics.json").read_text())["pooled"]["pixels"]["f"] == 1
+
+
+def test_evaluate_of_nothing_is_one_line(dddas, tmp_path):
+    result = dddas("evaluate", tmp_path / "nosuch", tmp_path)
+    assert result.exit_code == 2
+    assert result.stderr == f"dddas: no truth at {tmp_path / 'nosuch'}\n"
+
+
+def test_metrics_that_cannot_be_written_are_one_line(dddas, engine, clip, tmp_path):
+    dddas("detect", clip, "--out", tmp_path / "out", "--quiet")
+    (tmp_path / "file").write_text("")
+    result = dddas("evaluate", tmp_path / "out/masks", tmp_path / "out", "--out", tmp_path / "file/deep")
+    assert result.exit_code == 2
+    assert "cannot write" in result.stderr
+
+
+def test_demo_films_detects_and_scores_twice_into_the_same_folder(dddas, engine, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchvision_dddas.demo.film_into.__defaults__", (0, 3, (160, 120)))
+    for _ in range(2):
+        result = dddas("demo", "--out", tmp_path / "demo")
+        assert result.exit_code == 0, result.output
+    assert "Look at" in result.stdout
+    for name in ("overlay.mp4", "detections.csv", "metrics.json", "clip/frames/000003.jpg", "clip/masks/000003.png"):
+        assert (tmp_path / "demo" / name).is_file()
+
+
+def test_the_demo_clip_on_disk_is_the_scene(tmp_path):
+    from torchvision_dddas.simulation.scene import render
+
+    film_into(tmp_path, seed=1, frames=2, size=(160, 120))
+    made = render(1, 2, (160, 120))
+    read = cv2.imread(str(tmp_path / "frames/000002.jpg"))
+    assert np.abs(read.astype(int) - made.images[1]).mean() < 3
+    assert np.array_equal(cv2.imread(str(tmp_path / "masks/000002.png"), -1), made.masks[1])
+
+
+def test_progress_away_from_a_terminal_is_a_plain_line_now_and_then(capsys, monkeypatch):
+    clock = iter(np.arange(0, 100, 2.0))
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
+    with progress_module.progress("walk", 10, quiet=False) as tick:
+        for _ in range(6):
+            tick()
+    assert capsys.readouterr().err.splitlines() == [
+        "walk: 3 of 10 frames, 0.5 frames/s, 14 s left",
+        "walk: 6 of 10 frames, 0.5 frames/s, 8 s left",
+    ]
+
+
+def test_progress_on_a_terminal_shows_frames_a_second(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with progress_module.progress("a [b] clip", None, quiet=False) as tick:
+        tick()
+    assert "Traceback" not in capsys.readouterr().err

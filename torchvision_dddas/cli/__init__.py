@@ -1,0 +1,46 @@
+"""The command line, `dddas`: one file a command. Heavy imports wait until a command needs them."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from torchvision_dddas import __version__
+from torchvision_dddas.cli.demo import demo
+from torchvision_dddas.cli.detect import detect
+from torchvision_dddas.cli.evaluate import evaluate
+from torchvision_dddas.cli.mistakes import INTERRUPTED
+from torchvision_dddas.cli.settings import settings
+
+app = typer.Typer(
+    name="dddas",
+    help="Moving targets from a moving camera, steered by what the data show.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (detect, evaluate, demo, settings):
+    app.command()(command)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"dddas {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Entry point. Exit code 0: done; 2: bad input, one line on stderr; 130: stopped by Ctrl-C, outputs valid."""
+    try:
+        app()
+    except KeyboardInterrupt:  # outside a command, while Python still loads
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,33 @@
+"""`dddas demo`: a small scene end to end, no input needed."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+
+
+@explained
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the clip and everything found in it.")] = Path("demo-out"),
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
+) -> None:
+    """Film a small scene of walkers and cars from a moving camera, detect them, and compare with the truth."""
+    from torchvision_dddas.cli.detect import detect_clip, summary
+    from torchvision_dddas.cli.evaluate import score, show
+    from torchvision_dddas.demo import film_into
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.simulation.scene import FRAMES, SIZE
+    from torchvision_dddas.sinks import SAVED
+
+    if not quiet:
+        typer.echo(f"filming {FRAMES} frames of {SIZE[0]}×{SIZE[1]} into {out / 'clip'}", err=True)
+    clip = film_into(out / "clip")
+    journal = detect_clip(str(clip / "frames"), out, load(), "auto", SAVED, quiet=quiet)
+    report = score(clip / "masks", out, None, out)
+    if not quiet:
+        show(report)
+        for line in summary(journal, out, SAVED):
+            typer.echo(line)
+        typer.echo(f"Look at {out / 'overlay.mp4'}; the clip and its true masks are in {clip}")

@@ -1,0 +1,86 @@
+"""`dddas evaluate`: results against the truth."""
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+COLUMNS = {
+    "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
+    "boxes": ("f1", "precision", "recall"),
+    "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
+}
+
+
+@explained
+def evaluate(
+    truth: Annotated[
+        Path, typer.Argument(help="Masks (a folder of numbered PNGs), a file of boxes, or a folder of such clips.")
+    ],
+    result: Annotated[Path, typer.Argument(help="What dddas detect wrote, or a folder of such results by clip name.")],
+    first_frame: Annotated[
+        int | None,
+        typer.Option(help="Number in a mask's name that is the clip's first frame. [default: 0 if there, else 1]"),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for metrics.json. [default: RESULT]")] = None,
+) -> None:
+    """Score results: the six pixel measures, and boxes at IoU 0.5; per clip, pooled, and the mean over clips."""
+    report = score(truth, result, first_frame, out or result)
+    show(report)
+    typer.echo(f"{(out or result) / 'metrics.json'}: the same with its counts")
+
+
+def score(truth: Path, result: Path, first_frame: int | None, out: Path) -> dict[str, Any]:
+    """Evaluate, and write metrics.json into a folder. Raises InputError."""
+    from torchvision_dddas.evaluate import evaluate as compare
+    from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.sinks.whole import cannot_write, write_whole
+
+    report = compare(truth, result, first_frame)
+    path = out / "metrics.json"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_whole(path, (json.dumps(finite(report), indent=2) + "\n").encode())
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    return report
+
+
+def show(report: dict[str, Any]) -> None:
+    """Print a table for each kind of measure, and the notes."""
+    from rich.console import Console
+
+    console = Console()
+    for group in COLUMNS:
+        if any(group in clip for clip in report["clips"].values()):
+            console.print(_table(report, group))
+    for note in report["notes"]:
+        console.print(f"note: {note}", markup=False, highlight=False)
+
+
+def _table(report: dict[str, Any], group: str) -> "Table":
+    from rich.table import Table
+
+    table = Table(title={"pixels": "Pixels", "boxes": "Boxes, IoU ≥ 0.5", "target": "One labelled target"}[group])
+    table.add_column("clip", overflow="fold")
+    for column in ("frames", *COLUMNS[group]):
+        table.add_column(column.replace("_", " "), justify="right")
+    rows = {name: (str(clip["frames"]), clip[group]) for name, clip in report["clips"].items() if group in clip}
+    for name, (frames, clip) in rows.items():
+        table.add_row(name, frames, *(_cell(clip[c]) for c in COLUMNS[group]))
+    if len(rows) > 1:
+        table.add_section()
+        for name in ("pooled", "mean"):
+            table.add_row(name, "", *(_cell(report[name].get(group, {}).get(c, math.nan)) for c in COLUMNS[group]))
+    return table
+
+
+def _cell(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.3f}"
