@@ -1,0 +1,50 @@
+"""What every source of frames offers, and the record of what went wrong while reading."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+
+from torchvision_dddas.types import Frame
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that reading got over: the 1-based number of the first frame it touches, and what it was, in words."""
+
+    frame: int
+    what: str
+
+    def __str__(self) -> str:
+        return self.what
+
+
+class Source(Protocol):
+    """A clip, read one frame at a time.
+
+    name: what to call it in messages and tables. count: frames that it announces, None when unknown (a live stream).
+    rate_hz: frames a second. size: (width, height) in px, the same for every frame.
+    problems: filled while reading; every new iteration starts from the first frame and empties it.
+    Iterating yields frames in order, numbered from 1. A frame that cannot be decoded is left out and keeps its number.
+    """
+
+    name: str
+    count: int | None
+    rate_hz: float
+    size: tuple[int, int]
+    problems: list[Problem]
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV's own complaints off the terminal: the user gets our one line instead."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
