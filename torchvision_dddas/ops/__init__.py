@@ -1,8 +1,8 @@
-"""The pixel floor: pure functions from tensors to tensors, batched, differentiable where the mathematics is, exportable.
+"""The pixel floor: pure functions from tensors to tensors, batched, exportable, mostly differentiable.
 
-Images are (B, C, H, W) floats in [0, 1]; points are (B, N, 2), (u, v) in pixels from the centre of the top left one; matrices
-are named by direction (reference_from_frame). float32, or float64 for gradient checks; any device; every shape is fixed by
-the inputs' shapes, and what is missing is marked by a validity mask. Needs the extra `torch`.
+Images are (B, C, H, W) floats in [0, 1]; points are (B, N, 2), (u, v) in pixels from the centre of the top left one;
+matrices are named by direction (reference_from_frame). float32, or float64 for gradient checks; any device; every shape
+is fixed by the inputs' shapes, and what is missing is marked by a validity mask. Needs the extra `torch`.
 """
 
 from . import (

@@ -66,7 +66,7 @@ def ransac(
     minimal: Minimal,
     fit: Fit,
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
-    """Best of all hypotheses at once, then least squares on its inliers at ever smaller tolerances (appendix B, step S3).
+    """Best of all hypotheses at once, then least squares on its inliers, ever more strictly (appendix B, step S3).
 
     Hypotheses are ranked by their truncated squared error, which tells apart two that have as many inliers.
     A refit counts only if twice the minimal number of points support it. When nothing fits: identity, valid False.

@@ -1,8 +1,8 @@
 """Pyramidal Lucas-Kanade: where points of one frame are in another (appendix B, step S2).
 
-Agrees with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker; sampling patches with `grid_sample` in every iteration
-costs 17-20x OpenCV's time on a CPU, the correlation table per point that is used here 7-9x, 4-5x when sparse and predicted:
-the sums that an iteration needs at a fractional displacement are bilinear mixes of those at whole displacements, made once.
+Agrees with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker; sampling patches with `grid_sample` in every
+iteration costs 17-20x OpenCV's time on a CPU, the correlation table per point that is used here 7-9x, 4-5x when sparse
+and predicted: what an iteration needs at a fractional displacement is a bilinear mix of sums at whole ones, made once.
 """
 
 import torch
@@ -37,8 +37,8 @@ def track(
     """The points' places in the second frame, and which were found.
 
     guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
-    anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little texture
-    (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the second frame.
+    anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
+    texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the second frame.
     """
     place = points if guess is None else guess
     place = place / 2.0 ** (len(pyramid_from) - 1)
@@ -165,7 +165,7 @@ def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float
 
 
 def _gather(image: Tensor, corner: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Return side x side pixels from each whole corner (u, v), mirrored outside the picture, and where they are inside."""
+    """Pixels side x side from each whole corner (u, v), mirrored outside the picture, and where they are inside."""
     batch, _, height, width = image.shape
     steps = torch.arange(side, device=image.device)
     columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps

@@ -40,14 +40,18 @@ def closing(mask: Shaped[Tensor, "B C H W"], size_px: Size, shape: Shape = "rect
 
 def element_rows(width: int, height: int, shape: Shape) -> list[tuple[int, int]]:
     """The element as one run of columns [first, last) per row: cv2.getStructuringElement."""
-    if shape == "rectangle" or min(width, height) == 1:
+    if shape == "rectangle":
         return [(0, width)] * height
     radius, centre = height // 2, width // 2
     rows = []
     for row in range(height):
         offset = row - radius
         # Python rounds halves to even, as OpenCV does.
-        reach = round(centre * math.sqrt((radius**2 - offset**2) / radius**2)) if abs(offset) <= radius else -1
+        reach = (
+            round(centre * math.sqrt(max(radius**2 - offset**2, 0) / max(radius**2, 1)))
+            if abs(offset) <= radius
+            else -1
+        )
         rows.append((max(centre - reach, 0), min(centre + reach + 1, width)) if reach >= 0 else (0, 0))
     return rows
 
