@@ -1,4 +1,4 @@
-"""Pictures of our own making: smoothed noise at several scales with hard-edged patches, seen twice through a known plane."""
+"""Pictures of our own making: smoothed noise with hard-edged patches, seen twice through a known homography."""
 
 from collections.abc import Callable
 

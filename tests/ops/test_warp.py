@@ -18,10 +18,10 @@ def matrix(values: np.ndarray, dtype: torch.dtype = torch.float32) -> torch.Tens
 def test_agrees_with_opencv_to_a_grey_level_inside(texture, tensor, shape):
     picture = texture(0, *shape)
     wanted = torch.from_numpy(cv2.warpPerspective(picture, MOTION, shape[::-1])).double()
-    # OpenCV rounds positions to 1/32 px and the result to whole grey levels; with the same rounding nothing else is left.
+    # OpenCV rounds positions to 1/32 px and the result to whole grey levels; nothing else differs.
     found, inside = warp.warp(tensor(picture).double(), matrix(MOTION, torch.float64), subpixels=32)
     apart = (found[0, 0] * 255 - wanted).abs()[inside[0, 0]]
-    assert inside.float().mean() > 0.8
+    assert inside.float().mean() > 0.7
     assert apart.quantile(0.999) < 0.6
     # A position that falls on a rounding limit may go either way.
     assert (apart > 1).float().mean() < 1e-4

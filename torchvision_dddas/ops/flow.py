@@ -38,7 +38,7 @@ def track(
 
     guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
     anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
-    texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the second frame.
+    texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the frame.
     """
     place = points if guess is None else guess
     place = place / 2.0 ** (len(pyramid_from) - 1)

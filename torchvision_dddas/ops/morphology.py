@@ -47,12 +47,8 @@ def element_rows(width: int, height: int, shape: Shape) -> list[tuple[int, int]]
     for row in range(height):
         offset = row - radius
         # Python rounds halves to even, as OpenCV does.
-        reach = (
-            round(centre * math.sqrt(max(radius**2 - offset**2, 0) / max(radius**2, 1)))
-            if abs(offset) <= radius
-            else -1
-        )
-        rows.append((max(centre - reach, 0), min(centre + reach + 1, width)) if reach >= 0 else (0, 0))
+        reach = round(centre * math.sqrt(max(radius**2 - offset**2, 0) / max(radius**2, 1)))
+        rows.append((max(centre - reach, 0), min(centre + reach + 1, width)))
     return rows
 
 
@@ -69,7 +65,7 @@ def _extremum(mask: Tensor, size_px: Size, shape: Shape, better: Extremum, highe
     # row's end lands in the padding of the next, which is cut away.
     flat = padded.reshape(-1)
     size = flat.numel() - (height - 1) * pitch - (width - 1)
-    if all(row == rows[0] for row in rows):
+    if all(row == (0, width) for row in rows):
         result = _running(_running(flat, width, 1, better), height, pitch, better)
     else:
         result = _union_of_runs(flat, rows, pitch, size, better)
