@@ -20,9 +20,9 @@ def _texture(seed: int, height: int, width: int) -> np.ndarray:
         x, y = int(random.integers(width)), int(random.integers(height))
         w, h = random.integers(6, 40, 2).tolist()
         total[y : y + h, x : x + w] += random.normal(0, 3)
-    total = cv2.GaussianBlur(total, (0, 0), 0.8)
-    low, high = np.percentile(total, (1, 99))
-    return ((total - low) / (high - low) * 235 + 10).clip(0, 255).astype(np.uint8)
+    smoothed = cv2.GaussianBlur(total, (0, 0), 0.8)
+    low, high = np.percentile(smoothed, (1, 99))
+    return ((smoothed - low) / (high - low) * 235 + 10).clip(0, 255).astype(np.uint8)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ def scene(two_views, tensor):
     return first, second, corners, torch.from_numpy(corners[:, 0])[None]
 
 
-def pyramids(tensor, first, second, levels):
+def pyramids(tensor, first, second, levels) -> tuple[flow.Pyramid, flow.Pyramid]:
     return flow.pyramid(tensor(first), levels), flow.pyramid(tensor(second), levels)
 
 
@@ -155,4 +155,6 @@ def test_gradients_are_those_of_finite_differences(two_views, tensor):
     assert torch.autograd.gradcheck(lambda b: moved(images[0].detach(), b, points), (images[1],))
     assert torch.autograd.gradcheck(lambda a: moved(a, images[1].detach(), points), (images[0],))
     # Where a point goes also depends on where it started.
-    assert torch.autograd.gradcheck(lambda p: moved(*(x.detach() for x in images), p), (points.requires_grad_(),))
+    assert torch.autograd.gradcheck(
+        lambda p: moved(images[0].detach(), images[1].detach(), p), (points.requires_grad_(),)
+    )

@@ -105,4 +105,4 @@ def test_eigenvalue_gradients_are_those_of_finite_differences():
 def test_eigenvalue_gradients_of_a_blank_picture_are_finite():
     picture = torch.full((1, 1, 6, 7), 0.5, requires_grad=True)
     keypoints.min_eigenvalue(picture).sum().backward()
-    assert torch.isfinite(picture.grad).all()
+    assert picture.grad is not None and torch.isfinite(picture.grad).all()
