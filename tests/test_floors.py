@@ -99,15 +99,15 @@ def strangers(module: str, source: str, is_package: bool = False) -> list[str]:
         is_torch = top in {"torch", "kornia", "torchvision"}
         if top in sys.stdlib_module_names and name not in FILES:
             continue
+        # Both back ends speak the seam's words; the seam loads one of them only when asked to, and neither the other.
+        if folder == top == "vision":
+            if name.startswith(BACK_ENDS) and (at_module_level or module.startswith(BACK_ENDS)):
+                wrong.append(name)
+            continue
         if name == "jaxtyping" or (not is_torch and below(name, floor)) or any(below(name, other) for other in allowed):
             continue
         if "*" in allowed and not (is_torch and at_module_level):
             continue
-        # Both back ends speak the seam's words; the seam loads one of them only when asked to, and neither the other.
-        if folder == top == "vision":
-            backend = name.startswith(BACK_ENDS)
-            if not backend or not (at_module_level or module.startswith(BACK_ENDS)):
-                continue
         wrong.append(name)
     return wrong
 
