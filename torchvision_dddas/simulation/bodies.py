@@ -50,9 +50,9 @@ def draw(body: Body, time_s: float, view: View, canvas: Canvas, value: int) -> N
             if normal @ (view.position_m - corners.mean(0)) > 0:
                 light = 0.55 + 0.45 * max(float(normal @ _TO_SUN), 0.0)
                 canvas.fill(view.project(corners), light * colour, value)
-        for wheel, normal in _wheels(body, time_s):
-            if normal @ (view.position_m - wheel.mean(0)) > 0:
-                canvas.fill(view.project(wheel), np.array([26.0, 26, 26]), value)
+        for corners, normal, colour in _car_trim(body, time_s):
+            if normal @ (view.position_m - corners.mean(0)) > 0:
+                canvas.fill(view.project(corners), colour, value)
     else:
         for start, end, width_m, colour in _limbs(body, time_s):
             width = width_m * view.pixels_per_metre(start)
@@ -112,17 +112,55 @@ def _car_faces(body: Body, time_s: float) -> list[tuple[np.ndarray, np.ndarray, 
     return faces
 
 
-def _wheels(body: Body, time_s: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(outline (12, 3), outward normal) of the four wheels."""
+# Panels on a car's flanks: from, to along the car, from, to in height, brightness of the paint; below 0, a lamp.
+_FLANK = (
+    (-2.12, 2.05, 0.47, 0.53, 0.45),
+    (-1.02, -0.98, 0.36, 0.84, 0.4),
+    (0.02, 0.06, 0.36, 0.84, 0.4),
+    (1.0, 1.04, 0.36, 0.84, 0.4),
+    (-0.82, -0.6, 0.7, 0.74, 0.4),
+    (0.2, 0.42, 0.7, 0.74, 0.4),
+    (-1.0, -0.9, 0.86, 1.38, 0.75),
+    (-0.32, -0.22, 0.86, 1.4, 0.75),
+    (1.92, 2.1, 0.58, 0.74, -1),
+    (-2.16, -1.98, 0.58, 0.76, -2),
+)
+_LAMPS = {-1: np.array([205.0, 225, 230]), -2: np.array([36.0, 30, 150])}
+# Panels seen from above: from, to along the car, half width, height, brightness of the paint.
+_ABOVE = (
+    (-0.75, -0.1, 0.4, 1.42, 0.3),
+    (1.06, 1.1, 0.74, 0.85, 0.5),
+    (1.85, 1.89, 0.7, 0.85, 0.6),
+    (-1.8, -1.75, 0.72, 0.85, 0.5),
+)
+
+
+def _car_trim(body: Body, time_s: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """(corners (N, 3), outward normal, colour) of doors, pillars, lamps, roof window and wheels, to draw last."""
     ahead, left = _axes(body)
-    origin = np.append(body.place(time_s), 0.0)
+    origin, up = np.append(body.place(time_s), 0.0), np.array([0, 0, 1.0])
+    paint = np.array(body.colour)
+
+    def at(along: float, aside: float, height: float) -> np.ndarray:
+        return origin + along * ahead + aside * left + height * up
+
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)[:, None]
-    rim = 0.31 * (np.cos(turn) * ahead + np.sin(turn) * np.array([0, 0, 1.0]))
-    return [
-        (origin + along * ahead + 0.87 * side * left + np.array([0, 0, 0.31]) + rim, side * left)
-        for along in (-1.35, 1.35)
-        for side in (1, -1)
-    ]
+    rim = np.cos(turn) * ahead + np.sin(turn) * up
+    trim = []
+    for hand in (1, -1):
+        for back, front, low, high, tone in _FLANK:
+            # The flank leans inwards, more above the sill of the windows.
+            foot, head = hand * np.interp((low, high), (0.3, 0.85, 0.851, 1.42), (0.865, 0.825, 0.765, 0.645))
+            corners = [at(back, foot, low), at(front, foot, low), at(front, head, high), at(back, head, high)]
+            trim.append((np.stack(corners), hand * left, tone * 0.8 * paint if tone > 0 else _LAMPS[int(tone)]))
+        for along in (-1.35, 1.35):
+            hub = at(along, 0.875 * hand, 0.31)
+            trim.append((hub + 0.31 * rim, hand * left, np.array([26.0, 26, 26])))
+            trim.append((hub + 0.15 * rim, hand * left, np.array([120.0, 120, 122])))
+    for back, front, half_width, height, tone in _ABOVE:
+        places = ((back, -1), (front, -1), (front, 1), (back, 1))
+        trim.append((np.stack([at(a, h * half_width, height) for a, h in places]), up, tone * paint))
+    return trim
 
 
 def _limbs(body: Body, time_s: float) -> list[tuple[np.ndarray, np.ndarray, float, np.ndarray]]:
