@@ -30,10 +30,9 @@ def stub_engine(found=True, after=None):
     def load(backend, settings):
         return types.SimpleNamespace(name=f"stub {backend}")
 
-    modules = {}
-    for name, content in {"run": {"run": run}, "vision": {"load": load}}.items():
-        modules[f"torchvision_dddas.{name}"] = types.ModuleType(f"torchvision_dddas.{name}")
-        modules[f"torchvision_dddas.{name}"].__dict__.update(content)
+    modules = {f"torchvision_dddas.{name}": types.ModuleType(name) for name in ("run", "vision")}
+    modules["torchvision_dddas.run"].__dict__["run"] = run
+    modules["torchvision_dddas.vision"].__dict__["load"] = load
     return modules
 
 

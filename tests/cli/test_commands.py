@@ -1,6 +1,7 @@
 """The commands beside detect, and what they import."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -60,6 +61,15 @@ def test_evaluate_of_a_parent_folder_pools(dddas, engine, clip, tmp_path):
     assert json.loads((tmp_path / "score/metrics.json").read_text())["pooled"]["pixels"]["f"] == 1
 
 
+def test_a_terminal_that_knows_only_ascii_is_no_reason_to_crash(dddas, engine, clip, tmp_path):
+    dddas("detect", clip, "--out", tmp_path / "out", "--quiet")
+    words = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()", "evaluate"]
+    words += [str(tmp_path / "out/masks"), str(tmp_path / "out")]
+    done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"IoU" in done.stdout
+
+
 def test_evaluate_of_nothing_is_one_line(dddas, tmp_path):
     result = dddas("evaluate", tmp_path / "nosuch", tmp_path)
     assert result.exit_code == 2
@@ -89,14 +99,16 @@ def test_the_demo_clip_on_disk_is_the_scene(tmp_path):
 
     film_into(tmp_path, seed=1, frames=2, size=(160, 120))
     made = render(1, 2, (160, 120))
-    read = cv2.imread(str(tmp_path / "frames/000002.jpg"))
+    read, mask = cv2.imread(str(tmp_path / "frames/000002.jpg")), cv2.imread(str(tmp_path / "masks/000002.png"), -1)
+    assert read is not None
+    assert mask is not None
     assert np.abs(read.astype(int) - made.images[1]).mean() < 3
-    assert np.array_equal(cv2.imread(str(tmp_path / "masks/000002.png"), -1), made.masks[1])
+    assert np.array_equal(mask, made.masks[1])
 
 
 def test_progress_away_from_a_terminal_is_a_plain_line_now_and_then(capsys, monkeypatch):
     clock = iter(np.arange(0, 100, 2.0))
-    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
     with progress_module.progress("walk", 10, quiet=False) as tick:
         for _ in range(6):
             tick()

@@ -10,6 +10,7 @@ def test_masks_hold_every_target_number_in_the_smallest_type(tmp_path, scene, ta
     made = scene(3, targets=targets, size=(99, 61))
     Masks(tmp_path).write(made)
     read = cv2.imread(str(tmp_path / "masks/000003.png"), cv2.IMREAD_UNCHANGED)
+    assert read is not None
     assert read.dtype == kind
     assert np.array_equal(read, made.mask)
 

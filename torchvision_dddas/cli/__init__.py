@@ -1,5 +1,6 @@
 """The command line, `dddas`: one file a command. Heavy imports wait until a command needs them."""
 
+import io
 import sys
 from typing import Annotated
 
@@ -40,6 +41,9 @@ def _options(
 
 def main() -> None:
     """Entry point. Exit code 0: done; 2: bad input, one line on stderr; 130: stopped by Ctrl-C, outputs valid."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that cannot show × or ≥ shows a question mark
     try:
         app()
     except KeyboardInterrupt:  # outside a command, while Python still loads

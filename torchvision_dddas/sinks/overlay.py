@@ -129,6 +129,7 @@ class _H264:
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
+        self._stream.codec_context.thread_count = 2  # memory that does not depend on the machine's cores
         # No look-ahead: it would hold tens of frames in memory.
         self._stream.options = {"preset": "veryfast", "tune": "zerolatency", "crf": "22"}
 
