@@ -88,7 +88,7 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
         ("registration.keypoints=1.5", ["1.5", "a whole number"]),
         ("registration.keypoints=many", ["'many'", "50 to 5000 points"]),
         ("registration.keypoints=true", ["True", "a whole number"]),
-        ("registration.block_px=4", ["4", "odd"]),
+        ("registration.block_px=4", ["block_px = 4", "3 to 15 px, odd"]),
         ("registration.quality=nan", ["nan", "0.0001 to 0.5"]),
         ("registration.model=plane", ["'plane'", "homography or affine"]),
         ("interval.rule=1", ["true or false"]),

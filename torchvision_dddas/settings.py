@@ -322,8 +322,7 @@ def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
     if name not in fields:  # a rule across two knobs of one group
         return f"{name}: {str(first['msg']).removeprefix('Value error, ')}"
     field = fields[name]
-    unit = _unit(field)
+    low_to_high, comma, odd = range_of(field).partition(",")
+    unit = "" if _unit(field) == "-" else f" {_unit(field)}"
     whole = "a whole number, " if field.annotation is int else ""
-    return (
-        f"{name} = {first['input']!r} will not do; wanted {whole}{range_of(field)}{'' if unit == '-' else ' ' + unit}"
-    )
+    return f"{name} = {first['input']!r} will not do; wanted {whole}{low_to_high}{unit}{comma}{odd}"
