@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,18 @@ COLUMNS = {
     "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
     "boxes": ("f1", "precision", "recall"),
     "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
+}
+
+# Headings that fit a terminal of 80 columns beside the clips' names.
+SHORT = {
+    "f": "F",
+    "f1": "F1",
+    "precision": "prec.",
+    "specificity": "spec.",
+    "accuracy": "acc.",
+    "gmean": "Gmean",
+    "iou_0.3": "IoU ≥ 0.3",
+    "other_blobs_per_frame": "other blobs",
 }
 
 
@@ -57,7 +70,7 @@ def show(report: dict[str, Any]) -> None:
     """Print a table for each kind of measure, and the notes."""
     from rich.console import Console
 
-    console = Console()
+    console = Console() if sys.stdout.isatty() else Console(width=120)
     for group in COLUMNS:
         if any(group in clip for clip in report["clips"].values()):
             console.print(_table(report, group))
@@ -69,9 +82,9 @@ def _table(report: dict[str, Any], group: str) -> "Table":
     from rich.table import Table
 
     table = Table(title={"pixels": "Pixels", "boxes": "Boxes, IoU ≥ 0.5", "target": "One labelled target"}[group])
-    table.add_column("clip", overflow="fold")
+    table.add_column("clip", no_wrap=True)
     for column in ("frames", *COLUMNS[group]):
-        table.add_column(column.replace("_", " "), justify="right")
+        table.add_column(SHORT.get(column, column), justify="right", no_wrap=True)
     rows = {name: (str(clip["frames"]), clip[group]) for name, clip in report["clips"].items() if group in clip}
     for name, (frames, clip) in rows.items():
         table.add_row(name, frames, *(_cell(clip[c]) for c in COLUMNS[group]))
