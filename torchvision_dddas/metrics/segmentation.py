@@ -29,7 +29,7 @@ def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
 def measures(pixels: Pixels) -> dict[str, float]:
     """Accuracy, specificity, precision, recall, F and Gmean; NaN where a measure is 0/0, as recall is if nothing moves.
 
-    Source: appendix B, eq. 10 and 11. It prints Gmean without its square root, which the name asks for.
+    Source: appendix B, eq. 10 and 11.
     """
     tp, fp, fn, tn = pixels
     specificity, recall = ratio(tn, tn + fp), ratio(tp, tp + fn)
