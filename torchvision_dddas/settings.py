@@ -51,24 +51,26 @@ class RegistrationKnobs(Group):
     model: Literal["homography", "affine"] = knob(
         "homography", "-", meaning="the background's motion: homography, or the earlier affine baseline"
     )
-    keypoints: int = knob(1000, "points", 50, 5000, meaning="budget of good features to track in a frame")
+    keypoints: int = knob(500, "points", 50, 5000, meaning="budget of good features to track in a frame")
     cell_px: int = knob(
-        16, "px", 4, 256, meaning="side of the grid cell that yields its best point, so that points spread out"
+        16, "px", 4, 256, meaning="side of the grid cell that yields its best point; grows until the budget holds"
     )
     quality: float = knob(
         0.01, "-", 1e-4, 0.5, meaning="smaller eigenvalue of a point, as a share of the frame's largest"
     )
-    min_distance_px: float = knob(8.0, "px", 1, 100, meaning="distance that two points keep at least")
-    block_px: Odd = knob(3, "px", 3, 15, meaning="window over which the structure tensor is summed, odd")
+    block_px: Odd = knob(5, "px", 3, 15, meaning="window over which the structure tensor is summed, odd")
     window_px: Odd = knob(21, "px", 5, 51, meaning="Lucas-Kanade's window, odd")
-    levels: int = knob(3, "levels", 0, 6, meaning="pyramid levels above the full resolution")
+    levels: int = knob(4, "levels", 0, 6, meaning="pyramid levels above the full resolution")
     iterations: int = knob(30, "steps", 1, 100, meaning="Lucas-Kanade steps a level at most")
     epsilon_px: float = knob(0.01, "px", 1e-4, 1, meaning="a Lucas-Kanade step shorter than this ends the search")
     forward_backward_px: float = knob(
-        1.0, "px", 0.05, 20, meaning="a point tracked there and back may miss its start by this"
+        1.0, "px", 0, 20, meaning="a point tracked there and back may miss its start by this; 0 leaves the check out"
     )
-    ransac_px: float = knob(3.0, "px", 0.1, 20, meaning="a point this close to the model's prediction is an inlier")
+    ransac_px: float = knob(2.0, "px", 0.1, 20, meaning="a point this close to the model's prediction is an inlier")
     hypotheses: int = knob(128, "models", 8, 4096, meaning="models drawn by RANSAC")
+    redetect_frames: int = knob(
+        1, "frames", 1, 60, meaning="new keypoints every so many frames; between, inliers are carried on (onboard)"
+    )
     min_inliers: int = knob(20, "points", 4, 5000, meaning="fewer inliers make the registration unreliable")
     min_inlier_share: float = knob(
         0.4, "-", 0, 1, meaning="a smaller share of inliers makes the registration unreliable"
@@ -79,42 +81,101 @@ class IntervalKnobs(Group):
     """The detection interval and the rule that steers it (METHOD section 1; appendix B, eq. 2)."""
 
     rule: bool = knob(True, "-", meaning="steer the interval by altitude, speed and rate; false keeps `frames`")
-    frames: int = knob(1, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
-    minimum_frames: int = knob(1, "frames", 1, 60, meaning="shortest interval that the rule may choose")
+    frames: int = knob(3, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
+    minimum_frames: int = knob(3, "frames", 1, 60, meaning="shortest interval that the rule may choose")
     maximum_frames: int = knob(6, "frames", 1, 60, meaning="longest interval that the rule may choose")
     reference_altitude_m: float = knob(
         20.0, "m", 1, 1000, meaning="altitude above ground at which the interval is one frame"
     )
     reference_speed_m_s: float = knob(5.0, "m/s", 0.1, 100, meaning="ground speed at which the interval is one frame")
     reference_rate_hz: float = knob(10.0, "1/s", 1, 240, meaning="frame rate at which the interval is one frame")
-    reference_flow_px: float = knob(
-        17.5, "px", 0.5, 200, meaning="without telemetry: background flow a frame at which the interval is one frame"
+    reference_flow: float = knob(
+        0.02,
+        "widths",
+        1e-4,
+        1,
+        meaning="without telemetry: background flow a frame, as a share of the width, at which the interval is one",
     )
     lowest_speed_m_s: float = knob(
         0.5, "m/s", 0.01, 10, meaning="floor of the speed, so that hovering gives the longest interval"
     )
     cost: float = knob(1.0, "-", 0.1, 10, meaning="cost of one step relative to its reference (O in eq. 2)")
+    memory_frames: int = knob(9, "frames", 1, 100, meaning="steps over which the background flow's median is taken")
 
 
 class DifferenceKnobs(Group):
     """What makes a pixel foreground (METHOD section 1, S4)."""
 
-    kind: Literal["to_reference", "between_later"] = knob(
-        "to_reference",
+    kind: Literal["normalized", "to_reference", "between_later"] = knob(
+        "normalized",
         "-",
-        meaning="to_reference: min(|I(t) - W1|, |I(t) - W2|), once, at t; between_later: |W2 - W1|, the source's eq. 9",
+        meaning="normalized: the difference to both neighbours in units of local noise, exposure corrected; "
+        "to_reference: min(|I(t) - W1|, |I(t) - W2|) in grey levels; between_later: |W2 - W1|, the source's eq. 9",
     )
-    threshold: float = knob(20.0, "grey levels", 1, 255, meaning="a larger difference is foreground")
+    near_frames: tuple[Annotated[int, Field(ge=1, le=30)], ...] = knob(
+        (1, 2), "frames", meaning="distances of the neighbours on either side of the reference frame"
+    )
+    wide_frames: int = knob(6, "frames", 0, 60, meaning="distance of the pair that fills large targets; 0 is none")
+    noise_levels: float = knob(4.0, "grey levels", 0.1, 50, meaning="noise of a flat region (normalized)")
+    gradient_share: float = knob(
+        0.15, "-", 0, 2, meaning="share of the local gradient that counts as noise, for errors of registration"
+    )
+    threshold: float = knob(
+        4.0, "-", 0.1, 255, meaning="a larger difference is foreground: noise units if normalized, else grey levels"
+    )
+    peak: float = knob(7.0, "-", 0, 255, meaning="a target's largest difference reaches at least this, same unit")
     blur_px: Odd = knob(5, "px", 1, 31, meaning="Gaussian kernel on the difference, odd; 1 is none")
+    border_px: int = knob(4, "px", 0, 50, meaning="strip inside a warped frame's border that counts as outside")
 
 
 class MorphologyKnobs(Group):
     """How the silhouette is cleaned (METHOD section 1, S5)."""
 
     erode_px: int = knob(
-        3, "px", 1, 31, meaning="square that erodes the silhouette: precision up, recall down; 1 is none"
+        3, "px", 1, 31, meaning="ellipse that erodes the silhouette: precision up, recall down; 1 is none"
     )
-    close_px: int = knob(15, "px", 1, 101, meaning="square that closes gaps between fragments of one target; 1 is none")
+    close_px: int = knob(
+        25, "px", 1, 101, meaning="ellipse that closes gaps between fragments of one target; 1 is none"
+    )
+    hull: bool = knob(True, "-", meaning="take the convex hull of every blob")
+
+
+class RefineKnobs(Group):
+    """Redrawing a target's outline by its motion and its colours."""
+
+    on: bool = knob(True, "-", meaning="refine outlines; false leaves the blobs of the morphology")
+    spatial_px: float = knob(60.0, "px", 1, 500, meaning="how far evidence spreads where colours do not change")
+    colour_levels: float = knob(80.0, "grey levels", 1, 1000, meaning="change of colour that stops the spread")
+    share: float = knob(0.55, "-", 0.05, 0.95, meaning="share of foreground evidence that makes a pixel foreground")
+
+
+class PersistenceKnobs(Group):
+    """What a blob must show over time to be a target: moving as one, steadily, unlike its surroundings."""
+
+    on: bool = knob(True, "-", meaning="test blobs by flow and persistence; false passes every blob")
+    flow_share: float = knob(0.4, "-", 0, 1, meaning="share of a blob's core that must move steadily for the test")
+    sure_share: float = knob(0.7, "-", 0, 1, meaning="share at which a large blob needs no further frames")
+    links: int = knob(3, "frames", 1, 5, meaning="of two frames before, itself and two after: seen in so many")
+    passes: int = knob(2, "frames", 0, 5, meaning="of those, so many pass the flow test")
+    large_share: float = knob(
+        0.02, "-", 0, 1, meaning="a blob of this share of the picture needs one link and no flow test"
+    )
+
+
+class SmallKnobs(Group):
+    """Small slow targets: weak evidence over a longer gap, confirmed by steady travel."""
+
+    on: bool = knob(True, "-", meaning="look for small slow targets while the interval is long enough")
+    from_interval: int = knob(3, "frames", 1, 60, meaning="shortest interval at which they are looked for")
+    gap_frames: int = knob(3, "frames", 1, 30, meaning="distance of the neighbours on either side")
+    threshold: float = knob(10.0, "grey levels", 1, 255, meaning="a larger difference is a candidate")
+    min_area_px: int = knob(12, "px", 1, 10_000, meaning="smallest candidate")
+    max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
+    max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
+    gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
+    hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate, of twice as many, that confirm a track")
+    min_travel_px: float = knob(4.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
+    misses: int = knob(3, "frames", 0, 30, meaning="frames without a candidate after which a track ends")
 
 
 class HistoryKnobs(Group):
@@ -135,7 +196,7 @@ class HistoryKnobs(Group):
 class GateKnobs(Group):
     """Which blobs can be targets; the bounds in metres hold when telemetry is given (METHOD section 1)."""
 
-    min_area_px: int = knob(100, "px", 1, 1_000_000, meaning="smallest foreground area of a target")
+    min_area_px: int = knob(300, "px", 1, 1_000_000, meaning="smallest foreground area of a target")
     min_size_m: float = knob(0.2, "m", 0, 100, meaning="shortest longer side of a target on the ground")
     max_size_m: float = knob(25.0, "m", 0.1, 1000, meaning="longest longer side of a target on the ground")
     max_speed_m_s: float = knob(60.0, "m/s", 0.1, 500, meaning="fastest target over ground")
@@ -151,6 +212,9 @@ class Settings(Group):
     interval: IntervalKnobs = IntervalKnobs()
     difference: DifferenceKnobs = DifferenceKnobs()
     morphology: MorphologyKnobs = MorphologyKnobs()
+    refine: RefineKnobs = RefineKnobs()
+    persistence: PersistenceKnobs = PersistenceKnobs()
+    small: SmallKnobs = SmallKnobs()
     history: HistoryKnobs = HistoryKnobs()
     gates: GateKnobs = GateKnobs()
 

@@ -117,7 +117,9 @@ def reweighted(
 
 def _ranks_to_points(valid: Bool[Tensor, "B N"], samples: Int64[Tensor, "B S size"]) -> Int64[Tensor, "B S size"]:
     """Spread sample numbers over the valid points alone: number r of N becomes valid point floor(r n / N)."""
-    order = (~valid).to(torch.uint8).argsort(dim=1, stable=True)
+    # Valid points first, in order; unique keys, because a stable sort does not export.
+    place = torch.arange(valid.shape[1], device=valid.device)
+    order = torch.where(valid, place, place + valid.shape[1]).sort(1).indices
     available = valid.sum(1).reshape(-1, 1, 1)
     rank = torch.div(samples * available, valid.shape[1], rounding_mode="floor")
     rank = torch.minimum(rank, (available - 1).clamp(min=0))

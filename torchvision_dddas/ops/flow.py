@@ -90,13 +90,14 @@ class _FromPatch:
         corner = points - (window - 1) / 2
         base = corner.detach().floor()
         # One pixel more on every side for the gradient, one more to the right and below for the interpolation.
-        grey, inside = _gather(image, base.long() - 1, window + 3)
+        grey = _gather(image, base.long() - 1, window + 3)
+        inside = _inside(image, base.long(), window + 1)
         across = grey[..., 2:] - grey[..., :-2]
         down = grey[..., 2:, :] - grey[..., :-2, :]
         along_u = torch.add((across[..., :-2, :] + across[..., 2:, :]) * 3.0, across[..., 1:-1, :], alpha=10.0)
         along_v = torch.add((down[..., :-2] + down[..., 2:]) * 3.0, down[..., 1:-1], alpha=10.0)
         # Like OpenCV: grey is mirrored outside the picture, gradients are zero there.
-        slopes = torch.stack([along_u, along_v], 2) * (inside[..., 1:-1, 1:-1] / 32.0)[:, :, None]
+        slopes = torch.stack([along_u, along_v], 2) * (inside / 32.0)[:, :, None]
         planes = torch.cat([slopes, grey[..., 1:-1, 1:-1][:, :, None]], 2)
         part = (corner - base)[..., None, None, None, :]
         planes = torch.lerp(planes[..., :-1], planes[..., 1:], part[..., 0])
@@ -104,7 +105,7 @@ class _FromPatch:
         gradients = planes[:, :, :2]
         products = gradients @ planes.mT
         uu, uv, vv = products[..., 0, 0], products[..., 0, 1], products[..., 1, 1]
-        smaller = 0.5 * (uu + vv - torch.hypot(uu - vv, 2.0 * uv).detach())
+        smaller = 0.5 * (uu + vv - ((uu - vv).square() + 4.0 * uv.square()).detach().sqrt())
         # OpenCV's unit: grey levels 0..255, Scharr sums 32 times the slope, scaled by 2^-20, per pixel.
         self.textured = smaller.detach() * (255.0**2 / 1024.0 / window**2) >= min_eigen
         determinant = torch.where(self.textured, uu * vv - uv * uv, torch.ones_like(uu))
@@ -154,7 +155,7 @@ def _descend(
 def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float[Tensor, "B N 2 T"]:
     """The displacement that the second frame's patch asks for at each of span x span whole displacements."""
     window = patch.window
-    grey, _ = _gather(image, corner, window + span - 1)
+    grey = _gather(image, corner, window + span - 1)
     batch, count, side = grey.shape[:3]
     # Columns unfolded, rows not: rows of one displacement lie together in memory, so each is one strided product.
     strips = grey.unfold(-1, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
@@ -164,15 +165,23 @@ def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float
     return torch.stack(rows, 2).reshape(batch, count, 2, span * span)
 
 
-def _gather(image: Tensor, corner: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Pixels side x side from each whole corner (u, v), mirrored outside the picture, and where they are inside."""
+def _gather(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side side"]:
+    """Pixels from each whole corner (u, v), mirrored outside the picture."""
     batch, _, height, width = image.shape
     steps = torch.arange(side, device=image.device)
-    columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps
-    inside = ((rows >= 0) & (rows < height))[..., :, None] & ((columns >= 0) & (columns < width))[..., None, :]
-    columns, rows = reflected_index(columns, width), reflected_index(rows, height)
+    columns = reflected_index(corner[..., :1] + steps, width)
+    rows = reflected_index(corner[..., 1:] + steps, height) * width
     frame = torch.arange(batch, device=image.device).reshape(-1, 1, 1) * (height * width)
-    return image.take((rows * width + frame)[..., :, None] + columns[..., None, :]), inside
+    return image.take((rows + frame)[..., :, None] + columns[..., None, :])
+
+
+def _inside(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side side"]:
+    """1 where the pixels from each corner lie in the picture, else 0."""
+    steps = torch.arange(side, device=image.device)
+    columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps
+    along_u = ((columns >= 0) & (columns < image.shape[-1])).to(image.dtype)
+    along_v = ((rows >= 0) & (rows < image.shape[-2])).to(image.dtype)
+    return along_v[..., :, None] * along_u[..., None, :]
 
 
 def _halved(gray: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ def region_orientation(
     angle = orientation_rad.flatten(2)
     vectors = torch.cat([weight * angle.cos(), weight * angle.sin(), weight], 1)
     cos, sin, total = (vectors @ regions.flatten(2).to(history.dtype).mT).unbind(1)
-    found = torch.hypot(cos, sin) > 1e-3 * total.clamp(min=1e-6)
+    found = cos.square() + sin.square() > (1e-3 * total.clamp(min=1e-6)).square()
     return torch.where(found, torch.atan2(sin, cos), torch.zeros_like(cos)), found
 
 

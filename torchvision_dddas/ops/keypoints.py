@@ -55,9 +55,10 @@ def good_features(
     points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
     standing = best > 0
     standing = standing & _undisturbed(points, standing, min_distance_px, rounds)
-    # Move the survivors to the front; they stay in order of score.
+    # Move the survivors to the front, in order of score; unique keys, because a stable sort does not export.
     budget_here = min(budget, taken)
-    order = (~standing).to(torch.uint8).argsort(dim=1, stable=True)[:, :budget_here]
+    place = torch.arange(taken, device=gray.device)
+    order = torch.where(standing, place, place + taken).sort(1).indices[:, :budget_here]
     chosen = points.gather(1, order[..., None].expand(-1, -1, 2))
     filled = standing.gather(1, order)
     missing = budget - budget_here

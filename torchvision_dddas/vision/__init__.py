@@ -1,0 +1,30 @@
+"""Back ends: the same maps of what moves, from torch tensors or from OpenCV."""
+
+from importlib.util import find_spec
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.vision.protocol import Foreground, View, Vision, Window
+
+__all__ = ["Foreground", "View", "Vision", "Window", "load"]
+
+
+def load(backend: str, settings: Settings) -> Vision:
+    """The back end `torch` or `onboard`; `auto` takes onboard, the quicker one for a single stream on a CPU.
+
+    Raises InputError for another name, and for `torch` where the extra is not installed.
+    """
+    if backend in ("auto", "onboard"):
+        from torchvision_dddas.vision.onboard_vision import OnboardVision
+
+        return OnboardVision(settings)
+    if backend != "torch":
+        raise InputError(f"no back end is named '{backend}'; give auto, torch or onboard")
+    if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
+        raise InputError(
+            f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
+            "or take --backend onboard"
+        )
+    from torchvision_dddas.vision.torch_vision import TorchVision
+
+    return TorchVision(settings)
