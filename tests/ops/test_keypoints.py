@@ -74,18 +74,24 @@ def test_only_allowed_pixels_are_chosen_and_set_the_maximum(texture, tensor):
     assert valid.any() and (points[valid][:, 0] < 90).all()
 
 
-def test_grid_features_are_the_best_pixel_of_every_cell(texture, tensor):
+def test_grid_features_are_the_best_pixel_of_every_whole_cell(texture, tensor):
     picture = tensor(texture(2, 37, 53))
     eigen = keypoints.min_eigenvalue(picture)[0, 0]
     points, score, valid = keypoints.grid_features(picture, 16, quality=0.0)
-    assert points.shape == (1, 3 * 4, 2) and valid.all()
-    inner = torch.zeros_like(eigen)
-    inner[1:-1, 1:-1] = eigen[1:-1, 1:-1]
+    assert points.shape == (1, 2 * 3, 2) and valid.all()
     for number, (u, v) in enumerate(points[0].long().tolist()):
-        row, column = divmod(number, 4)
-        cell = inner[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
+        row, column = divmod(number, 3)
+        cell = eigen[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
         assert eigen[v, u] == cell.max() == score[0, number]
         assert (v // 16, u // 16) == (row, column)
+
+
+def test_a_cell_below_the_quality_yields_nothing(texture, tensor):
+    picture = texture(2, 64, 64)
+    picture[:32, :32] = picture[:32, :32] // 16 + 100
+    _, score, valid = keypoints.grid_features(tensor(picture), 32, quality=0.2)
+    assert valid.tolist() == [[False, True, True, True]]
+    assert score[0, 0] == 0
 
 
 def test_a_batch_is_the_same_as_each_picture_alone(texture, tensor):

@@ -4,6 +4,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .borders import reflected
+from .keypoints import box_sum
+
 
 def three_frame(warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
     """|I(t+2dt -> t) - I(t+dt -> t)|: both warped frames, never one against the raw reference (appendix B, eq. 9)."""
@@ -27,8 +30,9 @@ def exposure(
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
-    Each round keeps the pixels whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every
-    `stride`-th pixel is looked at (default: about 80 rows of them). Without inside pixels, or on a frame of one single
+    Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
+    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every `stride`-th pixel is looked at
+    (default: about 80 rows of them). Without inside pixels, or on a frame of one single
     grey, the gain stays 1 (and the offset what the mean asks for).
     """
     if stride is None:
@@ -36,13 +40,10 @@ def exposure(
     wanted = reference[..., ::stride, ::stride].flatten(1)
     given = warped[..., ::stride, ::stride].flatten(1)
     seen = inside[..., ::stride, ::stride].expand(-1, reference.shape[1], -1, -1).flatten(1)
-    middle = ((seen.sum(1, keepdim=True) - 1) // 2).clamp(min=0)
-    gain, offset = torch.ones_like(wanted[:, :1]), torch.zeros_like(wanted[:, :1])
+    gain, offset = torch.ones_like(wanted[:, :1]), masked_median((wanted - given).detach(), seen)
     for _ in range(rounds):
         error = (wanted - gain * given - offset).abs().detach()
-        # A median over the inside pixels alone: sort the others to the end.
-        median = error.masked_fill(~seen, torch.inf).sort(1).values.gather(1, middle)
-        kept = (seen & (error <= (3.7 * median).clamp(min=floor))).to(wanted.dtype)
+        kept = (seen & (error <= (3.7 * masked_median(error, seen)).clamp(min=floor))).to(wanted.dtype)
         count = kept.sum(1, keepdim=True).clamp(min=1.0)
         given_mean = (kept * given).sum(1, keepdim=True) / count
         wanted_mean = (kept * wanted).sum(1, keepdim=True) / count
@@ -53,3 +54,27 @@ def exposure(
         gain = torch.where(fitted, together / torch.where(fitted, spread, one), one)
         offset = wanted_mean - gain * given_mean
     return gain[:, 0], offset[:, 0]
+
+
+def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
+    """Lower median of the values under the mask; 0 where there are none."""
+    if not torch.compiler.is_compiling():
+        # Several times faster than sorting, but a graph cannot hold it.
+        return values.masked_fill(~mask, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(0.0)
+    middle = (mask.sum(1, keepdim=True) - 1) // 2
+    ordered = values.masked_fill(~mask, torch.inf).sort(1).values
+    return torch.where(middle >= 0, ordered.gather(1, middle.clamp(min=0)), torch.zeros_like(ordered[:, :1]))
+
+
+def gradient(levels: Float[Tensor, "B 1 H W"], block: int = 5) -> Float[Tensor, "B 1 H W"]:
+    """Mean gradient magnitude over block x block pixels, 4 x grey levels a pixel, for pictures in whole grey levels.
+
+    Rounded to whole numbers and cut off at 255 before and after the mean, as OpenCV's 8-bit pictures are.
+    """
+    padded = reflected(levels, 1, 1)
+    steep = padded[..., 2:, :] - padded[..., :-2, :]
+    smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
+    across = smooth[..., 2:] - smooth[..., :-2]
+    down = torch.add(steep[..., 2:] + steep[..., :-2], steep[..., 1:-1], alpha=2.0)
+    magnitude = across.square_().addcmul_(down, down).sqrt_().mul_(0.5).round_().clamp_(max=255.0)
+    return (box_sum(magnitude, block) / block**2).round()

@@ -22,7 +22,7 @@ def min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tens
     along_u = smooth[..., 2:] - smooth[..., :-2]
     along_v = torch.add(steep[..., 2:] + steep[..., :-2], steep[..., 1:-1], alpha=2.0)
     products = torch.cat([along_u * along_u, along_v * along_v, along_u * along_v], 1)
-    uu, vv, uv = _box_sum(products, block).split(1, 1)
+    uu, vv, uv = box_sum(products, block).split(1, 1)
     # The floor keeps the gradient of the root finite on a blank picture.
     root = torch.addcmul((0.5 * (uu - vv)).square(), uv, uv).clamp(min=1e-24).sqrt()
     return 0.5 * (uu + vv) - root
@@ -75,17 +75,25 @@ def grid_features(
     quality: float | Float[Tensor, "B"] = 0.01,
     block: int = 3,
     allowed: Bool[Tensor, "B 1 H W"] | None = None,
+    least: float = 1e-7,
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
-    """The best pixel of every cell_px x cell_px cell, row by row: spread over the frame, and faster.
+    """The best pixel of every whole cell_px x cell_px cell, row by row: spread over the frame, and faster.
 
-    N is the number of cells; valid where the cell holds a pixel above quality times the frame's maximum.
+    N is the number of cells that lie in the frame as a whole, which may be none. valid where the cell holds a pixel
+    above quality times the frame's maximum, and above `least`: the rounding that a blank picture shows.
     """
-    score = _above_quality(min_eigenvalue(gray, block), quality, allowed)
-    best, index = functional.max_pool2d(score, cell_px, cell_px, ceil_mode=True, return_indices=True)
+    eigen = min_eigenvalue(gray, block)
+    admitted = eigen if allowed is None else eigen * allowed
+    (height, width), batch = gray.shape[-2:], len(gray)
+    rows, columns = height // cell_px, width // cell_px
+    if not rows or not columns:
+        return gray.new_zeros(batch, 0, 2), gray.new_zeros(batch, 0), gray.new_zeros(batch, 0, dtype=torch.bool)
+    best, index = functional.max_pool2d(admitted, cell_px, cell_px, return_indices=True)
     best, index = best.flatten(1), index.flatten(1)
-    width = gray.shape[-1]
     points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
-    return points, best, best > 0
+    share = torch.as_tensor(quality, dtype=eigen.dtype, device=eigen.device).reshape(-1, 1)
+    valid = best > (share * admitted.flatten(1).amax(1, keepdim=True)).clamp(min=least)
+    return points, best * valid, valid
 
 
 def _above_quality(eigen: Tensor, quality: float | Tensor, allowed: Tensor | None) -> Tensor:
@@ -128,7 +136,7 @@ def _closer(these: Tensor, those: Tensor, distance_px: float) -> Tensor:
     return difference[..., 0].square() + difference[..., 1].square() < distance_px**2
 
 
-def _box_sum(values: Tensor, block: int) -> Tensor:
+def box_sum(values: Tensor, block: int) -> Tensor:
     """Sum over block x block pixels, mirrored at the edges, anchored where OpenCV's box filter is."""
     padded = reflected(values, block // 2, block - 1 - block // 2)
     for dim in (-2, -1):

@@ -1,0 +1,161 @@
+"""From one window's foreground to targets: blobs, their motion, their persistence, their outlines."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.targets.blobs import Blob, find_blobs
+from torchvision_dddas.targets.grouping import groups
+from torchvision_dddas.targets.layers import refine
+from torchvision_dddas.targets.motion import DenseFlow, Motion, blob_motion
+from torchvision_dddas.targets.persistence import Sighting, persistent
+from torchvision_dddas.types import Detections
+from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, View
+
+
+@dataclass(frozen=True)
+class Found:
+    """One target of a frame. box: x, y, width, height. mask: (height, width) bool inside the box."""
+
+    box: tuple[int, int, int, int]
+    mask: np.ndarray
+    velocity_px: np.ndarray
+    score: float
+
+
+@dataclass
+class Observation:
+    """What one frame showed, before it is judged. `foreground` and `view` are dropped once its targets are drawn."""
+
+    view: View | None
+    foreground: Foreground | None
+    blobs: list[Blob] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    targets: list[Found] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def observe(view: View, foreground: Foreground, flow: DenseFlow, settings: Settings) -> Observation:
+    """The blobs of a window's reference frame and how each of them moves."""
+    knobs = settings.difference
+    scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
+    blobs = find_blobs(
+        foreground.core,
+        foreground.evidence,
+        knobs.threshold * scale,
+        settings.gates.min_area_px,
+        knobs.peak * scale,
+        settings.morphology.hull,
+    )
+    motions: list[Motion] = []
+    if blobs and (settings.persistence.on or settings.refine.on):
+        flows = flow(view.grey, foreground.warped)
+        motions = [blob_motion(blob, flows, foreground.offsets) for blob in blobs]
+    return Observation(view, foreground, blobs, motions)
+
+
+def draw_targets(
+    observations: Sequence[Observation], steps: Sequence[np.ndarray | None], index: int, settings: Settings
+) -> list[Found]:
+    """The targets of `observations[index]`: the blobs that persist, with refined outlines, fragments joined.
+
+    steps: registration from each observation to the next, None at a cut.
+    """
+    here = observations[index]
+    if here.view is None or here.foreground is None or not here.blobs:
+        return []
+    kept = [True] * len(here.blobs)
+    if settings.persistence.on:
+        sightings = [Sighting(o.blobs, o.motions, step) for o, step in zip(observations, [*steps, None], strict=False)]
+        kept = persistent(sightings, index, here.view.size, settings.persistence)
+    found = []
+    for i, (blob, keep) in enumerate(zip(here.blobs, kept, strict=True)):
+        if not keep:
+            continue
+        motion = here.motions[i] if here.motions else None
+        mask = blob.mask
+        if settings.refine.on and motion is not None:
+            mask = _refined(blob, motion, here, settings)
+        velocity = motion.velocity_px if motion is not None else np.full(2, np.nan)
+        found += _parts(blob, mask, velocity, settings)
+    return join(found)
+
+
+def _refined(blob: Blob, motion: Motion, here: Observation, settings: Settings) -> np.ndarray:
+    view, foreground = here.view, here.foreground
+    assert view is not None and foreground is not None
+    return refine(
+        blob,
+        motion,
+        view.image,
+        view.grey,
+        foreground.evidence,
+        foreground.wide,
+        foreground.texture,
+        foreground.warped,
+        EVIDENCE_SCALE,
+        settings,
+    )
+
+
+def _parts(blob: Blob, mask: np.ndarray, velocity_px: np.ndarray, settings: Settings) -> list[Found]:
+    """The connected parts of a refined mask that are large enough to be targets of their own."""
+    import cv2
+
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
+    parts = []
+    for label in range(1, count):
+        left, top, width, height, area = (int(v) for v in stats[label])
+        if area < settings.gates.min_area_px / 2:
+            continue
+        part = labels[top : top + height, left : left + width] == label
+        box = (blob.box[0] + left, blob.box[1] + top, width, height)
+        parts.append(Found(box, part, velocity_px, score_of(blob.peak, settings)))
+    return parts
+
+
+def score_of(peak: float, settings: Settings) -> float:
+    """A confidence in [0, 1) that grows with the peak of evidence over the threshold."""
+    scale = EVIDENCE_SCALE if settings.difference.kind == "normalized" else 1.0
+    return float(1 - np.exp(-peak / (2 * settings.difference.threshold * scale)))
+
+
+def join(found: Sequence[Found]) -> list[Found]:
+    """Fragments of one mover as one target."""
+    if len(found) < 2:
+        return list(found)
+    joined = []
+    boxes, velocities = np.array([f.box for f in found], float), np.array([f.velocity_px for f in found])
+    for members in groups(boxes, velocities):
+        if len(members) == 1:
+            joined.append(found[members[0]])
+            continue
+        parts = [found[i] for i in members]
+        left, top = min(p.box[0] for p in parts), min(p.box[1] for p in parts)
+        right, bottom = max(p.box[0] + p.box[2] for p in parts), max(p.box[1] + p.box[3] for p in parts)
+        mask = np.zeros((bottom - top, right - left), bool)
+        for x, y, width, height, part in ((*p.box, p.mask) for p in parts):
+            mask[y - top : y - top + height, x - left : x - left + width] |= part
+        largest = max(parts, key=lambda p: int(p.mask.sum()))
+        box = (left, top, right - left, bottom - top)
+        joined.append(Found(box, mask, largest.velocity_px, max(p.score for p in parts)))
+    return joined
+
+
+def table(found: Sequence[Found], size: tuple[int, int]) -> tuple[Detections, np.ndarray]:
+    """The targets as a table and as a (H, W) uint16 mask whose value i + 1 is row i. size: (width, height)."""
+    mask = np.zeros((size[1], size[0]), np.uint16)
+    for i, target in enumerate(found):
+        x, y, width, height = target.box
+        mask[y : y + height, x : x + width][target.mask] = i + 1
+    velocity = np.array([f.velocity_px for f in found]).reshape(-1, 2)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    return Detections(
+        box_px=np.array([f.box for f in found], float).reshape(-1, 4),
+        score=np.array([f.score for f in found], float),
+        area_px=np.array([f.mask.sum() for f in found], float),
+        heading_rad=np.where(speed > 0, np.arctan2(velocity[:, 1], velocity[:, 0]), np.nan),
+        speed_px=speed,
+    ), mask

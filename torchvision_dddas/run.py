@@ -1,0 +1,341 @@
+"""The loop: frames in, scenes out, and what is found steers how the next frames are looked at."""
+
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from torchvision_dddas import control, windows
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.pipeline import Found, Observation, draw_targets, observe, table
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.targets.motion import DenseFlow
+from torchvision_dddas.targets.projective import chain
+from torchvision_dddas.targets.small import SmallTracks, candidates
+from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.vision.protocol import View, Vision, Window
+
+
+class Clip(Protocol):
+    """What the loop needs of a source."""
+
+    rate_hz: float
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+@dataclass
+class _Slot:
+    """One frame on its way through the loop. step: registration to the next frame; None until known or at the end."""
+
+    frame: Frame
+    view: View
+    step: Registration | None = None
+    interval: int = 0
+    adjustments: tuple[Adjustment, ...] = ()
+    observation: Observation | None = None
+    small: list[Found] = field(default_factory=list)
+    cause: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def run(
+    source: Clip, vision: Vision, settings: Settings, telemetry: Telemetry | None = None, batch: int | None = None
+) -> Iterator[Scene]:
+    """A scene for every frame number of the clip, in order.
+
+    Frames that could not be read, or whose registration cannot be trusted, give empty scenes flagged unreliable.
+    batch: windows given to the back end at once; the result does not depend on it. None takes 8 for torch, else 1.
+    Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
+    """
+    loop = Loop(vision, settings, source.rate_hz, telemetry, batch or (8 if vision.name == "torch" else 1))
+    for frame in source:
+        yield from loop.feed(frame)
+    yield from loop.end()
+
+
+class Loop:
+    """The state of a run: the frames in flight, the interval, the small tracks. Feed it frames in order."""
+
+    def __init__(
+        self, vision: Vision, settings: Settings, rate_hz: float, telemetry: Telemetry | None = None, batch: int = 1
+    ) -> None:
+        self.vision, self.settings, self.rate_hz, self.telemetry, self.batch = vision, settings, rate_hz, telemetry, batch
+        self.slots: deque[_Slot] = deque()
+        self.first = 0  # index of slots[0]; indices count frames read
+        self.registered = 0  # slots below this index have their step
+        self.observed = 0
+        self.drawn = 0
+        self.emitted = 0
+        self.total = 0
+        self.last_number = 0
+        self.ended = False
+        self.interval = settings.interval.frames
+        self.flows: deque[float] = deque(maxlen=settings.interval.memory_frames)
+        self.flow = DenseFlow()
+        self.tracks = SmallTracks(settings.small)
+
+    def feed(self, frame: Frame) -> Iterator[Scene]:
+        """Take one frame; yields the scenes that are settled by it."""
+        start = time.perf_counter()
+        slot = _Slot(frame, self.vision.prepare(frame.image))
+        slot.seconds["prepare"] = time.perf_counter() - start
+        self.slots.append(slot)
+        self.total += 1
+        if self.total - self.registered > self.batch:
+            yield from self._advance()
+
+    def end(self) -> Iterator[Scene]:
+        """The clip is over: settle everything that is left."""
+        wanted = 3
+        if self.total < wanted:
+            few = "no frame" if self.total == 0 else f"{self.total} frame" + "s" * (self.total > 1)
+            raise InputError(
+                f"the clip has {few} that can be read, a window needs {wanted}: {wanted - self.total} missing"
+            )
+        self.ended = True
+        yield from self._advance()
+
+    def _advance(self) -> Iterator[Scene]:
+        self._register()
+        while ready := self._ready():
+            self._observe(ready)
+        yield from self._settle()
+
+    def _at(self, index: int) -> _Slot:
+        return self.slots[index - self.first]
+
+    # -- registration ------------------------------------------------------------------------------------------------
+
+    def _register(self) -> None:
+        """The steps between successive frames, all that can be had now."""
+        todo = [self._at(i) for i in range(self.registered, self.total)]
+        if len(todo) < 2:
+            return
+        start = time.perf_counter()
+        steps = []
+        for i in range(0, len(todo) - 1, self.batch):
+            part = todo[i : i + self.batch + 1]
+            steps += self.vision.register([(a.view, b.view) for a, b in zip(part, part[1:], strict=False)])
+        spent = (time.perf_counter() - start) / len(steps)
+        for slot, step in zip(todo, steps, strict=False):
+            slot.step = step
+            slot.seconds["register"] = spent
+        self.registered += len(steps)
+
+    def _joined(self, index: int) -> bool:
+        """Whether frame `index` and the next hang together."""
+        slot = self._at(index)
+        return slot.step is not None and slot.step.reliable
+
+    def _stretch(self, index: int, back: int, ahead: int) -> tuple[int, int]:
+        """The first and last frame that hang together with `index`, at most so many frames away."""
+        first = last = index
+        while first > max(self.first, index - back) and self._joined(first - 1):
+            first -= 1
+        while last < min(self.registered, index + ahead) and self._joined(last):
+            last += 1
+        return first, last
+
+    # -- observation -------------------------------------------------------------------------------------------------
+
+    def _ready(self) -> list[int]:
+        """Up to `batch` frames whose windows are complete."""
+        ready: list[int] = []
+        while len(ready) < self.batch and self.observed + len(ready) < self.total:
+            index = self.observed + len(ready)
+            slot = self._at(index)
+            if not slot.interval:
+                if slot.step is None and not self.ended:
+                    break
+                self._steer(index, slot)
+            ahead = windows.reach(slot.interval, self.settings)
+            if not self.ended and self.registered < index + ahead:
+                break
+            ready.append(index)
+        # Whole batches only while the clip runs: an engine that batches is as quick for eight windows as for four.
+        return ready if self.ended or len(ready) == self.batch else []
+
+    def _steer(self, index: int, slot: _Slot) -> None:
+        """The feedback rule for the detection interval."""
+        knobs = self.settings.interval
+        if slot.step is not None and slot.step.reliable:
+            self.flows.append(slot.step.flow_px)
+        if knobs.rule:
+            wanted, why = None, ""
+            if self.telemetry is not None:
+                wanted, why = self._wanted_by_telemetry(slot)
+            if wanted is None and self.flows:
+                wanted = control.interval_from_flow(self.flows, slot.view.size[0], knobs)
+                why = f"background flow {np.median(self.flows):.2f} px a frame"
+            if wanted is not None:
+                self.interval, slot.adjustments = control.adjusted(slot.frame.number, self.interval, wanted, why, knobs)
+        slot.interval = self.interval
+
+    def _wanted_by_telemetry(self, slot: _Slot) -> tuple[float | None, str]:
+        from torchvision_dddas.sources.telemetry import at
+
+        assert self.telemetry is not None
+        flight = at(self.telemetry, slot.frame.time_s)
+        if flight is None:
+            return None, ""
+        wanted = control.interval_from_telemetry(
+            flight.altitude_m, flight.speed_m_s, self.rate_hz, self.settings.interval
+        )
+        return wanted, f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+
+    def _observe(self, ready: list[int]) -> None:
+        start = time.perf_counter()
+        made: list[tuple[int, Window]] = []
+        for index in ready:
+            window = self._window(index)
+            if window is None:
+                self._at(index).observation = Observation(None, None)
+            else:
+                made.append((index, window))
+        foregrounds = self.vision.foreground([window for _, window in made]) if made else []
+        spent = (time.perf_counter() - start) / max(len(made), 1)
+        for (index, window), foreground in zip(made, foregrounds, strict=True):
+            slot = self._at(index)
+            start = time.perf_counter()
+            slot.observation = observe(window.reference, foreground, self.flow, self.settings)
+            slot.seconds |= {"foreground": spent, "blobs": time.perf_counter() - start}
+        for index in ready:
+            self._follow_small(index)
+            self.observed = index + 1
+            self._draw()
+
+    def _window(self, index: int) -> Window | None:
+        slot = self._at(index)
+        back = max(self.settings.difference.wide_frames, 2 * slot.interval, 2 * max(self.settings.difference.near_frames))
+        first, last = self._stretch(index, back, 2 * slot.interval)
+        near, wide, small = windows.pairs(index, slot.interval, first, last, self.settings)
+        if not near:
+            slot.cause = self._why_alone(index)
+            return None
+        used = sorted({i for pair in [*near, wide, small] if pair for i in pair})
+        place = {i: k for k, i in enumerate(used)}
+        places = lambda pair: (place[pair[0]], place[pair[1]])  # noqa: E731
+        return Window(
+            slot.view,
+            tuple(self._at(i).view for i in used),
+            np.array([self._neighbour_from_reference(index, i) for i in used]),
+            tuple(i - index for i in used),
+            tuple(places(pair) for pair in near),
+            places(wide) if wide else None,
+            places(small) if small else None,
+        )
+
+    def _neighbour_from_reference(self, index: int, other: int) -> np.ndarray:
+        low, high = min(index, other), max(index, other)
+        steps = [self._at(i).step for i in range(low, high)]
+        high_from_low = chain([step.later_from_earlier for step in steps if step is not None])
+        return high_from_low if other > index else np.linalg.inv(high_from_low)
+
+    def _why_alone(self, index: int) -> str:
+        step = self._at(index).step or (self._at(index - 1).step if index > self.first else None)
+        if step is not None and not step.reliable:
+            return step.cause
+        before = self._at(index - 1).step if index > self.first else None
+        if before is not None and not before.reliable:
+            return before.cause
+        return "too few frames hang together with it"
+
+    def _follow_small(self, index: int) -> None:
+        slot = self._at(index)
+        if not self.settings.small.on:
+            return
+        start = time.perf_counter()
+        before = self._at(index - 1).step if index > self.first else None
+        linked = before is not None and before.reliable
+        observation = slot.observation
+        boxes = []
+        if observation is not None and observation.foreground is not None and observation.foreground.small is not None:
+            boxes = candidates(observation.foreground.small, self.settings.small)
+        self.tracks.step(index, before.later_from_earlier if before is not None and linked else None, boxes)
+        slot.seconds["small"] = time.perf_counter() - start
+
+    # -- targets -----------------------------------------------------------------------------------------------------
+
+    def _draw(self) -> None:
+        """Draw the targets of frames whose two followers have been observed."""
+        while self.drawn < self.observed and (self.drawn + 2 < self.observed or self.observed == self.total):
+            if self.observed == self.total and not self.ended and self.drawn + 2 >= self.observed:
+                return
+            index = self.drawn
+            start = time.perf_counter()
+            low = max(index - 2, self.first)
+            around = range(low, min(index + 3, self.observed))
+            observations = [self._at(i).observation or Observation(None, None) for i in around]
+            steps = [self._step(i) for i in around]
+            slot = self._at(index)
+            assert slot.observation is not None
+            slot.observation.targets = draw_targets(observations, steps, index - low, self.settings)
+            slot.observation.view = slot.observation.foreground = None
+            slot.seconds["outline"] = time.perf_counter() - start
+            self.drawn += 1
+
+    def _step(self, index: int) -> np.ndarray | None:
+        step = self._at(index).step
+        return step.later_from_earlier if step is not None and step.reliable else None
+
+    def _settle(self) -> Iterator[Scene]:
+        """Yield the scenes on which no later frame has a say any more, and forget what no window needs again."""
+        while self.emitted < self.drawn:
+            slot = self._at(self.emitted)
+            if not self.ended and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
+                break
+            yield from self._gap(slot.frame)
+            yield self._scene(slot, self.emitted)
+            slot.view.image = slot.view.grey  # the colours are not needed again
+            self.emitted += 1
+            memory = max(2 * self.settings.interval.maximum_frames, self.settings.difference.wide_frames, 8)
+            while self.first < self.emitted - memory:
+                self.slots.popleft()
+                self.first += 1
+
+    def _gap(self, frame: Frame) -> Iterator[Scene]:
+        """Empty scenes for frame numbers that could not be read."""
+        for number in range(self.last_number + 1, frame.number):
+            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros_like(frame.image))
+            mask = np.zeros(frame.image.shape[:2], np.uint16)
+            detections, _ = table([], (mask.shape[1], mask.shape[0]))
+            yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
+        self.last_number = frame.number
+
+    def _scene(self, slot: _Slot, index: int) -> Scene:
+        observation = slot.observation
+        assert observation is not None
+        found = list(observation.targets or [])
+        found += self._small_targets(index, found)
+        detections, mask = table(found, slot.view.size)
+        return Scene(
+            slot.frame, mask, detections, slot.interval, not slot.cause, slot.cause, slot.adjustments, slot.seconds
+        )
+
+    def _small_targets(self, index: int, found: list[Found]) -> list[Found]:
+        """Confirmed small tracks seen in this frame, where no other target covers them."""
+        extra = []
+        for track in self.tracks.confirmed():
+            if index not in track.frames:
+                continue
+            x, y, width, height = box = track.boxes[track.frames.index(index)]
+            centre = x + width / 2, y + height / 2
+            if any(
+                f.box[0] <= centre[0] <= f.box[0] + f.box[2] and f.box[1] <= centre[1] <= f.box[1] + f.box[3]
+                for f in found
+            ):
+                continue
+            extra.append(Found(box, np.ones((height, width), bool), track.velocity_px, 0.5))
+        return extra
+
+
+def scenes(frames: Iterable[Frame], vision: Vision, settings: Settings, rate_hz: float = 10.0) -> Iterator[Scene]:
+    """`run` on frames at hand."""
+    loop = Loop(vision, settings, rate_hz)
+    for frame in frames:
+        yield from loop.feed(frame)
+    yield from loop.end()

@@ -1,0 +1,86 @@
+"""From a mask to blobs: labelling, gates, hulls."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A connected region of the core mask.
+
+    box: x, y, width, height in pixels. mask: (height, width) bool, its region (or its convex hull) inside the box.
+    core: (height, width) bool, the pixels that are certain. peak: largest evidence in it.
+    """
+
+    box: tuple[int, int, int, int]
+    mask: np.ndarray
+    core: np.ndarray
+    peak: float
+
+    @property
+    def area_px(self) -> int:
+        """Pixels of the mask."""
+        return int(self.mask.sum())
+
+    @property
+    def centre_px(self) -> np.ndarray:
+        """(2,) centre of the box."""
+        x, y, width, height = self.box
+        return np.array([x + (width - 1) / 2, y + (height - 1) / 2])
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the box in the picture."""
+        x, y, width, height = self.box
+        return slice(y, y + height), slice(x, x + width)
+
+
+def find_blobs(
+    core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool
+) -> list[Blob]:
+    """Connected regions (8 neighbours) of `core` with enough area and a high enough peak of evidence.
+
+    core, evidence: (H, W) uint8. Evidence above `threshold` makes a pixel of a region certain. A hull that contains
+    another region's hull swallows it.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(core, ltype=cv2.CV_32S)
+    blobs = []
+    for label in range(1, count):
+        x, y, width, height, area = (int(v) for v in stats[label])
+        if area < min_area_px:
+            continue
+        window = np.s_[y : y + height, x : x + width]
+        region = labels[window] == label
+        seen = evidence[window]
+        if (highest := float(seen[region].max())) < peak:
+            continue
+        mask = filled_hull(region) if hull else region
+        blobs.append(Blob((x, y, width, height), mask, region & (seen > threshold), highest))
+    return _without_swallowed(blobs) if hull else blobs
+
+
+def filled_hull(region: np.ndarray) -> np.ndarray:
+    """The convex hull of the true pixels of a (h, w) mask, as a mask of the same shape."""
+    points = cv2.findNonZero(region.astype(np.uint8))
+    canvas = np.zeros(region.shape, np.uint8)
+    if points is not None:
+        cv2.fillConvexPoly(canvas, cv2.convexHull(points), 1)
+    return canvas > 0
+
+
+def _without_swallowed(blobs: list[Blob]) -> list[Blob]:
+    kept: list[Blob] = []
+    for blob in sorted(blobs, key=lambda b: -b.box[2] * b.box[3]):
+        x, y, width, height = blob.box
+        if not any(_contains(other, x, y, width, height) for other in kept):
+            kept.append(blob)
+    return kept
+
+
+def _contains(other: Blob, x: int, y: int, width: int, height: int) -> bool:
+    ox, oy, ow, oh = other.box
+    if x < ox or y < oy or x + width > ox + ow or y + height > oy + oh:
+        return False
+    return bool(other.mask[y - oy : y - oy + height, x - ox : x - ox + width].mean() > 0.9)

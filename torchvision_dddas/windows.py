@@ -1,0 +1,69 @@
+"""Which frames a window looks at: its neighbours in time, within a stretch of frames that hang together."""
+
+from collections.abc import Callable
+
+from torchvision_dddas.settings import Settings
+
+Pair = tuple[int, int]
+
+
+def reach(interval: int, settings: Settings) -> int:
+    """How many frames ahead of its reference a window looks, never more than the source's two intervals."""
+    if settings.difference.kind == "between_later":
+        return 2 * interval
+    near = max(settings.difference.near_frames)
+    wide = min(settings.difference.wide_frames, max(2 * interval - 2, 0))
+    small = settings.small.gap_frames if small_looked_for(interval, settings) else 0
+    return max(near, wide, small)
+
+
+def delay(interval: int, settings: Settings) -> int:
+    """How many further frames are observed before a frame's targets are settled; with `reach`, two intervals at most."""
+    if settings.persistence.on or settings.small.on:
+        return max(2, 2 * interval - reach(interval, settings))
+    return 0
+
+
+def small_looked_for(interval: int, settings: Settings) -> bool:
+    """Small slow targets show only over a long interval."""
+    return settings.small.on and interval >= settings.small.from_interval
+
+
+def pairs(
+    at: int, interval: int, first: int, last: int, settings: Settings
+) -> tuple[list[Pair], Pair | None, Pair | None]:
+    """(near pairs, wide pair, small pair) of frame indices for reference `at`, within first..last; near may be empty.
+
+    A window looks both ways where it can; at the ends of a stretch it looks one way only.
+    """
+    knobs = settings.difference
+    if knobs.kind == "between_later":
+        return [p for p in [_forward(at, interval, first, last)] if p], None, None
+    ahead = min(last, at + 2 * interval)
+    near = [p for gap in knobs.near_frames if (p := _symmetric(at, gap, first, ahead))]
+    if not near and (p := _symmetric(at, 1, first, ahead)):
+        near = [p]
+    near = list(dict.fromkeys(near))
+    wide = None
+    if knobs.wide_frames and near:
+        forward = min(knobs.wide_frames, max(2 * interval - 2, 0), ahead - at)
+        back = min(knobs.wide_frames, at - first)
+        wide = (at - back, at + forward) if back >= 3 and forward >= 2 else _symmetric(at, knobs.wide_frames, first, ahead)
+        wide = wide or next((p for gap in (5, 4, 3) if (p := _symmetric(at, gap, first, ahead))), None)
+    small = _symmetric(at, settings.small.gap_frames, first, ahead) if small_looked_for(interval, settings) else None
+    return near, wide, small
+
+
+def _symmetric(at: int, gap: int, first: int, last: int) -> Pair | None:
+    tries = ((at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap))
+    return next((p for p in tries if first <= min(p) and max(p) <= last), None)
+
+
+def _forward(at: int, gap: int, first: int, last: int) -> Pair | None:
+    tries: tuple[Callable[[int], Pair], ...] = (lambda g: (at + g, at + 2 * g), lambda g: (at - g, at - 2 * g))
+    for smaller in range(gap, 0, -1):
+        for make in tries:
+            pair = make(smaller)
+            if first <= min(pair) and max(pair) <= last:
+                return pair
+    return None
