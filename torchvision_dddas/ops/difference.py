@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .blur import box_sum
 from .borders import reflected
-from .keypoints import box_sum
 
 
 def three_frame(warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from .blur import box_sum
 from .borders import reflected
 from .morphology import dilate
 
@@ -134,15 +135,3 @@ def _undisturbed(points: Tensor, standing: Tensor, min_distance_px: float, round
 def _closer(these: Tensor, those: Tensor, distance_px: float) -> Tensor:
     difference = these[:, :, None] - those[:, None]
     return difference[..., 0].square() + difference[..., 1].square() < distance_px**2
-
-
-def box_sum(values: Tensor, block: int) -> Tensor:
-    """Sum over block x block pixels, mirrored at the edges, anchored where OpenCV's box filter is."""
-    padded = reflected(values, block // 2, block - 1 - block // 2)
-    for dim in (-2, -1):
-        size = padded.shape[dim] - block + 1
-        total = padded.narrow(dim, 0, size)
-        for shift in range(1, block):
-            total = total + padded.narrow(dim, shift, size)
-        padded = total
-    return padded
