@@ -160,6 +160,9 @@ class PersistenceKnobs(Group):
     large_share: float = knob(
         0.02, "-", 0, 1, meaning="a blob of this share of the picture needs one link and no flow test"
     )
+    trusted_blobs: int = knob(
+        4, "blobs", 0, 1000, meaning="where no more blobs are seen a frame, one link does: parallax comes in crowds"
+    )
 
 
 class SmallKnobs(Group):
@@ -181,6 +184,9 @@ class SmallKnobs(Group):
 class HistoryKnobs(Group):
     """The motion history, its gradient and the segmentation by motion (METHOD section 1, S5)."""
 
+    on: bool = knob(
+        True, "-", meaning="heading and speed from the history where the chain computes no flow; part touching targets"
+    )
     duration_frames: float = knob(6.0, "frames", 1, 120, meaning="how long a silhouette stays in the history")
     delta_min_frames: float = knob(
         0.5, "frames", 0, 60, meaning="smallest difference of time stamps that makes a gradient"
@@ -202,6 +208,12 @@ class GateKnobs(Group):
     max_speed_m_s: float = knob(60.0, "m/s", 0.1, 500, meaning="fastest target over ground")
     focal_px: float = knob(
         1000.0, "px", 10, 100_000, meaning="focal length: px bounds are metric bounds x focal / altitude"
+    )
+    expected_size_m: float = knob(
+        1.7, "m", 0.05, 100, meaning="size of a typical small target: sets the smallest area when telemetry is given"
+    )
+    expected_share: float = knob(
+        0.1, "-", 0.01, 1, meaning="share of the expected target's square that its foreground fills at least"
     )
 
 

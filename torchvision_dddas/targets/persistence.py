@@ -34,6 +34,7 @@ def persistent(
     per blob, not per pixel, is what keeps targets whole.
     """
     middle = sightings[index]
+    crowded = np.median([len(s.blobs) for s in sightings]) > knobs.trusted_blobs
     verdicts = []
     for blob, motion in zip(middle.blobs, middle.motions, strict=True):
         members, passes = 1, int(motion.steady > knobs.flow_share)
@@ -49,7 +50,8 @@ def persistent(
         possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
         share = blob.area_px / (size[0] * size[1])
         steady = members >= min(knobs.links, possible) and passes >= min(knobs.passes, possible)
-        large = share >= knobs.large_share and (members >= 2 or possible < 2)
+        trusted = share >= knobs.large_share if crowded else True
+        large = trusted and (members >= 2 or possible < 2)
         sure = motion.steady > knobs.sure_share and share >= knobs.large_share / 10
         verdicts.append(bool(steady or large or sure))
     return verdicts
