@@ -7,10 +7,14 @@ import numpy as np
 
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.targets.blobs import Blob, find_blobs
+from torchvision_dddas.targets.gates import Gates
 from torchvision_dddas.targets.grouping import groups
+from torchvision_dddas.targets.history import MotionHistory
 from torchvision_dddas.targets.layers import refine
-from torchvision_dddas.targets.motion import DenseFlow, Motion, blob_motion
+from torchvision_dddas.targets.motion import DenseFlow, Motion, blob_motion, only_velocity
+from torchvision_dddas.targets.parting import parted_by_flow
 from torchvision_dddas.targets.persistence import Sighting, persistent
+from torchvision_dddas.targets.segmentation import moving_parts
 from torchvision_dddas.types import Detections
 from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, View
 
@@ -37,8 +41,13 @@ class Observation:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-def observe(view: View, foreground: Foreground, flow: DenseFlow, settings: Settings) -> Observation:
-    """The blobs of a window's reference frame and how each of them moves."""
+def observe(
+    view: View, foreground: Foreground, flow: DenseFlow, settings: Settings, history: MotionHistory | None = None
+) -> Observation:
+    """The blobs of a window's reference frame and how each of them moves.
+
+    history: moved on to this frame; it tells the motions where the settings ask for no dense flow.
+    """
     knobs = settings.difference
     scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
     blobs = find_blobs(
@@ -52,7 +61,13 @@ def observe(view: View, foreground: Foreground, flow: DenseFlow, settings: Setti
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)
+        if settings.history.on:
+            blobs = [part for blob in blobs for part in parted_by_flow(blob, flows, foreground.offsets)]
         motions = [blob_motion(blob, flows, foreground.offsets) for blob in blobs]
+    elif history is not None:
+        history.add(foreground.core)
+        parts = [part for blob in blobs for part in moving_parts(blob, history, view.size, settings.history)]
+        blobs, motions = [part.blob for part in parts], [only_velocity(part.velocity_px) for part in parts]
     return Observation(view, foreground, blobs, motions)
 
 
@@ -142,6 +157,11 @@ def join(found: Sequence[Found]) -> list[Found]:
         box = (left, top, right - left, bottom - top)
         joined.append(Found(box, mask, largest.velocity_px, max(p.score for p in parts)))
     return joined
+
+
+def admitted(found: Sequence[Found], gates: Gates | None) -> list[Found]:
+    """The targets that the gates let through; all of them without gates."""
+    return [f for f in found if gates is None or gates.admit(f.box[2], f.box[3], f.velocity_px)]
 
 
 def table(found: Sequence[Found], size: tuple[int, int]) -> tuple[Detections, np.ndarray]:

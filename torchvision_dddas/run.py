@@ -10,8 +10,10 @@ import numpy as np
 
 from torchvision_dddas import control, windows
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.pipeline import Found, Observation, draw_targets, observe, table
+from torchvision_dddas.pipeline import Found, Observation, admitted, draw_targets, observe, table
 from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.telemetry import Flight, at
+from torchvision_dddas.targets.history import MotionHistory
 from torchvision_dddas.targets.motion import DenseFlow
 from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.small import SmallTracks, candidates
@@ -35,6 +37,7 @@ class _Slot:
     view: View
     step: Registration | None = None
     interval: int = 0
+    regime: control.Regime | None = None
     adjustments: tuple[Adjustment, ...] = ()
     observation: Observation | None = None
     small: list[Found] = field(default_factory=list)
@@ -51,10 +54,27 @@ def run(
     batch: windows given to the back end at once; the result does not depend on it. None takes 8 for torch, else 1.
     Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
     """
+    count = getattr(source, "count", None)
+    if telemetry is not None and count:
+        _check_overlap(telemetry, (count - 1) / source.rate_hz)
     loop = Loop(vision, settings, source.rate_hz, telemetry, batch or (8 if vision.name == "torch" else 1))
+    last_s = 0.0
     for frame in source:
+        last_s = frame.time_s
         yield from loop.feed(frame)
+    if telemetry is not None:
+        _check_overlap(telemetry, last_s)
     yield from loop.end()
+
+
+def _check_overlap(telemetry: Telemetry, last_s: float) -> None:
+    """Raises InputError for telemetry that tells nothing about a clip from 0 to last_s."""
+    from_s, to_s = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
+    if at(telemetry, 0.0) is None and at(telemetry, last_s) is None and not 0 <= from_s <= last_s:
+        raise InputError(
+            f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to {last_s:.1f} s; they do not overlap: "
+            "count time_s from the clip's first frame"
+        )
 
 
 class Loop:
@@ -77,6 +97,9 @@ class Loop:
         self.flows: deque[float] = deque(maxlen=settings.interval.memory_frames)
         self.flow = DenseFlow()
         self.tracks = SmallTracks(settings.small)
+        self.regime = control.Regime(settings)
+        self.history = MotionHistory(settings.history.duration_frames)
+        self.remembered = 0  # frames below this index are in the history
 
     def feed(self, frame: Frame) -> Iterator[Scene]:
         """Take one frame; yields the scenes that are settled by it."""
@@ -162,30 +185,29 @@ class Loop:
     def _steer(self, index: int, slot: _Slot) -> None:
         """The feedback rule for the detection interval."""
         knobs = self.settings.interval
+        flight = self._flight(slot)
+        altitude = flight.altitude_m if flight else None
+        number = slot.frame.number
+        self.regime, slot.adjustments = control.steered(number, self.regime, altitude, self.rate_hz, self.settings)
+        slot.regime = self.regime
         if slot.step is not None and slot.step.reliable:
             self.flows.append(slot.step.flow_px)
         if knobs.rule:
             wanted, why = None, ""
-            if self.telemetry is not None:
-                wanted, why = self._wanted_by_telemetry(slot)
+            if flight is not None:
+                wanted = control.interval_from_telemetry(flight.altitude_m, flight.speed_m_s, self.rate_hz, knobs)
+                why = f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
             if wanted is None and self.flows:
                 wanted = control.interval_from_flow(self.flows, slot.view.size[0], knobs)
                 why = f"background flow {np.median(self.flows):.2f} px a frame"
             if wanted is not None:
-                self.interval, slot.adjustments = control.adjusted(slot.frame.number, self.interval, wanted, why, knobs)
+                self.interval, moved = control.adjusted(number, self.interval, wanted, why, knobs)
+                slot.adjustments += moved
         slot.interval = self.interval
 
-    def _wanted_by_telemetry(self, slot: _Slot) -> tuple[float | None, str]:
-        from torchvision_dddas.sources.telemetry import at
-
-        assert self.telemetry is not None
-        flight = at(self.telemetry, slot.frame.time_s)
-        if flight is None:
-            return None, ""
-        wanted = control.interval_from_telemetry(
-            flight.altitude_m, flight.speed_m_s, self.rate_hz, self.settings.interval
-        )
-        return wanted, f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+    def _flight(self, slot: _Slot) -> Flight | None:
+        """Altitude and speed at a frame, where the telemetry tells."""
+        return at(self.telemetry, slot.frame.time_s) if self.telemetry is not None else None
 
     def _observe(self, ready: list[int]) -> None:
         start = time.perf_counter()
@@ -201,18 +223,33 @@ class Loop:
         for (index, window), foreground in zip(made, foregrounds, strict=True):
             slot = self._at(index)
             start = time.perf_counter()
-            slot.observation = observe(window.reference, foreground, self.flow, self.settings)
+            slot.observation = observe(
+                window.reference, foreground, self.flow, self._settings(slot), self._history(index)
+            )
             slot.seconds |= {"foreground": spent, "blobs": time.perf_counter() - start}
         for index in ready:
             self._follow_small(index)
             self.observed = index + 1
             self._draw()
 
+    def _settings(self, slot: _Slot) -> Settings:
+        """Those in force at a frame."""
+        return slot.regime.settings if slot.regime else self.settings
+
+    def _history(self, index: int) -> MotionHistory | None:
+        """The motion history, moved on to a frame."""
+        if not self.settings.history.on:
+            return None
+        for i in range(max(self.remembered, self.first), index + 1):
+            self.history.move(self._at(i).frame.number, self._step(i - 1) if i > self.first else None)
+        self.remembered = index + 1
+        return self.history
+
     def _window(self, index: int) -> Window | None:
         slot = self._at(index)
         back = max(self.settings.difference.wide_frames, 2 * slot.interval, 2 * max(self.settings.difference.near_frames))
         first, last = self._stretch(index, back, 2 * slot.interval)
-        near, wide, small = windows.pairs(index, slot.interval, first, last, self.settings)
+        near, wide, small = windows.pairs(index, slot.interval, first, last, self._settings(slot))
         if not near:
             slot.cause = self._why_alone(index)
             return None
@@ -273,7 +310,7 @@ class Loop:
             steps = [self._step(i) for i in around]
             slot = self._at(index)
             assert slot.observation is not None
-            slot.observation.targets = draw_targets(observations, steps, index - low, self.settings)
+            slot.observation.targets = draw_targets(observations, steps, index - low, self._settings(slot))
             slot.observation.view = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self.drawn += 1
@@ -311,6 +348,7 @@ class Loop:
         assert observation is not None
         found = list(observation.targets or [])
         found += self._small_targets(index, found)
+        found = admitted(found, slot.regime.gates if slot.regime else None)
         detections, mask = table(found, slot.view.size)
         return Scene(
             slot.frame, mask, detections, slot.interval, not slot.cause, slot.cause, slot.adjustments, slot.seconds

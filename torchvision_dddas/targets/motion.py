@@ -82,9 +82,15 @@ def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int
     centre_u, centre_v = 2 * (left + column.mean()) + 0.5, 2 * (top + row.mean()) + 0.5
     scale = float(max(width, height))
     u, w = (2 * (left + column) + 0.5 - centre_u) / scale, (2 * (top + row) + 0.5 - centre_v) / scale
-    affine = [_robust_affine(u, w, flow[row, column]) for flow in near]
+    affine = [robust_affine(u, w, flow[row, column]) for flow in near]
     velocity = (affine[0][0] / offsets[0] + affine[1][0] / offsets[1]) / 2
     return Motion(velocity, steady, (affine[0], affine[1]), (centre_u, centre_v, scale))
+
+
+def only_velocity(velocity_px: np.ndarray) -> Motion:
+    """A motion of which nothing but the velocity is known."""
+    nothing = np.zeros((3, 2))
+    return Motion(velocity_px, 0.0, (nothing, nothing), (0.0, 0.0, 1.0))
 
 
 def _at_half(blob: Blob, mask: np.ndarray, shape: tuple[int, int], left: int, top: int) -> np.ndarray:
@@ -98,7 +104,7 @@ def _at_half(blob: Blob, mask: np.ndarray, shape: tuple[int, int], left: int, to
     return inside
 
 
-def _robust_affine(u: np.ndarray, v: np.ndarray, flow_px: np.ndarray, rounds: int = 5) -> np.ndarray:
+def robust_affine(u: np.ndarray, v: np.ndarray, flow_px: np.ndarray, rounds: int = 5) -> np.ndarray:
     """(3, 2) affine motion by reweighted least squares; a small pull towards pure translation keeps slim blobs sane."""
     columns = np.c_[np.ones(len(u)), u, v]
     median = np.median(flow_px, axis=0)
