@@ -20,8 +20,8 @@ _ROUNDS = 4
 def two_motions(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray | None:
     """Which core pixels move by the second of two motions, (H, W) bool; None where one motion explains the core.
 
-    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. One robust affine motion is fitted to all, a second one
-    to what the first misses; then every pixel goes to the motion that fits it better.
+    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. Where one robust affine motion misses too much, two are
+    fitted, to the halves that two means of the flow make, and every pixel goes to the one that fits it better.
     """
     row, column = np.nonzero(core)
     if len(row) < 40:
@@ -40,7 +40,10 @@ def two_motions(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray | None:
     first = fitted(np.ones(len(u), bool))
     miss = np.linalg.norm(flow - columns @ first, axis=1)
     speed = float(np.linalg.norm(first[0]))
-    second = miss > max(_CLEARLY_PX / 2, _CLEARLY / 2 * speed)
+    missed = miss > max(_CLEARLY_PX / 2, _CLEARLY / 2 * speed)
+    if missed.mean() < _LEAST_SHARE:
+        return None
+    second = _further(flow)
     for _ in range(_ROUNDS):
         if not _LEAST_SHARE <= second.mean() <= 1 - _LEAST_SHARE:
             return None
@@ -86,6 +89,19 @@ def cut(blob: Blob, share: np.ndarray) -> Blob:
     window = np.s_[top : top + height, left : left + width]
     box = (blob.box[0] + left, blob.box[1] + top, width, height)
     return Blob(box, mask[window], (blob.core & mask)[window], blob.peak)
+
+
+def _further(flow_px: np.ndarray) -> np.ndarray:
+    """The one of two clusters of (N, 2) vectors: two means, begun at the vectors that lie furthest out."""
+    start = flow_px[np.linalg.norm(flow_px - np.median(flow_px, axis=0), axis=1).argmax()]
+    means = [flow_px[np.linalg.norm(flow_px - start, axis=1).argmax()], start]
+    second = np.ones(len(flow_px), bool)
+    for _ in range(_ROUNDS):
+        second = np.linalg.norm(flow_px - means[1], axis=1) < np.linalg.norm(flow_px - means[0], axis=1)
+        if second.all() or not second.any():
+            break
+        means = [flow_px[~second].mean(axis=0), flow_px[second].mean(axis=0)]
+    return second
 
 
 def _one_piece(part: np.ndarray) -> float:
