@@ -13,7 +13,7 @@ KNOBS = HistoryKnobs()
 
 
 def film(painted, *movers, frames=6, step=None):
-    """The history of boxes (x, y, width, height, vx, vy), where they stand in the last frame, and that frame's blobs."""
+    """The history of boxes (x, y, width, height, vx, vy), placed as in the last frame, and that frame's blobs."""
     history = MotionHistory(KNOBS.duration_frames)
     silhouette = painted(SIZE)
     for number in range(1, frames + 1):

@@ -20,7 +20,7 @@ _ROUNDS = 4
 def two_motions(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray | None:
     """Which core pixels move by the second of two motions, (H, W) bool; None where one motion explains the core.
 
-    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. Where one robust affine motion misses too much, two are
+    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. Where one affine motion misses too much, two are
     fitted, to the halves that two means of the flow make, and every pixel goes to the one that fits it better.
     """
     row, column = np.nonzero(core)
@@ -37,12 +37,11 @@ def two_motions(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray | None:
         chosen = np.flatnonzero(which)[sample]
         return robust_affine(u[chosen], v[chosen], flow[chosen])
 
-    first = fitted(np.ones(len(u), bool))
-    miss = np.linalg.norm(flow - columns @ first, axis=1)
-    speed = float(np.linalg.norm(first[0]))
-    missed = miss > max(_CLEARLY_PX / 2, _CLEARLY / 2 * speed)
-    if missed.mean() < _LEAST_SHARE:
-        return None
+    # Least squares as well: the robust fit is slow to believe in a body that turns or grows.
+    for one in (fitted(np.ones(len(u), bool)), np.linalg.lstsq(columns[sample], flow[sample], rcond=None)[0]):
+        miss = np.linalg.norm(flow - columns @ one, axis=1)
+        if (miss > max(_CLEARLY_PX / 2, _CLEARLY / 2 * float(np.linalg.norm(one[0])))).mean() < _LEAST_SHARE:
+            return None
     second = _further(flow)
     for _ in range(_ROUNDS):
         if not _LEAST_SHARE <= second.mean() <= 1 - _LEAST_SHARE:
