@@ -60,7 +60,7 @@ class SmallTracks:
             tip = np.vstack([track.points_px[-1] - track.velocity_px, track.points_px])
             moved = transfer(this_from_last, tip)  # type: ignore[arg-type]
             track.points_px = moved[1:]
-            track.velocity_px = moved[1] - moved[0]
+            track.velocity_px = moved[-1] - moved[0]
         centres = np.array([[x + (w - 1) / 2, y + (h - 1) / 2] for x, y, w, h in boxes]).reshape(-1, 2)
         taken = self._continue(frame, centres, boxes)
         for i in set(range(len(boxes))) - taken:
