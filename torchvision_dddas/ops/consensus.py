@@ -115,6 +115,13 @@ def reweighted(
     return matrix, inliers, valid & (inliers.sum(1) >= size)
 
 
+def spread(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
+    """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer."""
+    batch, available = valid.shape
+    samples = torch.arange(count, device=valid.device) * available // count
+    return _ranks_to_points(valid, samples.expand(batch, 1, -1))[:, 0]
+
+
 def _ranks_to_points(valid: Bool[Tensor, "B N"], samples: Int64[Tensor, "B S size"]) -> Int64[Tensor, "B S size"]:
     """Spread sample numbers over the valid points alone: number r of N becomes valid point floor(r n / N)."""
     # Valid points first, in order; unique keys, because a stable sort does not export.

@@ -23,6 +23,8 @@ Item = TypeVar("Item")
 
 # Pixels of warped neighbours in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
 PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
+POINTS_AT_ONCE = {"cpu": 500, "cuda": 100_000}
+SCOUTS = 64
 LEVEL = 255.0
 
 
@@ -58,20 +60,26 @@ class TorchVision:
     # ----------------------------------------------------------------------------------------------------------------
 
     def _register(self, pairs: list[tuple[View, View]]) -> list[Registration]:
-        knobs, size = self.knobs.registration, pairs[0][0].size
         self._prepare_views([view for pair in pairs for view in pair])
-        points, valid = (torch.cat([earlier.kept[name] for earlier, _ in pairs]) for name in ("points", "valid"))
-        pyramids = [
+        count = max(pairs[0][0].kept["points"].shape[1], 1)
+        step = max(1, POINTS_AT_ONCE.get(self.device.type, 500) // count)
+        parts = (pairs[first : first + step] for first in range(0, len(pairs), step))
+        return [result for part in parts for result in self._register_at_once(part)]
+
+    def _register_at_once(self, pairs: list[tuple[View, View]]) -> list[Registration]:
+        knobs, size = self.knobs.registration, pairs[0][0].size
+        points, valid = (_joined([earlier.kept[name] for earlier, _ in pairs]) for name in ("points", "valid"))
+        earlier, later = (
             [_joined(level) for level in zip(*(pair[i].kept["pyramid"] for pair in pairs), strict=True)] for i in (0, 1)
-        ]
+        )
         if points.shape[1]:
-            end, found = _follow(points, pyramids[0], pyramids[1], knobs)
+            end, found = _follow(points, valid, earlier, later, knobs)
             tracked = valid & found
             matrices = _fit(points.double(), end.double(), tracked, knobs)
         else:
             end, tracked, matrices = points, valid, torch.eye(3).expand(len(pairs), 3, 3)
         arrays = (array.cpu().numpy() for array in (points, end, valid, tracked, matrices))
-        return [_judged(*one, size=size, knobs=knobs) for one in zip(*arrays, strict=True)]
+        return [_judged(one, size, knobs) for one in zip(*arrays, strict=True)]
 
     def _prepare_views(self, views: list[View]) -> None:
         """Pyramid and keypoints of those views that have none yet, in batches."""
@@ -145,8 +153,8 @@ class TorchVision:
         rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)
         smalls = [None] * len(windows) if small is None else list(small[:, 0].cpu().numpy())
         return [
-            Foreground(*row[:4], small_map, row[4:], (window.offsets[a], window.offsets[b]))
-            for window, row, small_map in zip(windows, rows, smalls, strict=True)
+            Foreground(core, near, wide, texture, small, (one, other), (window.offsets[a], window.offsets[b]))
+            for window, (core, near, wide, texture, one, other), small in zip(windows, rows, smalls, strict=True)
         ]
 
     def _small(
@@ -187,18 +195,53 @@ def _joined(pictures: Sequence[Tensor]) -> Tensor:
 
 
 def _follow(
-    points: Tensor, earlier: list[Tensor], later: list[Tensor], knobs: RegistrationKnobs
+    points: Tensor, valid: Tensor, earlier: list[Tensor], later: list[Tensor], knobs: RegistrationKnobs
 ) -> tuple[Tensor, Tensor]:
-    settings: dict[str, Any] = {
+    """Where the points are in the later frames, and which were found.
+
+    A few scouts search the whole pyramid; the others start where the scouts' motion takes them, which is quicker by
+    far. Where the scouts do not agree, all points search the whole pyramid.
+    """
+    if points.shape[1] < 2 * SCOUTS:
+        return _search(points, earlier, later, knobs)
+    scouts = consensus.spread(valid, SCOUTS)
+    start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
+    ahead, found = flow.track(start, earlier, later, rounds=3, **_tracking(knobs))
+    found = found & valid.gather(1, scouts)
+    motion = _fit(start, ahead, found, knobs)
+    near = found & (consensus.transfer_error(motion, start, ahead) < knobs.ransac_px)
+    agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
+    end, kept = torch.zeros_like(points), torch.zeros_like(valid)
+    for choice, guessed in ((agreed, True), (~agreed, False)):
+        chosen = choice.nonzero()[:, 0]
+        if len(chosen):
+            pyramids = earlier, later
+            if len(chosen) < len(points):
+                pyramids = [level[chosen] for level in earlier], [level[chosen] for level in later]
+            guess = consensus.transfer(motion[chosen], points[chosen]) if guessed else None
+            end[chosen], kept[chosen] = _search(points[chosen], *pyramids, knobs, guess)
+    return end, kept
+
+
+def _search(
+    points: Tensor, earlier: list[Tensor], later: list[Tensor], knobs: RegistrationKnobs, guess: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Lucas-Kanade through the whole pyramid, or, near a guess, in its finest level."""
+    settings = _tracking(knobs) | {"rounds": 3}
+    if guess is not None:
+        earlier, later, settings = earlier[:1], later[:1], settings | {"reach_px": 2, "rounds": 2}
+    if knobs.forward_backward_px > 0:
+        return flow.forward_backward(points, earlier, later, guess, limit_px=knobs.forward_backward_px, **settings)
+    return flow.track(points, earlier, later, guess, **settings)
+
+
+def _tracking(knobs: RegistrationKnobs) -> dict[str, Any]:
+    return {
         "window_px": knobs.window_px,
         "iterations": knobs.iterations,
         "epsilon_px": knobs.epsilon_px,
         "min_eigen": 1e-4 * LEVEL**2,
-        "rounds": 3,
     }
-    if knobs.forward_backward_px > 0:
-        return flow.forward_backward(points, earlier, later, limit_px=knobs.forward_backward_px, **settings)
-    return flow.track(points, earlier, later, **settings)
 
 
 def _fit(start: Tensor, end: Tensor, tracked: Tensor, knobs: RegistrationKnobs) -> Tensor:
@@ -215,15 +258,8 @@ def _fit(start: Tensor, end: Tensor, tracked: Tensor, knobs: RegistrationKnobs) 
     return model.ransac(start, end, tracked, samples, knobs.ransac_px, refits)[0]
 
 
-def _judged(
-    start: np.ndarray,
-    end: np.ndarray,
-    valid: np.ndarray,
-    tracked: np.ndarray,
-    later_from_earlier: np.ndarray,
-    size: tuple[int, int],
-    knobs: RegistrationKnobs,
-) -> Registration:
+def _judged(found: tuple[np.ndarray, ...], size: tuple[int, int], knobs: RegistrationKnobs) -> Registration:
+    start, end, valid, tracked, later_from_earlier = found
     start, end = start[tracked], end[tracked]
     if valid.sum() < 4 or len(start) < 4:
         return judged(np.eye(3), len(start) if valid.sum() >= 4 else 0, 0, np.inf, size, knobs)
