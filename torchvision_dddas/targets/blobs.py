@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from torchvision_dddas.targets.occupied import occupied
+
 
 @dataclass(frozen=True)
 class Blob:
@@ -45,19 +47,22 @@ def find_blobs(
     core, evidence: (H, W) uint8. Evidence above `threshold` makes a pixel of a region certain. A hull that contains
     another region's hull swallows it.
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(core, ltype=cv2.CV_32S)
     blobs = []
-    for label in range(1, count):
-        x, y, width, height, area = (int(v) for v in stats[label])
-        if area < min_area_px:
-            continue
-        window = np.s_[y : y + height, x : x + width]
-        region = labels[window] == label
-        seen = evidence[window]
-        if (highest := float(seen[region].max())) < peak:
-            continue
-        mask = filled_hull(region) if hull else region
-        blobs.append(Blob((x, y, width, height), mask, region & (seen > threshold), highest))
+    for left, top, wide, high in occupied(core, 2):
+        part = np.s_[top : top + high, left : left + wide]
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(core[part], ltype=cv2.CV_32S)
+        for label in range(1, count):
+            x, y, width, height, area = (int(v) for v in stats[label])
+            if area < min_area_px:
+                continue
+            window = np.s_[y : y + height, x : x + width]
+            region = labels[window] == label
+            seen = evidence[part][window]
+            if (highest := float(seen[region].max())) < peak:
+                continue
+            mask = filled_hull(region) if hull else region
+            blobs.append(Blob((left + x, top + y, width, height), mask, region & (seen > threshold), highest))
+    blobs.sort(key=lambda blob: (blob.box[1], blob.box[0]))
     return _without_swallowed(blobs) if hull else blobs
 
 
