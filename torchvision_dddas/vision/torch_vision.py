@@ -142,7 +142,9 @@ class TorchVision:
                 sampled = _exposed(levels, sampled, run)
             warped.append(sampled.to(torch.uint8))
             seen.append(run)
-        texture = difference.gradient(levels)
+        # Without either nobody asks for the texture.
+        wanted = knobs.kind == "normalized" or self.knobs.refine.on
+        texture = difference.gradient(levels) if wanted else torch.zeros_like(levels)
         near, wide = _evidence(one, grey, warped, seen, texture, knobs)
         scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
         core = (near > int(knobs.threshold * scale)).to(torch.uint8) * 255
