@@ -57,3 +57,10 @@ def test_channels_do_not_mix_and_the_input_is_left_alone():
 def test_pictures_of_one_row_or_column_work(shape):
     after = spread(np.ones((*shape, 1), np.float32), np.zeros(shape, np.uint8), 10, 80)
     np.testing.assert_allclose(after, 1, atol=1e-6)
+
+
+def test_a_grey_picture_stops_the_spread_like_the_same_picture_in_colour():
+    grey = np.random.default_rng(1).integers(0, 256, (13, 17)).astype(np.uint8)
+    evidence = np.random.default_rng(0).random((13, 17, 2)).astype(np.float32)
+    in_colour = spread(evidence, np.dstack([grey] * 3), 10, 80)
+    np.testing.assert_allclose(spread(evidence, grey, 10, 80), in_colour, atol=1e-6)

@@ -3,13 +3,16 @@
 import numpy as np
 
 
-def spread(evidence: np.ndarray, guide: np.ndarray, spatial_px: float, colour_levels: float, rounds: int = 2) -> np.ndarray:
+def spread(
+    evidence: np.ndarray, guide: np.ndarray, spatial_px: float, colour_levels: float, rounds: int = 2
+) -> np.ndarray:
     """Smooth (H, W, K) evidence along a picture's flat regions, without crossing its edges.
 
     guide: (H, W, 3) or (H, W) uint8. spatial_px: reach where the colour does not change. colour_levels: change of
     colour, summed over the channels, that counts as much as that reach.
     """
     colours = np.atleast_3d(guide).astype(np.float32)
+    colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
     across = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=1)).sum(axis=2)
     down = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=0)).sum(axis=2)
     # Rows are made contiguous for either direction: each step then works on whole rows.
