@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,12 +21,20 @@ from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Tele
 from torchvision_dddas.vision.protocol import View, Vision, Window
 
 
+# A picture whose grey levels spread by less than this shows nothing, not even through fog.
+_BLANK_LEVELS = 1.0
+
+
 class Clip(Protocol):
     """What the loop needs of a source."""
 
     rate_hz: float
 
     def __iter__(self) -> Iterator[Frame]: ...
+
+
+def _blank(view: View) -> bool:
+    return float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
 
 
 @dataclass
@@ -125,8 +133,7 @@ class Loop:
     def _advance(self) -> Iterator[Scene]:
         self._register()
         while ready := self._ready():
-            self._observe(ready)
-        yield from self._settle()
+            yield from self._observe(ready)
 
     def _at(self, index: int) -> _Slot:
         return self.slots[index - self.first]
@@ -144,8 +151,10 @@ class Loop:
             part = todo[i : i + self.batch + 1]
             steps += self.vision.register([(a.view, b.view) for a, b in zip(part, part[1:], strict=False)])
         spent = (time.perf_counter() - start) / len(steps)
-        for slot, step in zip(todo, steps, strict=False):
-            slot.step = step
+        for slot, after, step in zip(todo, todo[1:], steps, strict=False):
+            # Keypoints can seem to be followed onto a blank picture: they stay where the search began.
+            blank = _blank(slot.view) or _blank(after.view)
+            slot.step = replace(step, reliable=False, cause="the picture is blank") if blank else step
             slot.seconds["register"] = spent
         self.registered += len(steps)
 
@@ -209,7 +218,7 @@ class Loop:
         """Altitude and speed at a frame, where the telemetry tells."""
         return at(self.telemetry, slot.frame.time_s) if self.telemetry is not None else None
 
-    def _observe(self, ready: list[int]) -> None:
+    def _observe(self, ready: list[int]) -> Iterator[Scene]:
         start = time.perf_counter()
         made: list[tuple[int, Window]] = []
         for index in ready:
@@ -231,6 +240,7 @@ class Loop:
             self._follow_small(index)
             self.observed = index + 1
             self._draw()
+            yield from self._settle()  # after every frame: what is settled must not depend on the batch
 
     def _settings(self, slot: _Slot) -> Settings:
         """Those in force at a frame."""
@@ -298,10 +308,9 @@ class Loop:
     # -- targets -----------------------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
-        """Draw the targets of frames whose two followers have been observed."""
-        while self.drawn < self.observed and (self.drawn + 2 < self.observed or self.observed == self.total):
-            if self.observed == self.total and not self.ended and self.drawn + 2 >= self.observed:
-                return
+        """Draw the targets of frames whose followers, as far as they have a say, have been observed."""
+        followers = 2 if self.settings.persistence.on else 0
+        while self.drawn < self.observed and (self.drawn + followers < self.observed or self._all_observed()):
             index = self.drawn
             start = time.perf_counter()
             low = max(index - 2, self.first)
@@ -315,6 +324,9 @@ class Loop:
             slot.seconds["outline"] = time.perf_counter() - start
             self.drawn += 1
 
+    def _all_observed(self) -> bool:
+        return self.ended and self.observed == self.total
+
     def _step(self, index: int) -> np.ndarray | None:
         step = self._at(index).step
         return step.later_from_earlier if step is not None and step.reliable else None
@@ -323,7 +335,7 @@ class Loop:
         """Yield the scenes on which no later frame has a say any more, and forget what no window needs again."""
         while self.emitted < self.drawn:
             slot = self._at(self.emitted)
-            if not self.ended and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
+            if not self._all_observed() and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
                 break
             yield from self._gap(slot.frame)
             yield self._scene(slot, self.emitted)

@@ -11,7 +11,9 @@ def reach(interval: int, settings: Settings) -> int:
     """How many frames ahead of its reference a window looks, never more than the source's two intervals."""
     if settings.difference.kind == "between_later":
         return 2 * interval
-    near = max(settings.difference.near_frames)
+    gap = max(settings.difference.near_frames)
+    # At a stretch's start the window looks ahead only, as far as the frames that `delay` waits for leave room.
+    near = max(gap, min(2 * gap, 2 * interval - (2 if settings.persistence.on else 0)))
     wide = min(settings.difference.wide_frames, max(2 * interval - 2, 0))
     small = settings.small.gap_frames if small_looked_for(interval, settings) else 0
     return max(near, wide, small)
@@ -39,7 +41,8 @@ def pairs(
     knobs = settings.difference
     if knobs.kind == "between_later":
         return [p for p in [_forward(at, interval, first, last)] if p], None, None
-    ahead = min(last, at + 2 * interval)
+    # No further than the reach, whatever is known already: the result must not depend on how frames are batched.
+    ahead = min(last, at + reach(interval, settings))
     near = [p for gap in knobs.near_frames if (p := _symmetric(at, gap, first, ahead))]
     if not near and (p := _symmetric(at, 1, first, ahead)):
         near = [p]
@@ -66,4 +69,5 @@ def _forward(at: int, gap: int, first: int, last: int) -> Pair | None:
             pair = make(smaller)
             if first <= min(pair) and max(pair) <= last:
                 return pair
-    return None
+    # The middle one of three frames has a neighbour on either side only.
+    return (at - 1, at + 1) if first < at < last else None

@@ -1,4 +1,4 @@
-"""Blobs that stay are targets, blobs that flicker are not. Knobs are given, so that a new default changes nothing here."""
+"""Blobs that stay are targets, blobs that flicker are not. Knobs are given: a new default changes nothing here."""
 
 import numpy as np
 import pytest

@@ -1,0 +1,328 @@
+"""The whole loop on small films: what comes out, when, and what happens where the film is bad."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.run import Loop, run, scenes
+from torchvision_dddas.settings import Settings, load, with_knobs
+from torchvision_dddas.simulation.scene import render
+from torchvision_dddas.types import Frame, Scene, Telemetry
+from torchvision_dddas.vision import load as load_vision
+
+SIZE = (240, 180)
+CONFIGS = (None, "source", "fast")
+RATE_HZ = 10.0
+
+
+def frames_of(images: Sequence[np.ndarray]) -> list[Frame]:
+    return [Frame(i + 1, i / RATE_HZ, image) for i, image in enumerate(images)]
+
+
+def detect(frames: Sequence[Frame], settings: Settings, batch: int = 1) -> list[Scene]:
+    loop = Loop(load_vision("onboard", settings), settings, RATE_HZ, batch=batch)
+    return [scene for frame in frames for scene in loop.feed(frame)] + list(loop.end())
+
+
+class Film:
+    """A source of frames at hand."""
+
+    rate_hz = RATE_HZ
+
+    def __init__(self, images: Sequence[np.ndarray], count: int | None = None) -> None:
+        self.frames, self.count = frames_of(images), count
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+def same(a: Scene, b: Scene) -> bool:
+    return (
+        np.array_equal(a.mask, b.mask)
+        and np.array_equal(a.detections.box_px, b.detections.box_px)
+        and np.array_equal(a.detections.speed_px, b.detections.speed_px, equal_nan=True)
+        and (a.interval_frames, a.reliable, a.cause) == (b.interval_frames, b.reliable, b.cause)
+    )
+
+
+def f_measure(found: Sequence[Scene], truth: Sequence[np.ndarray]) -> float:
+    precision, recall = pixels(found, truth)
+    return 2 * precision * recall / max(precision + recall, 1e-9)
+
+
+def pixels(found: Sequence[Scene], truth: Sequence[np.ndarray]) -> tuple[float, float]:
+    """(precision, recall) over all frames."""
+    hit = sum(((s.mask > 0) & (t > 0)).sum() for s, t in zip(found, truth, strict=True))
+    return hit / max(sum((s.mask > 0).sum() for s in found), 1), hit / sum((t > 0).sum() for t in truth)
+
+
+@pytest.fixture(scope="module")
+def film():
+    return render(seed=0, frames=16, size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def noise() -> np.ndarray:
+    """A big texture to pan over."""
+    coarse = np.random.default_rng(5).integers(0, 256, (90, 120, 3)).astype(np.uint8)
+    return cv2.resize(coarse, (480, 360), interpolation=cv2.INTER_CUBIC)
+
+
+def pan(ground: np.ndarray, frames: int, size=SIZE, car: float | None = None) -> list[np.ndarray]:
+    """A camera that pans by 2 px a frame over a picture; a painted car drives at `car` px a frame over the ground."""
+    paint = cv2.resize(np.random.default_rng(9).integers(0, 2, (4, 7, 3)).astype(np.uint8) * 200 + 30, (72, 36))
+    images = []
+    for k in range(frames):
+        picture = ground.copy()
+        if car is not None:
+            x = round(20 + car * k)
+            picture[80 : 80 + 36, x : x + 72] = paint
+        images.append(np.ascontiguousarray(picture[10 : 10 + size[1], 10 + 2 * k : 10 + 2 * k + size[0]]))
+    return images
+
+
+# -- what comes out --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(config, film):
+    found = detect(frames_of(film.images), load(config))
+    assert [s.frame.number for s in found] == list(range(1, 17))
+    for scene in found:
+        assert scene.mask.shape == (SIZE[1], SIZE[0]) and scene.mask.dtype == np.uint16
+        assert scene.mask.max() <= len(scene.detections)
+        for i, (x, y, width, height) in enumerate(scene.detections.box_px):
+            rows, columns = np.nonzero(scene.mask == i + 1)
+            assert x <= columns.min() and columns.max() < x + width
+            assert y <= rows.min() and rows.max() < y + height
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_car_that_drives_under_a_panning_camera_is_found_with_its_heading_and_speed(config, noise):
+    found = detect(frames_of(pan(noise, 14, car=5.0)), load(config))
+    hits, headings, speeds = 0, [], []
+    for k, scene in enumerate(found):
+        assert scene.reliable
+        centre = 20 + 5 * k - 10 - 2 * k + 36, 88
+        for (x, y, width, height), heading, speed in zip(
+            scene.detections.box_px, scene.detections.heading_rad, scene.detections.speed_px, strict=True
+        ):
+            if x <= centre[0] <= x + width and y <= centre[1] <= y + height:
+                hits += 1
+                headings.append(heading)
+                speeds.append(speed)
+                break
+    assert hits >= 11
+    assert abs(np.degrees(np.nanmedian(headings))) < 20
+    assert np.nanmedian(speeds) == pytest.approx(5.0, rel=0.4)
+
+
+def test_a_pan_over_ground_where_nothing_moves_finds_nothing(noise):
+    found = detect(frames_of(pan(noise, 10)), load())
+    assert sum(len(s.detections) for s in found) == 0
+    assert all(s.reliable for s in found)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_the_result_does_not_depend_on_the_batch_size(config, film):
+    settings = load(config)
+    one = detect(frames_of(film.images), settings)
+    for batch in (3, 8, 50):
+        assert all(same(a, b) for a, b in zip(one, detect(frames_of(film.images), settings, batch), strict=True))
+
+
+def test_a_run_can_be_repeated(film):
+    settings = load()
+    first, second = (detect(frames_of(film.images), settings) for _ in range(2))
+    assert all(same(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
+    """A live stream gets the result of a file: the scene of t is the same whatever follows t + 2 intervals."""
+    settings = load(config)
+    whole = detect(frames_of(film.images), settings)
+    for kept in (8, 11):
+        blank = [np.zeros_like(film.images[0])] * (len(film.images) - kept)
+        other = detect(frames_of([*film.images[:kept], *blank]), settings)
+        for t, (a, b) in enumerate(zip(whole, other, strict=True)):
+            if t + 2 * max(a.interval_frames, b.interval_frames) < kept:
+                assert same(a, b), f"frame {t + 1} of {kept} kept"
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_scene_comes_out_two_intervals_after_its_frame_at_the_latest(config, film):
+    settings = load(config)
+    loop = Loop(load_vision("onboard", settings), settings, RATE_HZ, batch=1)
+    out: list[Scene] = []
+    for t, frame in enumerate(frames_of(film.images)):
+        out += loop.feed(frame)
+        interval = max([loop.interval, *(slot.interval for slot in loop.slots)])
+        assert len(out) >= t + 1 - 2 * interval, f"after frame {t + 1}"
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("size", [(101, 67), (160, 33), (37, 121)])
+def test_odd_and_narrow_sizes_work(config, size, film):
+    images = [np.ascontiguousarray(image[: size[1], : size[0]]) for image in film.images[:6]]
+    found = detect(frames_of(images), load(config))
+    assert [s.mask.shape for s in found] == [(size[1], size[0])] * 6
+
+
+def test_grey_frames_give_masks_like_colour_ones(noise):
+    colour = pan(noise, 10, car=5.0)
+    grey = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in colour]
+    truth = [scene.mask for scene in detect(frames_of(colour), load())]
+    assert min(pixels(detect(frames_of(grey), load()), truth)) > 0.85
+
+
+# -- light, cuts, bad frames -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gain", [0.85, 1.15])
+def test_an_exposure_that_jumps_costs_at_most_a_twentieth_of_f(gain, film):
+    settings = with_knobs(load(), {"gates.min_area_px": 40})  # the people of so small a film
+    calm = f_measure(detect(frames_of(film.images), settings), film.masks)
+    gains = [gain if k % 4 >= 2 else 1.0 for k in range(16)]
+    jumpy = [
+        np.clip(g * image.astype(float), 0, 255).astype(np.uint8) for g, image in zip(gains, film.images, strict=True)
+    ]
+    found = detect(frames_of(jumpy), settings)
+    assert all(s.reliable for s in found)
+    assert calm > 0.5
+    assert f_measure(found, film.masks) > calm - 0.05
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_cut_gives_no_full_mask_and_is_not_looked_across(config, noise):
+    one, two = pan(noise, 8, car=5.0), pan(255 - noise[::-1, ::-1], 8, car=5.0)
+    settings = load(config)
+    found = detect(frames_of(one + two), settings)
+    assert max((s.mask > 0).mean() for s in found) < 0.25
+    # Each side is as if it were alone.
+    alone = detect(frames_of(one), settings)
+    assert all(np.array_equal(a.mask, b.mask) for a, b in zip(found[:8], alone, strict=True))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_blank_frames_in_the_middle_are_unreliable_and_empty(config, level, noise):
+    images = pan(noise, 15, car=5.0)
+    for k in (6, 7):
+        images[k] = np.full_like(images[k], level)
+    found = detect(frames_of(images), load(config))
+    for k in (6, 7):
+        assert not found[k].reliable and found[k].cause
+        assert not found[k].mask.any() and len(found[k].detections) == 0
+    assert all(s.reliable for s in found[:5] + found[9:])
+    assert max((s.mask > 0).mean() for s in found) < 0.25
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_clip_of_blank_frames_is_unreliable_from_end_to_end(config):
+    found = detect(frames_of([np.zeros((67, 101, 3), np.uint8)] * 5), load(config))
+    assert [s.reliable for s in found] == [False] * 5
+    assert not any(s.mask.any() for s in found)
+    assert all(s.cause == "the picture is blank" for s in found)
+
+
+def test_frames_of_pure_noise_are_unreliable():
+    rng = np.random.default_rng(0)
+    found = detect(frames_of([rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(6)]), load())
+    assert not any(s.reliable for s in found) and not any(s.mask.any() for s in found)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film):
+    frames = [frame for frame in frames_of(film.images) if frame.number not in (1, 6, 7)]
+    found = detect(frames, load(config))
+    assert [s.frame.number for s in found] == list(range(1, 17))
+    for number in (1, 6, 7):
+        scene = found[number - 1]
+        assert (scene.reliable, scene.cause) == (False, "the frame could not be read")
+        assert not scene.mask.any() and len(scene.detections) == 0
+
+
+# -- clips too short, telemetry --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("count", "says"), [(0, "no frame"), (1, "1 frame "), (2, "2 frames")])
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_clip_shorter_than_a_window_is_refused_with_the_number_that_is_missing(count, says, config, film):
+    with pytest.raises(InputError, match=f"{says}.* {3 - count} missing"):
+        detect(frames_of(film.images[:count]), load(config))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_three_frames_are_enough_and_all_three_are_judged(config, noise):
+    found = detect(frames_of(pan(noise, 3, car=5.0)), load(config))
+    assert [s.reliable for s in found] == [True] * 3
+
+
+def flight(time_s, altitude_m=60.0, speed_m_s=5.0) -> Telemetry:
+    time = np.asarray(time_s, float)
+    return Telemetry(time, np.broadcast_to(altitude_m, time.shape), np.broadcast_to(speed_m_s, time.shape))
+
+
+@pytest.mark.parametrize("count", [16, None])
+@pytest.mark.parametrize(("from_s", "to_s"), [(50.0, 60.0), (-60.0, -50.0)])
+def test_telemetry_of_another_time_is_refused_naming_both_spans(count, from_s, to_s, film):
+    settings = load("fast")
+    told = run(Film(film.images, count), load_vision("onboard", settings), settings, flight([from_s, to_s]))
+    with pytest.raises(InputError, match=f"{from_s} to {to_s} s, the clip 0.0 to 1.5 s"):
+        list(told)
+
+
+def test_telemetry_of_a_part_of_the_clip_is_taken_for_that_part(film):
+    settings = load("fast")
+    vision = load_vision("onboard", settings)
+    told = list(run(Film(film.images, 16), vision, settings, flight([0.9, 1.0])))
+    assert len(told) == 16
+
+
+def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
+    settings = with_knobs(load(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6})
+    altitude = np.where(np.arange(16) < 8, 60.0, 100.0)
+    told = list(
+        run(Film(film.images), load_vision("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
+    )
+    assert [s.interval_frames for s in told] == [3] * 8 + [5] * 8
+    (moved,) = [a for s in told for a in s.adjustments if a.knob == "interval.frames"]
+    assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
+    assert "altitude 100.0 m" in moved.cause
+    gates = [a for s in told for a in s.adjustments if a.knob == "gates.max_size_px"]
+    assert [a.frame for a in gates] == [1, 9]
+
+
+def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left_out(noise):
+    images = pan(noise, 12, car=5.0)
+    base = {"gates.focal_px": 1000.0, "gates.min_size_m": 0.2, "gates.max_size_m": 25.0, "gates.max_speed_m_s": 60.0}
+
+    def count(**knobs: float) -> int:
+        settings = with_knobs(load("fast"), base | {f"gates.{k}": v for k, v in knobs.items()})
+        vision = load_vision("onboard", settings)
+        told = run(Film(images), vision, settings, flight([0, 1.1], altitude_m=100.0))
+        return sum(len(s.detections) for s in told)
+
+    seen = count()
+    assert seen >= 8
+    assert count(max_size_m=5.0) < 0.4 * seen  # the car is 72 px: 7.2 m at 100 m
+    assert count(min_size_m=20.0) == 0
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_no_altitude_however_odd_breaks_a_run(config, film):
+    settings = load(config)
+    for altitude in (0.0, -5.0, 1e5):
+        told = run(Film(film.images[:5]), load_vision("onboard", settings), settings, flight([0, 1], altitude))
+        assert len(list(told)) == 5
+
+
+def test_scenes_of_frames_at_hand_are_those_of_a_run(film):
+    settings = load("fast")
+    vision = load_vision("onboard", settings)
+    at_hand = list(scenes(frames_of(film.images), vision, settings, RATE_HZ))
+    assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), vision, settings), strict=True))
