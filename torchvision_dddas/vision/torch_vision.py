@@ -23,8 +23,8 @@ Item = TypeVar("Item")
 
 # Pixels of warped neighbours in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
 PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
-POINTS_AT_ONCE = {"cpu": 500, "cuda": 100_000}
-SCOUTS = 64
+POINTS_AT_ONCE = {"cpu": 1000, "cuda": 100_000}
+SCOUTS = 32
 LEVEL = 255.0
 
 
@@ -62,7 +62,7 @@ class TorchVision:
     def _register(self, pairs: list[tuple[View, View]]) -> list[Registration]:
         self._prepare_views([view for pair in pairs for view in pair])
         count = max(pairs[0][0].kept["points"].shape[1], 1)
-        step = max(1, POINTS_AT_ONCE.get(self.device.type, 500) // count)
+        step = max(1, POINTS_AT_ONCE.get(self.device.type, 1000) // count)
         parts = (pairs[first : first + step] for first in range(0, len(pairs), step))
         return [result for part in parts for result in self._register_at_once(part)]
 
