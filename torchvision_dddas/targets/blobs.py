@@ -68,10 +68,10 @@ def find_blobs(
 
 def filled_hull(region: np.ndarray) -> np.ndarray:
     """The convex hull of the true pixels of a (h, w) mask, as a mask of the same shape."""
-    points = cv2.findNonZero(region.astype(np.uint8))
-    canvas = np.zeros(region.shape, np.uint8)
-    if points is not None:
-        cv2.fillConvexPoly(canvas, cv2.convexHull(points), 1)
+    canvas = region.astype(np.uint8)
+    outlines, _ = cv2.findContours(canvas, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    if outlines:
+        cv2.fillConvexPoly(canvas, cv2.convexHull(np.concatenate(outlines)), 1)
     return canvas > 0
 
 

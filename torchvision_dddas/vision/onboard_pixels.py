@@ -9,6 +9,7 @@ from torchvision_dddas.targets.projective import transfer
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
 # round places to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
+_MOST_TILES = 6
 # Distances between grey levels among which a median distance is sought; the first is that of the least trimming.
 _DISTANCES = np.append(3 / 3.7 * 1.25 ** np.arange(19), 256.0)
 
@@ -26,44 +27,55 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     """
     height, width = picture.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for tiles in (1, 2, 3, 4, 6):
-        across, down = np.linspace(0, width, tiles + 1).astype(int), np.linspace(0, height, tiles + 1).astype(int)
-        corners = _tile_corners(across, down)
-        affine, error = _affine_maps(picture_from_reference, corners)
-        if error <= _TILE_ERROR_PX:
-            break
-    else:
+    # The error falls with the square of the number of tiles across: that of a single one tells how many it takes.
+    _, error = _affine_maps(picture_from_reference, np.array([[0, 0, width - 1, height - 1]]))
+    count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
+    if not 0 <= count <= _MOST_TILES:
         return cv2.warpPerspective(
             picture, picture_from_reference, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
+    tiles = _tiles(width, height, max(int(count), 1))
+    maps, _ = _affine_maps(picture_from_reference, tiles)
     warped = np.empty_like(picture)
-    for (left, top, right, bottom), tile_map in zip((corners + np.array([0, 0, 1, 1])).tolist(), affine, strict=True):
-        tile, size = warped[top:bottom, left:right], (right - left, bottom - top)
-        cv2.warpAffine(picture, tile_map, size, dst=tile, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    for (left, top, right, bottom), affine in zip(tiles.tolist(), maps, strict=True):
+        tile, size = warped[top : bottom + 1, left : right + 1], (right - left + 1, bottom - top + 1)
+        cv2.warpAffine(picture, affine, size, dst=tile, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return warped
 
 
-def _tile_corners(across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """(N, 4) first column, first row, last column, last row of every tile."""
-    top, left = (a.ravel() for a in np.meshgrid(down[:-1], across[:-1], indexing="ij"))
-    bottom, right = (a.ravel() for a in np.meshgrid(down[1:], across[1:], indexing="ij"))
-    return np.stack([left, top, right - 1, bottom - 1], axis=1)
+def _tiles(width: int, height: int, count: int) -> np.ndarray:
+    """(N, 4) first column, first row, last column, last row of count x count tiles."""
+    across, down = (np.unique(np.arange(count + 1) * side // count) for side in (width, height))
+    rows, columns = len(down) - 1, len(across) - 1
+    return np.stack(
+        [
+            np.tile(across[:-1], rows),
+            np.repeat(down[:-1], columns),
+            np.tile(across[1:] - 1, rows),
+            np.repeat(down[1:] - 1, columns),
+        ],
+        axis=1,
+    )
 
 
 def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, float]:
-    """The tiles' affine maps, (N, 2, 3), fitted to their four corners, and the largest error there in pixels.
+    """The tiles' affine maps, (N, 2, 3), from pixels counted within the tile, and their largest error in pixels.
 
-    They map pixels counted within the tile.
+    The slopes are the means over opposite sides; the error is shared between the corners and the middle.
     """
     left, top, right, bottom = tiles.T.astype(float)
-    corners = np.stack([[left, right, left, right], [top, top, bottom, bottom]], axis=-1)
-    first, second, third, fourth = transfer(to_from, corners.reshape(-1, 2)).reshape(4, -1, 2)
-    # Over a rectangle's corners the least-squares plane has the mean of opposite sides as slopes, and misses all four
-    # corners by the same amount.
+    u = np.stack([left, right, left, right, (left + right) / 2])
+    v = np.stack([top, top, bottom, bottom, (top + bottom) / 2])
+    away = to_from @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = (away[:2] / away[2]).reshape(2, 5, -1)
+    first, second, third, fourth, middle = places.transpose(1, 2, 0)
     wide, tall = np.maximum(right - left, 1)[:, None], np.maximum(bottom - top, 1)[:, None]
     by_u, by_v = (second + fourth - first - third) / (2 * wide), (third + fourth - first - second) / (2 * tall)
-    miss = (first + fourth - second - third) / 4
-    return np.stack([by_u, by_v, first - miss], axis=2), float(np.linalg.norm(miss, axis=1).max())
+    twist = (first + fourth - second - third) / 4
+    bulge = (middle - (first + second + third + fourth) / 4) / 2
+    error = (np.abs(twist) + np.abs(bulge)).max() if (away[2] > 0).all() else np.inf
+    return np.stack([by_u, by_v, first - twist + bulge], axis=2), float(error)
 
 
 def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
@@ -107,16 +119,18 @@ def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.n
     x = np.arange(256.0)
     gain, offset = 1.0, pairs.median_offset()
     for _ in range(4):
+        before = gain, offset
         middle = gain * x + offset
-        reach = pairs.trimming(middle)
-        n, y = pairs.near(middle, reach)
+        n, y = pairs.near(middle, pairs.trimming(middle))
         total = n.sum()
         mean_x, mean_y = n @ x / total, y.sum() / total
         spread = n @ (x - mean_x) ** 2 / total
         gain = float((x - mean_x) @ y / total / spread) if spread > 1e-3 else 1.0
         offset = float(mean_y - gain * mean_x)
+        if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
+            break
     table = np.clip(np.round(gain * x + offset), 0, 255).astype(np.uint8)
-    return cv2.LUT(warped, table)
+    return warped if (table == x).all() else cv2.LUT(warped, table)
 
 
 class _GreyPairs:
