@@ -83,7 +83,7 @@ class IntervalKnobs(Group):
     rule: bool = knob(True, "-", meaning="steer the interval by altitude, speed and rate; false keeps `frames`")
     frames: int = knob(3, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
     minimum_frames: int = knob(3, "frames", 1, 60, meaning="shortest interval that the rule may choose")
-    maximum_frames: int = knob(6, "frames", 1, 60, meaning="longest interval that the rule may choose")
+    maximum_frames: int = knob(8, "frames", 1, 60, meaning="longest interval that the rule may choose")
     reference_altitude_m: float = knob(
         20.0, "m", 1, 1000, meaning="altitude above ground at which the interval is one frame"
     )
@@ -170,14 +170,19 @@ class SmallKnobs(Group):
 
     on: bool = knob(True, "-", meaning="look for small slow targets while the interval is long enough")
     from_interval: int = knob(3, "frames", 1, 60, meaning="shortest interval at which they are looked for")
-    gap_frames: int = knob(3, "frames", 1, 30, meaning="distance of the neighbours on either side")
-    threshold: float = knob(10.0, "grey levels", 1, 255, meaning="a larger difference is a candidate")
-    min_area_px: int = knob(12, "px", 1, 10_000, meaning="smallest candidate")
+    gap_frames: int = knob(
+        6, "frames", 1, 30, meaning="distance of the neighbours on either side, no longer than the interval"
+    )
+    threshold: float = knob(6.0, "grey levels", 1, 255, meaning="a larger difference makes a candidate, ...")
+    noise_ratio: float = knob(6.0, "-", 0, 100, meaning="... one that is also this many times the picture's mean")
+    close_px: int = knob(13, "px", 1, 31, meaning="ellipse that joins the parts of a candidate; 1 is none")
+    min_area_px: int = knob(12, "px", 1, 10_000, meaning="smallest area of a candidate")
     max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
     max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
     gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
-    hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate, of twice as many, that confirm a track")
+    hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate, of three times as many, that confirm a track")
     min_travel_px: float = knob(4.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
+    sureness: float = knob(8.0, "-", 1, 100, meaning="... at a speed of so many of its standard deviations")
     misses: int = knob(3, "frames", 0, 30, meaning="frames without a candidate after which a track ends")
 
 
