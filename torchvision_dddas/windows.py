@@ -15,7 +15,7 @@ def reach(interval: int, settings: Settings) -> int:
     # At a stretch's start the window looks ahead only, as far as the frames that `delay` waits for leave room.
     near = max(gap, min(2 * gap, 2 * interval - (2 if settings.persistence.on else 0)))
     wide = min(settings.difference.wide_frames, max(2 * interval - 2, 0))
-    small = settings.small.gap_frames if small_looked_for(interval, settings) else 0
+    small = small_gap(interval, settings) if small_looked_for(interval, settings) else 0
     return max(near, wide, small)
 
 
@@ -29,6 +29,11 @@ def delay(interval: int, settings: Settings) -> int:
 def small_looked_for(interval: int, settings: Settings) -> bool:
     """Small slow targets show only over a long interval."""
     return settings.small.on and interval >= settings.small.from_interval
+
+
+def small_gap(interval: int, settings: Settings) -> int:
+    """How far the neighbours are that show small targets: the slower the scene, the further."""
+    return min(interval, settings.small.gap_frames)
 
 
 def pairs(
@@ -53,7 +58,7 @@ def pairs(
         back = min(knobs.wide_frames, at - first)
         wide = (at - back, at + forward) if back >= 3 and forward >= 2 else _symmetric(at, knobs.wide_frames, first, ahead)
         wide = wide or next((p for gap in (5, 4, 3) if (p := _symmetric(at, gap, first, ahead))), None)
-    small = _symmetric(at, settings.small.gap_frames, first, ahead) if small_looked_for(interval, settings) else None
+    small = _symmetric(at, small_gap(interval, settings), first, ahead) if small_looked_for(interval, settings) else None
     return near, wide, small
 
 

@@ -51,7 +51,7 @@ def persistent(
         share = blob.area_px / (size[0] * size[1])
         steady = members >= min(knobs.links, possible) and passes >= min(knobs.passes, possible)
         trusted = share >= knobs.large_share if crowded else True
-        large = trusted and (members >= 2 or possible < 2)
+        large = trusted and (members >= 2 or possible < 2 or share >= knobs.large_share / 5)
         sure = motion.steady > knobs.sure_share and share >= knobs.large_share / 10
         verdicts.append(bool(steady or large or sure))
     return verdicts
@@ -69,14 +69,15 @@ def _follow(
     blob, motion = here
     velocity = np.nan_to_num(motion.velocity_px)
     there_from_here = step if direction > 0 else np.linalg.inv(step)
-    centre = transfer(there_from_here, blob.centre_px + direction * velocity)[0]
+    # Where it is by its own motion, and where it is if that was measured wrongly.
+    centre, unmoved = transfer(there_from_here, np.vstack([blob.centre_px + direction * velocity, blob.centre_px]))
     best, best_score = None, 0.0
     there = sightings[at + direction]
     for other, its in zip(there.blobs, there.motions, strict=True):
         ratio = other.area_px / max(blob.area_px, 1)
         if not 1 / _SIZE_RATIO < ratio < _SIZE_RATIO:
             continue
-        overlap = _iou(centre, blob.box[2:], other.centre_px, other.box[2:])
+        overlap = max(_iou(c, blob.box[2:], other.centre_px, other.box[2:]) for c in (centre, unmoved))
         reach = 0.5 * float(np.hypot(*blob.box[2:]))
         alike = float(np.linalg.norm(velocity - np.nan_to_num(its.velocity_px)))
         near = float(np.linalg.norm(other.centre_px - centre)) < reach and alike < _VELOCITY_PX

@@ -12,10 +12,8 @@ from torchvision_dddas.targets.projective import transfer
 
 # A track is straight when its points lie this close to a constant velocity, px (root mean square).
 _STRAIGHT_PX = 2.0
-# Its speed is sure when it is this many of its own standard deviations.
-_SURE_SPEED = 8.0
 # It has travelled when it has gone this many of its own lengths.
-_LENGTHS = 1.5
+_LENGTHS = 0.5
 
 
 @dataclass
@@ -88,7 +86,7 @@ class SmallTracks:
 
     def _judge(self, track: Track) -> None:
         """Fit a constant velocity to the latest frames; confirm a track that travels straight, far and surely."""
-        recent = np.array(track.frames) > track.frames[-1] - 2 * self.knobs.hits
+        recent = np.array(track.frames) > track.frames[-1] - 3 * self.knobs.hits
         time, points = np.array(track.frames, float)[recent], track.points_px[recent]
         if len(time) < 2:
             return
@@ -106,7 +104,7 @@ class SmallTracks:
         length = float(np.median([max(w, h) for _, _, w, h in track.boxes]))
         travel = speed * (time[-1] - time[0])
         far = travel >= max(self.knobs.min_travel_px, _LENGTHS * length)
-        track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= _SURE_SPEED)
+        track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.knobs.sureness)
 
     def confirmed(self) -> list[Track]:
         """The tracks believed so far."""

@@ -85,8 +85,8 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
         a, b = window.small
         small = cv2.GaussianBlur(least(window.small), (5, 5), 0)
         small = cv2.bitwise_and(cv2.bitwise_and(small, seen[a], dst=small), seen[b], dst=small)
-        small = cv2.threshold(small, int(settings.small.threshold), 255, cv2.THRESH_BINARY)[1]
-        small = closed(cv2.erode(small, ellipse(3)), 5)
+        level = max(settings.small.threshold, settings.small.noise_ratio * cv2.mean(small)[0])
+        small = closed(cv2.threshold(small, int(level), 255, cv2.THRESH_BINARY)[1], settings.small.close_px)
     a, b = window.near[-1]
     offsets = (window.offsets[a], window.offsets[b])
     return Foreground(core, near, wide, texture, small, (warped[a], warped[b]), offsets)

@@ -167,8 +167,10 @@ class TorchVision:
         a, b = window.small
         least = torch.minimum(_apart(grey, warped[a]), _apart(grey, warped[b]))
         least = blur.gaussian_levels(least, 5) * _both(seen[a], seen[b], grey.shape[-1])
-        small = (least > int(self.knobs.small.threshold)).to(torch.uint8) * 255
-        return morphology.closing(morphology.erode(small, 3, "ellipse"), 5, "ellipse")
+        knobs = self.knobs.small
+        mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
+        level = (knobs.noise_ratio * mean).clamp(min=knobs.threshold).floor()
+        return morphology.closing((least > level).to(torch.uint8) * 255, knobs.close_px, "ellipse")
 
 
 def cell_side(width: int, height: int, knobs: RegistrationKnobs) -> int:
