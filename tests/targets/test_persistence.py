@@ -73,9 +73,15 @@ def test_at_the_ends_of_a_clip_fewer_frames_do(sightings):
     assert persistent(frames[:1], 0, SIZE, STRICT) == [True]
 
 
-def test_a_large_blob_needs_one_link_only(sightings):
+def test_a_large_blob_is_believed_without_steady_flow(sightings):
     assert verdict(sightings(there=(0, 0, 1, 1, 0), size=(100, 100), steady=0.0))
-    assert not verdict(sightings(there=(0, 0, 1, 0, 0), size=(100, 100), steady=0.0))
+    assert not verdict(sightings(there=(0, 0, 1, 1, 0), size=(20, 20), steady=0.0))
+
+
+def test_where_few_blobs_are_seen_one_link_does_for_a_small_one(sightings):
+    few = STRICT.model_copy(update={"trusted_blobs": 4})
+    assert verdict(sightings(there=(0, 0, 1, 1, 0), steady=0.0), knobs=few)
+    assert not verdict(sightings(there=(0, 0, 1, 0, 0), steady=0.0), knobs=few)
 
 
 def test_a_blob_that_jumps_elsewhere_is_not_the_same(box_blob):
