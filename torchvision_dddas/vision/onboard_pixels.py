@@ -10,8 +10,10 @@ from torchvision_dddas.targets.projective import transfer
 # round places to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
 _MOST_TILES = 6
-# Distances between grey levels among which a median distance is sought; the first is that of the least trimming.
-_DISTANCES = np.append(3 / 3.7 * 1.25 ** np.arange(19), 256.0)
+# The least median distance between grey levels that exposures are trimmed by; times 3.7 it is 3 levels.
+_LEAST_DISTANCE = 3 / 3.7
+_LEVELS = np.arange(256)
+_ROWS = 257 * _LEVELS
 
 
 def ellipse(side: int) -> np.ndarray:
@@ -142,19 +144,22 @@ class _GreyPairs:
         self.sum_below = _sums_along(times * np.arange(256, dtype=np.float32))
         self.count = float(self.below[:, -1].sum())
 
-    def near(self, middle: np.ndarray, reach: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(..., 256) for each x: how many y lie within `reach` of `middle`, and their sum."""
-        x = np.arange(256)
-        low = np.clip(np.ceil(middle - reach), 0, 256).astype(int)
-        high = np.clip(np.floor(middle + reach) + 1, low, 256).astype(int)
-        return self.below[x, high] - self.below[x, low], self.sum_below[x, high] - self.sum_below[x, low]
+    def near(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """(256,) for each x: how many y lie within `reach` of `middle`, and their sum."""
+        low, high = self._band(middle, reach)
+        return self.below.take(high) - self.below.take(low), self.sum_below.take(high) - self.sum_below.take(low)
+
+    def share(self, middle: np.ndarray, reach: float) -> float:
+        """The share of all pairs whose y lies within `reach` of `middle`."""
+        low, high = self._band(middle, reach)
+        return float(self.below.take(high).sum() - self.below.take(low).sum()) / self.count
 
     def median_offset(self) -> float:
         """The median of y - x."""
-        x, low, high = np.arange(256), -255, 255
+        low, high = -255, 255
         while low < high:
             middle = (low + high) // 2
-            if 2 * self.below[x, np.clip(x + middle + 1, 0, 256)].sum() >= self.count:
+            if 2 * self.below.take(_ROWS + np.clip(_LEVELS + middle + 1, 0, 256)).sum() >= self.count:
                 high = middle
             else:
                 low = middle + 1
@@ -162,10 +167,18 @@ class _GreyPairs:
 
     def trimming(self, middle: np.ndarray) -> float:
         """How far y may lie from `middle`: 3.7 times the median distance, at least 3 levels."""
-        if 2 * self.near(middle, _DISTANCES[0])[0].sum() >= self.count:
-            return 3.0
-        held = self.near(middle, _DISTANCES[:, None])[0].sum(axis=1)
-        return 3.7 * float(np.interp(self.count / 2, held, _DISTANCES))
+        near, held = _LEAST_DISTANCE, 0.0
+        while (more := self.share(middle, near)) < 0.5:
+            near, held = 1.25 * near, more
+        if near == _LEAST_DISTANCE:
+            return 3.7 * near
+        return 3.7 * float(np.interp(0.5, [held, more], [near / 1.25, near]))
+
+    def _band(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sums begin and end, as flat indices."""
+        low = np.clip(np.ceil(middle - reach), 0, 256)
+        high = np.maximum(np.clip(np.floor(middle + reach) + 1, 0, 256), low)
+        return _ROWS + low.astype(np.intp), _ROWS + high.astype(np.intp)
 
 
 def _sums_along(values: np.ndarray) -> np.ndarray:
