@@ -1,5 +1,7 @@
 """The plain OpenCV chain that speed is measured against: every three-frame window computed from nothing."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -21,7 +23,8 @@ def register(grey: np.ndarray, later: np.ndarray, start: np.ndarray) -> np.ndarr
     """(3, 3) grey_from_later by pyramidal Lucas-Kanade and RANSAC; the identity where too few points are found."""
     if not len(start):
         return np.eye(3)
-    end, found, _ = cv2.calcOpticalFlowPyrLK(grey, later, start, None, winSize=(21, 21), maxLevel=3)
+    nothing: Any = None
+    end, found, _ = cv2.calcOpticalFlowPyrLK(grey, later, start, nothing, winSize=(21, 21), maxLevel=3)
     good = found[:, 0] == 1
     if np.count_nonzero(good) < 8:
         return np.eye(3)
@@ -43,7 +46,7 @@ def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np
         seen &= cv2.warpPerspective(full, homography, (width, height), flags=cv2.INTER_NEAREST)
         difference = cv2.min(difference, cv2.absdiff(greys[0], warped))
     seen = cv2.erode(seen, np.ones((9, 9), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    smooth = cv2.GaussianBlur(difference, (7, 7), 0) & seen
+    smooth = cv2.bitwise_and(cv2.GaussianBlur(difference, (7, 7), 0), seen)
     mask = cv2.threshold(smooth, THRESHOLD, 255, cv2.THRESH_BINARY)[1]
     mask = cv2.morphologyEx(cv2.erode(mask, ellipse(3)), cv2.MORPH_CLOSE, ellipse(15))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)

@@ -1,10 +1,11 @@
 """How far registrations lie from a careful one: the mean displacement over the picture's four corners, in pixels.
 
-The careful registration follows up to 3000 corners from frame to frame and back through a wide window to a thousandth of a
-pixel, takes them for background by MAGSAC and fits the inliers thrice at a shrinking tolerance. Errors are those of
-frames one and two apart; ours two apart are composed of two steps, as the loop composes them.
+The careful registration follows up to 3000 corners from frame to frame and back through a wide window to a thousandth
+of a pixel, takes them for background by MAGSAC and fits the inliers thrice at a shrinking tolerance. Errors are those
+of frames one and two apart; ours two apart are composed of two steps, as the loop composes them.
 """
 
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -20,8 +21,9 @@ def errors(frames: list[np.ndarray], configs: tuple[str, ...] = ("fast", "defaul
     """{"plain": {"median", "p90", "pairs"}, "fast": ..., "default": ...} over all pairs of a clip."""
     greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
     apart = [(i, i + gap) for gap in (1, 2) for i in range(len(greys) - gap)]
-    careful = {pair: carefully(greys[pair[0]], greys[pair[1]]) for pair in apart}
-    known = [pair for pair in apart if careful[pair] is not None]
+    tried = {(a, b): carefully(greys[a], greys[b]) for a, b in apart}
+    careful = {pair: found for pair, found in tried.items() if found is not None}
+    known = list(careful)
     found = {"plain": {pair: np.linalg.inv(plain(greys[pair[0]], greys[pair[1]])) for pair in known}}
     for config in configs:
         steps = onboard(frames, config)
@@ -43,7 +45,7 @@ def onboard(frames: list[np.ndarray], config: str) -> list[np.ndarray]:
     """later_from_earlier of successive frames."""
     vision = load_vision("onboard", load(None if config == "default" else config))
     views = [vision.prepare(frame) for frame in frames]
-    return [vision.register([pair])[0].later_from_earlier for pair in zip(views, views[1:], strict=False)]
+    return [vision.register([pair])[0].later_from_earlier for pair in pairwise(views)]
 
 
 def carefully(grey: np.ndarray, later: np.ndarray) -> np.ndarray | None:

@@ -3,9 +3,9 @@
 usage: python eval/speed.py [CLIP...] [--sizes 640x480 1280x720] [--rounds 12] [--chains NAME...] [--json FILE]
 
 A clip is a video, a folder of pictures, or a folder that holds clips. With none the project's own scene is rendered at
-each of --sizes. All chains go through the same decoded frames, forwards and backwards, in turns of eight frames, so that
-whatever else the machine does meets them all; the first turns are left out. A ratio is the median over the turns of
-a chain's time through the plain chain's in the same turn. Garbage is collected between the turns.
+each of --sizes. All chains go through the same decoded frames, forwards and backwards, in turns of eight frames, so
+that whatever else the machine does meets them all; the first turns are left out. A ratio is the median over the turns
+of a chain's time through the plain chain's in the same turn. Garbage is collected between the turns.
 """
 
 import argparse
