@@ -36,6 +36,7 @@ FLOORS: dict[str, set[str]] = {
         "settings",
         "errors",
     },
+    "vision.exposure": {"cv2", "numpy"},
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "types", "settings", "errors"},
     "vision.onboard_registration": {"cv2", "numpy", "targets.projective", "types", "settings", "errors"},
     "vision.onboard_pixels": {"cv2", "numpy", "targets.occupied", "targets.projective", "types", "settings", "errors"},

@@ -13,6 +13,7 @@ import numpy as np
 from torchvision_dddas.settings import RegistrationKnobs
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Registration
+from torchvision_dddas.vision.exposure import in_one_light
 from torchvision_dddas.vision.judgement import judged
 from torchvision_dddas.vision.protocol import View
 
@@ -119,7 +120,7 @@ def _step(
     """The registration and its inliers' places in the later frame."""
     size, end, tracked = earlier.size, start, np.zeros(len(start), bool)
     if len(start) >= 4:
-        end, tracked = _track(earlier.grey, later.grey, start, knobs, predicted)
+        end, tracked = _track(*in_one_light(earlier, later), start, knobs, predicted)
     start, end = start[tracked], end[tracked]
     if len(start) < 4:
         return judged(np.eye(3), len(start), 0, np.inf, size, knobs), end
