@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.targets.blobs import Blob, find_blobs
+from torchvision_dddas.targets.blobs import Blob, find_blobs, parts_of
 from torchvision_dddas.targets.gates import Gates
 from torchvision_dddas.targets.grouping import groups
 from torchvision_dddas.targets.history import MotionHistory
@@ -15,8 +15,9 @@ from torchvision_dddas.targets.motion import DenseFlow, Motion, blob_motion, onl
 from torchvision_dddas.targets.parting import parted_by_flow
 from torchvision_dddas.targets.persistence import Sighting, persistent
 from torchvision_dddas.targets.segmentation import moving_parts
+from torchvision_dddas.targets.shadow import without_shadow
 from torchvision_dddas.types import Detections
-from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, View
+from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, Window
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Found:
 
 @dataclass
 class Observation:
-    """What one frame showed, before it is judged. `foreground` and `view` are dropped once its targets are drawn."""
+    """What one frame showed, before it is judged. Window and foreground are dropped once its targets are drawn."""
 
-    view: View | None
+    window: Window | None
     foreground: Foreground | None
     blobs: list[Blob] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
@@ -42,13 +43,13 @@ class Observation:
 
 
 def observe(
-    view: View, foreground: Foreground, flow: DenseFlow, settings: Settings, history: MotionHistory | None = None
+    window: Window, foreground: Foreground, flow: DenseFlow, settings: Settings, history: MotionHistory | None = None
 ) -> Observation:
     """The blobs of a window's reference frame and how each of them moves.
 
     history: moved on to this frame; it tells the motions where the settings ask for no dense flow.
     """
-    knobs = settings.difference
+    knobs, view = settings.difference, window.reference
     scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
     blobs = find_blobs(
         foreground.core,
@@ -68,7 +69,7 @@ def observe(
         history.add(foreground.core)
         parts = [part for blob in blobs for part in moving_parts(blob, history, view.size, settings.history)]
         blobs, motions = [part.blob for part in parts], [only_velocity(part.velocity_px) for part in parts]
-    return Observation(view, foreground, blobs, motions)
+    return Observation(window, foreground, blobs, motions)
 
 
 def draw_targets(
@@ -79,12 +80,12 @@ def draw_targets(
     steps: registration from each observation to the next, None at a cut.
     """
     here = observations[index]
-    if here.view is None or here.foreground is None or not here.blobs:
+    if here.window is None or here.foreground is None or not here.blobs:
         return []
     kept = [True] * len(here.blobs)
     if settings.persistence.on:
         sightings = [Sighting(o.blobs, o.motions, step) for o, step in zip(observations, [*steps, None], strict=False)]
-        kept = persistent(sightings, index, here.view.size, settings.persistence)
+        kept = persistent(sightings, index, here.window.reference.size, settings.persistence)
     found = []
     for i, (blob, keep) in enumerate(zip(here.blobs, kept, strict=True)):
         if not keep:
@@ -94,14 +95,17 @@ def draw_targets(
         if settings.refine.on and motion is not None:
             mask = _refined(blob, motion, here, settings)
         velocity = motion.velocity_px if motion is not None else np.full(2, np.nan)
-        found += _parts(blob, mask, velocity, settings)
+        score = score_of(blob.peak, settings)
+        for box, part in parts_of(mask, blob.box, settings.gates.min_area_px // 2):
+            found.append(Found(box, part, velocity, score))
     return join(found)
 
 
 def _refined(blob: Blob, motion: Motion, here: Observation, settings: Settings) -> np.ndarray:
-    view, foreground = here.view, here.foreground
-    assert view is not None and foreground is not None
-    return refine(
+    window, foreground = here.window, here.foreground
+    assert window is not None and foreground is not None
+    view = window.reference
+    mask = refine(
         blob,
         motion,
         view.image,
@@ -113,22 +117,12 @@ def _refined(blob: Blob, motion: Motion, here: Observation, settings: Settings) 
         EVIDENCE_SCALE,
         settings,
     )
-
-
-def _parts(blob: Blob, mask: np.ndarray, velocity_px: np.ndarray, settings: Settings) -> list[Found]:
-    """The connected parts of a refined mask that are large enough to be targets of their own."""
-    import cv2
-
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
-    parts = []
-    for label in range(1, count):
-        left, top, width, height, area = (int(v) for v in stats[label])
-        if area < settings.gates.min_area_px / 2:
-            continue
-        part = labels[top : top + height, left : left + width] == label
-        box = (blob.box[0] + left, blob.box[1] + top, width, height)
-        parts.append(Found(box, part, velocity_px, score_of(blob.peak, settings)))
-    return parts
+    # From the air, where targets are small and shadows as large; beside a car they are thin and dark as its tyres.
+    if window.wide is not None and blob.area_px <= settings.refine.shadow_share * view.grey.size:
+        grounds = [window.neighbours[i].image for i in window.wide]
+        maps = [window.neighbour_from_reference[i] for i in window.wide]
+        mask = without_shadow(mask, blob.box, view.image, grounds, maps)
+    return mask
 
 
 def score_of(peak: float, settings: Settings) -> float:

@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,6 @@ from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.small import SmallTracks, candidates
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision.protocol import View, Vision, Window
-
 
 # A picture whose grey levels spread by less than this shows nothing, not even through fog.
 _BLANK_LEVELS = 1.0
@@ -91,7 +91,8 @@ class Loop:
     def __init__(
         self, vision: Vision, settings: Settings, rate_hz: float, telemetry: Telemetry | None = None, batch: int = 1
     ) -> None:
-        self.vision, self.settings, self.rate_hz, self.telemetry, self.batch = vision, settings, rate_hz, telemetry, batch
+        self.vision, self.settings, self.batch = vision, settings, batch
+        self.rate_hz, self.telemetry = rate_hz, telemetry
         self.slots: deque[_Slot] = deque()
         self.first = 0  # index of slots[0]; indices count frames read
         self.registered = 0  # slots below this index have their step
@@ -149,7 +150,7 @@ class Loop:
         steps = []
         for i in range(0, len(todo) - 1, self.batch):
             part = todo[i : i + self.batch + 1]
-            steps += self.vision.register([(a.view, b.view) for a, b in zip(part, part[1:], strict=False)])
+            steps += self.vision.register([(a.view, b.view) for a, b in pairwise(part)])
         spent = (time.perf_counter() - start) / len(steps)
         for slot, after, step in zip(todo, todo[1:], steps, strict=False):
             # Keypoints can seem to be followed onto a blank picture: they stay where the search began.
@@ -232,9 +233,7 @@ class Loop:
         for (index, window), foreground in zip(made, foregrounds, strict=True):
             slot = self._at(index)
             start = time.perf_counter()
-            slot.observation = observe(
-                window.reference, foreground, self.flow, self._settings(slot), self._history(index)
-            )
+            slot.observation = observe(window, foreground, self.flow, self._settings(slot), self._history(index))
             slot.seconds |= {"foreground": spent, "blobs": time.perf_counter() - start}
         for index in ready:
             self._follow_small(index)
@@ -257,7 +256,9 @@ class Loop:
 
     def _window(self, index: int) -> Window | None:
         slot = self._at(index)
-        back = max(self.settings.difference.wide_frames, 2 * slot.interval, 2 * max(self.settings.difference.near_frames))
+        back = max(
+            self.settings.difference.wide_frames, 2 * slot.interval, 2 * max(self.settings.difference.near_frames)
+        )
         first, last = self._stretch(index, back, 2 * slot.interval)
         near, wide, small = windows.pairs(index, slot.interval, first, last, self._settings(slot))
         if not near:
@@ -320,7 +321,7 @@ class Loop:
             slot = self._at(index)
             assert slot.observation is not None
             slot.observation.targets = draw_targets(observations, steps, index - low, self._settings(slot))
-            slot.observation.view = slot.observation.foreground = None
+            slot.observation.window = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self.drawn += 1
 
@@ -339,8 +340,10 @@ class Loop:
                 break
             yield from self._gap(slot.frame)
             yield self._scene(slot, self.emitted)
-            slot.view.image = slot.view.grey  # the colours are not needed again
             self.emitted += 1
+            if (old := self.emitted - 1 - self.settings.difference.wide_frames) >= self.first:
+                view = self._at(old).view
+                view.image = view.grey  # no window looks at its colours again
             memory = max(2 * self.settings.interval.maximum_frames, self.settings.difference.wide_frames, 8)
             while self.first < self.emitted - memory:
                 self.slots.popleft()
@@ -350,8 +353,8 @@ class Loop:
         """Empty scenes for frame numbers that could not be read."""
         for number in range(self.last_number + 1, frame.number):
             missing = Frame(number, (number - 1) / self.rate_hz, np.zeros_like(frame.image))
-            mask = np.zeros(frame.image.shape[:2], np.uint16)
-            detections, _ = table([], (mask.shape[1], mask.shape[0]))
+            height, width = frame.image.shape[:2]
+            detections, mask = table([], (width, height))
             yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
         self.last_number = frame.number
 

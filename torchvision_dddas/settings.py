@@ -147,6 +147,9 @@ class RefineKnobs(Group):
     spatial_px: float = knob(60.0, "px", 1, 500, meaning="how far evidence spreads where colours do not change")
     colour_levels: float = knob(80.0, "grey levels", 1, 1000, meaning="change of colour that stops the spread")
     share: float = knob(0.55, "-", 0.05, 0.95, meaning="share of foreground evidence that makes a pixel foreground")
+    shadow_share: float = knob(
+        0.01, "-", 0, 1, meaning="cast shadows are cut off blobs of at most this share of the picture"
+    )
 
 
 class PersistenceKnobs(Group):
@@ -180,7 +183,9 @@ class SmallKnobs(Group):
     max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
     max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
     gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
-    hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate, of three times as many, that confirm a track")
+    hits: int = knob(
+        10, "frames", 2, 60, meaning="frames with a candidate, of three times as many, that confirm a track"
+    )
     min_travel_px: float = knob(4.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
     sureness: float = knob(8.0, "-", 1, 100, meaning="... at a speed of so many of its standard deviations")
     misses: int = knob(3, "frames", 0, 30, meaning="frames without a candidate after which a track ends")

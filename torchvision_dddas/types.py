@@ -55,7 +55,7 @@ class Detections:
 
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion over the ground, image axes
-    (0 = right, pi/2 = down), NaN when unknown. speed_px: (N,) pixels a frame relative to the background, NaN when unknown.
+    (0 = right, pi/2 = down). speed_px: (N,) pixels a frame relative to the background. Both NaN when unknown.
     kind: what it was found to be. Row i has value i + 1 in the frame's mask.
     """
 

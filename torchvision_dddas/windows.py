@@ -20,7 +20,7 @@ def reach(interval: int, settings: Settings) -> int:
 
 
 def delay(interval: int, settings: Settings) -> int:
-    """How many further frames are observed before a frame's targets are settled; with `reach`, two intervals at most."""
+    """How many further frames are observed before a frame is settled; with `reach`, two intervals at most."""
     if settings.persistence.on or settings.small.on:
         return max(2, 2 * interval - reach(interval, settings))
     return 0
@@ -56,9 +56,14 @@ def pairs(
     if knobs.wide_frames and near:
         forward = min(knobs.wide_frames, max(2 * interval - 2, 0), ahead - at)
         back = min(knobs.wide_frames, at - first)
-        wide = (at - back, at + forward) if back >= 3 and forward >= 2 else _symmetric(at, knobs.wide_frames, first, ahead)
-        wide = wide or next((p for gap in (5, 4, 3) if (p := _symmetric(at, gap, first, ahead))), None)
-    small = _symmetric(at, small_gap(interval, settings), first, ahead) if small_looked_for(interval, settings) else None
+        if back >= 3 and forward >= 2:
+            wide = (at - back, at + forward)
+        else:
+            gaps = range(knobs.wide_frames, 2, -1)
+            wide = next((p for gap in gaps if (p := _symmetric(at, gap, first, ahead))), None)
+    small = None
+    if small_looked_for(interval, settings):
+        small = _symmetric(at, small_gap(interval, settings), first, ahead)
     return near, wide, small
 
 

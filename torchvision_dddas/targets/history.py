@@ -24,7 +24,7 @@ class _Past:
 
 
 class MotionHistory:
-    """A clip's silhouettes of the last `duration_frames`. Move it to every frame in order, then add what moves there."""
+    """A clip's silhouettes of the last `duration_frames`. Move it on to every frame in order, then add its own."""
 
     def __init__(self, duration_frames: float) -> None:
         self.duration_frames = duration_frames
@@ -77,7 +77,7 @@ def gradient(
 def region_orientation(
     orientation_rad: np.ndarray, valid: np.ndarray, stamps: np.ndarray, region: np.ndarray, duration_frames: float
 ) -> tuple[float, float]:
-    """Mean direction of a (H, W) bool region in radians, NaN where it has none, and how far its gradients agree, 0 to 1.
+    """Mean direction of a (H, W) bool region in radians, NaN where it has none, and their agreement, 0 to 1.
 
     The weighted circular mean of the valid gradients, the newest weighing most: as `ops.history.region_orientation`.
     """

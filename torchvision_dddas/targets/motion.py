@@ -20,8 +20,8 @@ class Motion:
     """A blob's own motion over the registered background.
 
     velocity_px: (2,) pixels a frame, NaN where unknown. steady: share of its core that moves alike at both neighbours
-    and unlike its surroundings. affine: for each neighbour (3, 2), the displacement
-    affine[0] + affine[1] (u - centre_u) / scale + affine[2] (v - centre_v) / scale in pixels. frame: centre_u, centre_v, scale.
+    and unlike its surroundings. frame: centre_u, centre_v, scale. affine: for each neighbour (3, 2), the displacement
+    affine[0] + affine[1] (u - centre_u) / scale + affine[2] (v - centre_v) / scale in pixels.
     """
 
     velocity_px: np.ndarray
@@ -46,7 +46,7 @@ class DenseFlow:
             return [np.zeros((size[1], size[0], 2), np.float32) for _ in others]
         small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         pictures = (cv2.resize(other, size, interpolation=cv2.INTER_AREA) for other in others)
-        return [2 * self._search.calc(small, picture, None) for picture in pictures]
+        return [2 * self._search.calc(small, picture, np.zeros((*small.shape, 2), np.float32)) for picture in pictures]
 
 
 def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> Motion:

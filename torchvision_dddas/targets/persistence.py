@@ -25,9 +25,7 @@ class Sighting:
     next_from_this: np.ndarray | None
 
 
-def persistent(
-    sightings: Sequence[Sighting], index: int, size: tuple[int, int], knobs: PersistenceKnobs
-) -> list[bool]:
+def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int], knobs: PersistenceKnobs) -> list[bool]:
     """Which blobs of `sightings[index]` are targets, judged by up to two frames before and after it.
 
     size: (width, height) of the picture. Source: METHOD.md section 1 asks for independently moving targets; the test

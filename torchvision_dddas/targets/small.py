@@ -48,9 +48,7 @@ class SmallTracks:
         self.knobs = knobs
         self.tracks: list[Track] = []
 
-    def step(
-        self, frame: int, this_from_last: np.ndarray | None, boxes: Sequence[tuple[int, int, int, int]]
-    ) -> None:
+    def step(self, frame: int, this_from_last: np.ndarray | None, boxes: Sequence[tuple[int, int, int, int]]) -> None:
         """Take the candidates of one frame. this_from_last: (3, 3) registration, None at a cut."""
         if this_from_last is None:
             self.tracks = []
@@ -73,14 +71,14 @@ class SmallTracks:
         gate = self.knobs.gate_px
         rows, columns = linear_sum_assignment(np.minimum(distance, 2 * gate))
         taken = set()
-        for row, column in zip(rows, columns, strict=True):
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
             if distance[row, column] > gate:
                 continue
             track = self.tracks[row]
             track.frames.append(frame)
             track.points_px = np.vstack([track.points_px, centres[column]])
             track.boxes.append(boxes[column])
-            taken.add(int(column))
+            taken.add(column)
             self._judge(track)
         return taken
 

@@ -18,7 +18,7 @@ class View:
     """One frame as the back end holds it. Made by `Vision.prepare`.
 
     image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W).
-    kept: what the engine computed for this frame and will want again (pyramid, tensor, keypoints); nobody else reads it.
+    kept: what the engine computed for this frame and will want again (pyramid, tensor, keypoints); its own affair.
     """
 
     image: np.ndarray
