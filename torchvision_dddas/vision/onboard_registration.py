@@ -166,10 +166,14 @@ def _fit(start: np.ndarray, end: np.ndarray, knobs: RegistrationKnobs) -> np.nda
         model = cv2.findHomography(start, end, cv2.USAC_MAGSAC, knobs.ransac_px, maxIters=2000, confidence=0.999)[0]
     if model is None:
         return np.eye(3)
+    fitted = np.zeros(0, bool)
     for tolerance in (1.5 * knobs.ransac_px, knobs.ransac_px, 0.5 * knobs.ransac_px, 0.5 * knobs.ransac_px):
         near = np.linalg.norm(transfer(model, start) - end, axis=1) < tolerance
         if near.sum() < 12:
             break
+        if np.array_equal(near, fitted):  # the same points again give the same model
+            continue
+        fitted = near
         if affine:
             rows = np.c_[start[near], np.ones(near.sum())].astype(np.float64)
             refit = np.vstack([np.linalg.lstsq(rows, end[near].astype(np.float64), rcond=None)[0].T, [0, 0, 1]])
