@@ -25,17 +25,9 @@ FLOORS: dict[str, set[str]] = {
     # Labelling stays in OpenCV for every runtime: hence cv2 here.
     "targets": {"numpy", "scipy", "cv2", "pymap3d", "types", "settings", "errors"},
     "vision": {"numpy", "targets.projective", "types", "settings", "errors"},
-    "vision.torch_vision": {
-        "torch",
-        "kornia",
-        "numpy",
-        "cv2",
-        "ops",
-        "targets.projective",
-        "types",
-        "settings",
-        "errors",
-    },
+    "vision.torch_vision": {"torch", "numpy", "cv2", "ops", "types", "settings", "errors"},
+    "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},
+    "vision.torch_pixels": {"torch", "ops", "settings"},
     "vision.exposure": {"cv2", "numpy"},
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "types", "settings", "errors"},
     "vision.onboard_registration": {"cv2", "numpy", "targets.projective", "types", "settings", "errors"},
@@ -56,8 +48,8 @@ FLOORS: dict[str, set[str]] = {
     "cli": {"*"},
 }
 # Only these may need torch to be imported at all.
-NEED_TORCH = ("ops", "vision.torch_vision", "tuning", "exporting")
-BACK_ENDS = ("vision.torch_vision", "vision.onboard_vision")
+NEED_TORCH = ("ops", "vision.torch_vision", "vision.torch_registration", "vision.torch_pixels", "tuning", "exporting")
+BACK_ENDS = ("vision.torch_", "vision.onboard_")
 
 FILES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
@@ -115,7 +107,8 @@ def strangers(module: str, source: str, is_package: bool = False) -> list[str]:
             continue
         # Both back ends speak the seam's words; the seam loads one of them only when asked to, and neither the other.
         if folder == top == "vision":
-            if name.startswith(BACK_ENDS) and (at_module_level or module.startswith(BACK_ENDS)):
+            home, asked = (next((b for b in BACK_ENDS if m.startswith(b)), None) for m in (module, name))
+            if asked is not None and asked != home and (at_module_level or home is not None):
                 wrong.append(name)
             continue
         if name == "jaxtyping" or (not is_torch and below(name, floor)) or any(below(name, other) for other in allowed):
@@ -144,6 +137,8 @@ def test_a_module_imports_only_what_its_floor_allows(module: str) -> None:
         ("vision.onboard_vision", "def f():\n    from torchvision_dddas.ops import warp", "ops.warp"),
         ("vision.onboard_vision", "from torchvision_dddas.vision.torch_vision import load", "vision.torch_vision"),
         ("vision.onboard_vision", "def f():\n    import torchvision_dddas.vision.torch_vision", "vision.torch_vision"),
+        ("vision.onboard_pixels", "from torchvision_dddas.vision.torch_pixels import warp", "vision.torch_pixels"),
+        ("vision.judgement", "from torchvision_dddas.vision.torch_pixels import warp", "vision.torch_pixels"),
         ("vision", "from torchvision_dddas.vision.torch_vision import load", "vision.torch_vision"),
         ("cli.detect", "import torch", "torch"),
         ("cli.detect", "class A:\n    from kornia import filters", "kornia"),
@@ -164,7 +159,7 @@ def test_a_forbidden_import_is_noticed(
     [
         ("cli.detect", "def f():\n    import torch"),
         ("vision", "def f():\n    from torchvision_dddas.vision.torch_vision import load"),
-        ("vision.torch_vision", "import torch\nfrom .protocol import Vision"),
+        ("vision.torch_vision", "import torch\nfrom .protocol import Vision\nfrom .torch_pixels import warp"),
         ("targets.geodesy", "import math\nfrom torchvision_dddas.types import Frame\nfrom .plane import solve"),
         ("ops.warp", "import torch.nn.functional as F\nfrom ..errors import InputError"),
     ],

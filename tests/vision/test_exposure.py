@@ -1,0 +1,89 @@
+"""A gain that jumps is told from a camera that moves, and does not move the registration."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from torchvision_dddas import settings as knobs
+from torchvision_dddas.simulation.scene import render
+from torchvision_dddas.targets.projective import corner_error
+from torchvision_dddas.vision import View, load
+from torchvision_dddas.vision.exposure import exposure, in_one_light
+
+SIZE = (320, 240)
+GAIN = [1.0, 1.15, 0.85, 0.85, 1.0, 1.15]
+
+
+def lit(grey: np.ndarray, gain: float, offset: float = 0.0) -> np.ndarray:
+    return np.clip(np.round(grey * gain + offset), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def greys() -> list[np.ndarray]:
+    onboard = load("onboard", knobs.load())
+    return [onboard.prepare(image).grey for image in render(3, 6, SIZE).images]
+
+
+def view(grey: np.ndarray) -> View:
+    return View(grey, grey)
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset"), [(1.15, 0.0), (0.85, 0.0), (1.35, 0.0), (0.74, 0.0), (1.0, 12.0), (0.9, 15)]
+)
+def test_the_later_frame_comes_back_to_the_earlier_ones_light_though_the_camera_moved(greys, gain, offset) -> None:
+    same, moved = greys[0].astype(int), greys[1]
+    earlier, later = in_one_light(view(greys[0]), view(lit(moved, gain, offset)))
+    # One of the two was brought to the other, the darker one.
+    changed = later if gain * 128 + offset < 128 else earlier
+    wanted = moved if gain * 128 + offset < 128 else lit(same, gain, offset)
+    unclipped = (wanted > 5) & (wanted < 250)
+    assert np.median(np.abs(changed.astype(int) - wanted)[unclipped]) <= 2
+
+
+def test_frames_of_one_light_are_left_as_they_are_however_the_camera_moves(greys) -> None:
+    for a, b in [*pairwise(greys), (greys[0], greys[5])]:
+        earlier, later = in_one_light(view(a), view(b))
+        assert earlier is a and later is b
+
+
+def test_content_that_changes_is_not_taken_for_light(greys) -> None:
+    changed = greys[0].copy()
+    changed[:, :110] = 235
+    assert not np.array_equal(in_one_light(view(greys[0]), view(lit(greys[0], 1.15)))[0], greys[0])
+    earlier, later = in_one_light(view(greys[0]), view(changed))
+    assert earlier is greys[0] and later is changed
+
+
+def test_what_white_has_cut_off_is_cut_off_in_both(greys) -> None:
+    bright = np.clip(greys[0].astype(int) + 90, 0, 255).astype(np.uint8)
+    lighter = lit(bright, 1.15)
+    assert (lighter == 255).mean() > 0.02
+    earlier, later = in_one_light(view(bright), view(lighter))
+    assert later is lighter
+    assert (earlier[lighter == 255] >= 250).mean() > 0.95
+
+
+def test_too_few_levels_tell_nothing() -> None:
+    dark, white = np.zeros(33), np.full(33, 255.0)
+    assert exposure(dark, white) == (1.0, 0.0)
+    flat = np.full(33, 100.0)
+    gain, offset = exposure(flat, flat + 20)
+    assert gain == 1.0 and offset == pytest.approx(-20)
+
+
+@pytest.mark.parametrize("config", [None, "fast"])
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_a_jumping_gain_does_not_move_the_registration(backend, config) -> None:
+    if backend == "torch":
+        pytest.importorskip("torch")
+    steps = []
+    for gain in (None, GAIN):
+        engine = load(backend, knobs.load(config))
+        views = [engine.prepare(image) for image in render(3, 6, SIZE, gain).images]
+        # One pair a call, as in a stream: what is carried from step to step must bear the jump too.
+        steps.append([engine.register([pair])[0] for pair in pairwise(views)])
+    for as_it_is, jumping in zip(*steps, strict=True):
+        assert jumping.reliable
+        assert corner_error(as_it_is.later_from_earlier, jumping.later_from_earlier, SIZE) < 0.2

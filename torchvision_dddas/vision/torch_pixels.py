@@ -1,0 +1,113 @@
+"""Pixel steps of the batched back end, on whole grey levels."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.ops import blur, difference, morphology, warp
+from torchvision_dddas.settings import DifferenceKnobs, SmallKnobs
+from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, View, Window
+
+LEVEL = 255.0
+
+
+def levels_of(view: View, device: torch.device) -> Tensor:
+    """(1, 1, H, W) float32 grey levels, made once."""
+    if "levels" not in view.kept:
+        view.kept["levels"] = torch.from_numpy(view.grey)[None, None].to(device).float()
+    levels: Tensor = view.kept["levels"]
+    return levels
+
+
+def joined(pictures: Sequence[Tensor]) -> Tensor:
+    """One batch; a single picture is not copied."""
+    return pictures[0] if len(pictures) == 1 else torch.cat(list(pictures))
+
+
+def evidence(
+    window: Window,
+    grey: Tensor,
+    warped: list[Tensor],
+    seen: list[tuple[Tensor, Tensor]],
+    texture: Tensor,
+    knobs: DifferenceKnobs,
+) -> tuple[Tensor, Tensor]:
+    """The largest evidence over the near pairs, and that of the wide pair, uint8."""
+    width = grey.shape[-1]
+    if knobs.kind == "normalized":
+        noise = texture.square().mul_((knobs.gradient_share / 4) ** 2).add_(knobs.noise_levels**2)
+        weight, textured = noise.rsqrt_().mul_(EVIDENCE_SCALE), texture > 16
+    distance = {k: apart(grey, warped[k]) for k in _used(window)} if knobs.kind != "between_later" else {}
+
+    def of(pair: tuple[int, int]) -> Tensor:
+        a, b = pair
+        both = seen_by_both(seen[a], seen[b], width)
+        least = apart(warped[a], warped[b]) if not distance else torch.minimum(distance[a], distance[b])
+        if knobs.kind != "normalized":
+            return blur.gaussian_levels(least, knobs.blur_px) * both
+        z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
+        z = blur.gaussian_levels(z, knobs.blur_px)
+        return _in_units(z, textured & both)
+
+    near = of(window.near[0])
+    for pair in window.near[1:]:
+        near = torch.maximum(near, of(pair))
+    return near, near if window.wide is None else of(window.wide)
+
+
+def small_movers(
+    window: Window, grey: Tensor, warped: list[Tensor], seen: list[tuple[Tensor, Tensor]], knobs: SmallKnobs
+) -> Tensor | None:
+    """255 where something small may move, uint8; None where nobody looks for it."""
+    if window.small is None:
+        return None
+    a, b = window.small
+    least = torch.minimum(apart(grey, warped[a]), apart(grey, warped[b]))
+    least = blur.gaussian_levels(least, 5) * seen_by_both(seen[a], seen[b], grey.shape[-1])
+    mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
+    level = (knobs.noise_ratio * mean).clamp(min=knobs.threshold).floor()
+    return morphology.closing((least > level).to(torch.uint8) * 255, knobs.close_px, "ellipse")
+
+
+def _used(window: Window) -> set[int]:
+    return {k for pair in (*window.near, *([window.wide] if window.wide else [])) for k in pair}
+
+
+def _in_units(z: Tensor, textured: Tensor) -> Tensor:
+    """Evidence divided by its median over textured pixels, where that is above one noise unit."""
+    units = []
+    for one, here in zip(z, textured, strict=True):
+        counts = torch.bincount(one[here], minlength=256).cumsum(0)
+        total = int(counts[-1])
+        # The mean of the two in the middle, as NumPy takes it.
+        ranks = torch.tensor([(total - 1) // 2, total // 2], device=z.device)
+        median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > 500 else 0.0
+        units.append(max(1.0, median / EVIDENCE_SCALE))
+    if max(units) == 1.0:
+        return z
+    per_unit = torch.tensor([1 / unit for unit in units], device=z.device).reshape(-1, 1, 1, 1)
+    return z.float().mul_(per_unit).round_().to(torch.uint8)
+
+
+def exposed(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
+    """The warped pictures in their references' exposure, in whole levels."""
+    first, last = (edge[:, ::4] for edge in seen)
+    columns = torch.arange(0, reference.shape[-1], 4, device=reference.device)
+    inside = (columns >= first[..., None]) & (columns <= last[..., None])
+    wanted, given = (picture[..., ::4, ::4] / LEVEL for picture in (reference, warped))
+    gain, offset = difference.exposure(wanted, given, inside[:, None], stride=1)
+    enough = inside.sum((1, 2)) >= 100
+    gain, offset = torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
+    gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
+    return warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+
+
+def apart(a: Tensor, b: Tensor) -> Tensor:
+    """|a - b| of unsigned bytes."""
+    return torch.maximum(a, b).sub_(torch.minimum(a, b))
+
+
+def seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Tensor:
+    """Where both neighbours are seen, as a Boolean mask."""
+    return warp.between(torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1]), width)

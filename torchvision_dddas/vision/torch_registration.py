@@ -1,0 +1,167 @@
+"""The step from a frame to the next in tensors: grid keypoints, Lucas-Kanade, RANSAC, refits; all pairs at once."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchvision_dddas.ops import affine, consensus, flow, homography, keypoints
+from torchvision_dddas.settings import RegistrationKnobs
+from torchvision_dddas.targets.projective import transfer
+from torchvision_dddas.types import Registration
+from torchvision_dddas.vision.exposure import in_one_light
+from torchvision_dddas.vision.judgement import judged
+from torchvision_dddas.vision.protocol import View
+from torchvision_dddas.vision.torch_pixels import LEVEL, joined, levels_of
+
+POINTS_AT_ONCE = {"cpu": 1000, "cuda": 100_000}
+SCOUTS = 32
+
+
+def register(pairs: list[tuple[View, View]], knobs: RegistrationKnobs, device: torch.device) -> list[Registration]:
+    """The background's motion from the first to the second frame of each pair, all of one size.
+
+    Pyramids, and the keypoints of the earlier frames, are left in `kept` for other pairs.
+    """
+    for earlier, _ in pairs:
+        _detect(earlier, knobs, device)
+    followed = [_in_one_light(earlier, later) for earlier, later in pairs]
+    _build_pyramids([view for pair in followed for view in pair], knobs, device)
+    count = max(pairs[0][0].kept["points"].shape[1], 1)
+    step = max(1, POINTS_AT_ONCE.get(device.type, 1000) // count)
+    found: list[Registration] = []
+    for first in range(0, len(pairs), step):
+        part = np.s_[first : first + step]
+        found += _register_at_once([earlier for earlier, _ in pairs[part]], followed[part], knobs)
+    return found
+
+
+def _register_at_once(
+    detected: list[View], followed: list[tuple[View, View]], knobs: RegistrationKnobs
+) -> list[Registration]:
+    """detected: the frames that hold the keypoints. followed: the same frames and the later ones, in one light."""
+    points, valid = (joined([view.kept[name] for view in detected]) for name in ("points", "valid"))
+    earlier, later = (
+        [joined(level) for level in zip(*(pair[i].kept["pyramid"] for pair in followed), strict=True)] for i in (0, 1)
+    )
+    if points.shape[1]:
+        end, found = _follow(points, valid, earlier, later, knobs)
+        tracked = valid & found
+        matrices = _fit(points.double(), end.double(), tracked, knobs)
+    else:
+        end, tracked, matrices = points, valid, torch.eye(3).expand(len(detected), 3, 3)
+    arrays = (array.cpu().numpy() for array in (points, end, valid, tracked, matrices))
+    return [_judged(one, detected[0].size, knobs) for one in zip(*arrays, strict=True)]
+
+
+def _in_one_light(earlier: View, later: View) -> tuple[View, View]:
+    """The pair as it is followed: where exposures differ, one of the two is a view of its own."""
+    greys = in_one_light(earlier, later)
+    first, second = (
+        view if grey is view.grey else View(view.image, grey)
+        for view, grey in zip((earlier, later), greys, strict=True)
+    )
+    return first, second
+
+
+def _build_pyramids(views: list[View], knobs: RegistrationKnobs, device: torch.device) -> None:
+    """Those that are not there yet, in one batch."""
+    missing = list({id(view): view for view in views if "pyramid" not in view.kept}.values())
+    if not missing:
+        return
+    levels, smaller_side = 1, min(missing[0].size)
+    # OpenCV's rule: a level that Lucas-Kanade's window does not fit into is left out.
+    while levels <= knobs.levels and smaller_side / 2**levels > knobs.window_px:
+        levels += 1
+    pictures = flow.pyramid(joined([levels_of(view, device) for view in missing]), levels)
+    for number, view in enumerate(missing):
+        view.kept["pyramid"] = [level[number : number + 1] for level in pictures]
+
+
+def _detect(view: View, knobs: RegistrationKnobs, device: torch.device) -> None:
+    if "points" not in view.kept:
+        cell = cell_side(*view.size, knobs)
+        view.kept["points"], _, view.kept["valid"] = keypoints.grid_features(
+            levels_of(view, device), cell, knobs.quality, knobs.block_px, least=1e-7 * LEVEL**2
+        )
+
+
+def cell_side(width: int, height: int, knobs: RegistrationKnobs) -> int:
+    """Side of the grid cells, in pixels, that keeps the number of keypoints within the budget."""
+    return max(knobs.cell_px, int(np.ceil(np.sqrt(width * height / knobs.keypoints))))
+
+
+def _follow(
+    points: Tensor, valid: Tensor, earlier: list[Tensor], later: list[Tensor], knobs: RegistrationKnobs
+) -> tuple[Tensor, Tensor]:
+    """Where the points are in the later frames, and which were found.
+
+    A few scouts search the whole pyramid; the others start where the scouts' motion takes them, which is quicker by
+    far. Where the scouts do not agree, all points search the whole pyramid.
+    """
+    if points.shape[1] < 2 * SCOUTS:
+        return _search(points, earlier, later, knobs)
+    scouts = consensus.spread(valid, SCOUTS)
+    start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
+    ahead, found = flow.track(start, earlier, later, rounds=3, **_tracking(knobs))
+    found = found & valid.gather(1, scouts)
+    motion = _fit(start, ahead, found, knobs)
+    near = found & (consensus.transfer_error(motion, start, ahead) < knobs.ransac_px)
+    agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
+    end, kept = torch.zeros_like(points), torch.zeros_like(valid)
+    for choice, guessed in ((agreed, True), (~agreed, False)):
+        chosen = choice.nonzero()[:, 0]
+        if len(chosen):
+            pyramids = earlier, later
+            if len(chosen) < len(points):
+                pyramids = [level[chosen] for level in earlier], [level[chosen] for level in later]
+            guess = consensus.transfer(motion[chosen], points[chosen]) if guessed else None
+            end[chosen], kept[chosen] = _search(points[chosen], *pyramids, knobs, guess)
+    return end, kept
+
+
+def _search(
+    points: Tensor, earlier: list[Tensor], later: list[Tensor], knobs: RegistrationKnobs, guess: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Lucas-Kanade through the whole pyramid, or, near a guess, in its finest level."""
+    settings = _tracking(knobs) | {"rounds": 3}
+    if guess is not None:
+        earlier, later, settings = earlier[:1], later[:1], settings | {"reach_px": 2, "rounds": 2}
+    if knobs.forward_backward_px > 0:
+        return flow.forward_backward(points, earlier, later, guess, limit_px=knobs.forward_backward_px, **settings)
+    return flow.track(points, earlier, later, guess, **settings)
+
+
+def _tracking(knobs: RegistrationKnobs) -> dict[str, Any]:
+    return {
+        "window_px": knobs.window_px,
+        "iterations": knobs.iterations,
+        "epsilon_px": knobs.epsilon_px,
+        "min_eigen": 1e-4 * LEVEL**2,
+    }
+
+
+def _fit(start: Tensor, end: Tensor, tracked: Tensor, knobs: RegistrationKnobs) -> Tensor:
+    """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy."""
+    model = affine if knobs.model == "affine" else homography
+    batch, count = tracked.shape
+    if count < model.SAMPLE_SIZE:
+        return torch.eye(3, dtype=start.dtype, device=start.device).expand(batch, 3, 3)
+    # The same numbers for every pair and call: what one pair gives does not depend on its company.
+    generator = torch.Generator().manual_seed(0)
+    samples = consensus.draw_samples(generator, 1, knobs.hypotheses, count, model.SAMPLE_SIZE)
+    samples = samples.to(start.device).expand(batch, -1, -1)
+    refits = tuple(share * knobs.ransac_px for share in (1.5, 1.0, 0.5, 0.5))
+    return model.ransac(start, end, tracked, samples, knobs.ransac_px, refits)[0]
+
+
+def _judged(found: tuple[np.ndarray, ...], size: tuple[int, int], knobs: RegistrationKnobs) -> Registration:
+    start, end, valid, tracked, later_from_earlier = found
+    start, end = start[tracked], end[tracked]
+    if valid.sum() < 4 or len(start) < 4:
+        return judged(np.eye(3), len(start) if valid.sum() >= 4 else 0, 0, np.inf, size, knobs)
+    miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
+    inliers = miss < knobs.ransac_px
+    error = float(np.median(miss[inliers])) if inliers.any() else np.inf
+    return judged(later_from_earlier.astype(np.float64), len(start), int(inliers.sum()), error, size, knobs)
