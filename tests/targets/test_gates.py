@@ -48,4 +48,4 @@ def test_on_the_ground_the_scale_stays_finite(altitude):
     ],
 )
 def test_the_longer_side_and_the_speed_decide(box, velocity, passes):
-    assert Gates(10.0, 200.0, 60.0).admit(*box, np.array(velocity)) is passes
+    assert Gates(10.0, 200.0, 60.0).admit(box[0], box[1], np.array(velocity)) is passes

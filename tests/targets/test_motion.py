@@ -13,7 +13,7 @@ BOX = (50, 40, 40, 30)
 
 def texture(seed: int, shape=SHAPE) -> np.ndarray:
     noise = np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
-    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), noise, 0, 255, cv2.NORM_MINMAX)
 
 
 def scene(shift: tuple[int, int]) -> np.ndarray:

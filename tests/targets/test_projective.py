@@ -10,7 +10,9 @@ TILT = np.array([[1.02, 0.01, 5], [-0.02, 0.99, 2], [1e-4, -2e-4, 1]])
 
 
 def test_transfer_by_hand():
-    np.testing.assert_allclose(transfer(np.array([[2, 0, 1], [0, 1, 0], [0, 0.1, 1]]), [[3, 10]]), [[3.5, 5]])
+    np.testing.assert_allclose(
+        transfer(np.array([[2, 0, 1], [0, 1, 0], [0, 0.1, 1]]), np.array([[3, 10]])), np.array([[3.5, 5]])
+    )
 
 
 def test_there_and_back_is_the_identity():
@@ -19,7 +21,7 @@ def test_there_and_back_is_the_identity():
 
 
 def test_a_point_on_the_horizon_goes_to_infinity_without_a_warning():
-    assert not np.isfinite(transfer(np.array([[1, 0, 0], [0, 1, 0], [1, 0, 0.0]]), [[0, 5]])).all()
+    assert not np.isfinite(transfer(np.array([[1, 0, 0], [0, 1, 0], [1, 0, 0.0]]), np.array([[0, 5]]))).all()
 
 
 def test_no_points_give_no_points():
