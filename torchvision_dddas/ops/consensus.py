@@ -83,13 +83,31 @@ def ransac(
     matrix = hypotheses.gather(1, best[..., None, None].expand(-1, 1, 3, 3))[:, 0]
     found = possible.gather(1, best)[:, 0] & (valid.sum(1) >= size)
     matrix = torch.where(found[:, None, None], matrix, torch.eye(3, dtype=p.dtype, device=p.device))
-    for gate_px in refits:
-        support = valid & (transfer_error(matrix, p, q) < gate_px)
-        refitted, solved = fit(p, q, support.to(p.dtype) / _depth(matrix, p).square())
-        solved = solved & found & (support.sum(1) >= 2 * size)
-        matrix = torch.where(solved[:, None, None], refitted, matrix)
+    matrix = refitted(p, q, valid & found[:, None], matrix, refits, size, fit)
     inliers = valid & found[:, None] & (transfer_error(matrix, p, q) < tolerance)
     return matrix, inliers, found & (inliers.sum(1) >= size)
+
+
+def refitted(
+    p: Float[Tensor, "B N 2"],
+    q: Float[Tensor, "B N 2"],
+    valid: Bool[Tensor, "B N"],
+    guess: Float[Tensor, "B 3 3"],
+    gates_px: tuple[float, ...],
+    size: int,
+    fit: Fit,
+) -> Float[Tensor, "B 3 3"]:
+    """The guess, fitted anew once per gate to the valid pairs that miss it by less.
+
+    A fit counts only if twice the minimal number of points, `size`, support it.
+    """
+    matrix = guess
+    for gate_px in gates_px:
+        support = valid & (transfer_error(matrix, p, q) < gate_px)
+        found, solved = fit(p, q, support.to(p.dtype) / _depth(matrix, p).square())
+        solved = solved & (support.sum(1) >= 2 * size)
+        matrix = torch.where(solved[:, None, None], found, matrix)
+    return matrix
 
 
 def reweighted(

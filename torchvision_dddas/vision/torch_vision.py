@@ -16,7 +16,7 @@ from torchvision_dddas.ops import difference, morphology, warp
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.types import Registration
 from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, View, Window
-from torchvision_dddas.vision.torch_pixels import evidence, exposed, joined, levels_of, small_movers
+from torchvision_dddas.vision.torch_pixels import closed, evidence, exposed, joined, levels_of, small_movers
 from torchvision_dddas.vision.torch_registration import register
 
 Item = TypeVar("Item")
@@ -91,7 +91,7 @@ class TorchVision:
         near, wide = evidence(one, grey, warped, seen, texture, knobs)
         scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
         core = (near > int(knobs.threshold * scale)).to(torch.uint8) * 255
-        core = morphology.closing(morphology.erode(core, morph.erode_px, "ellipse"), morph.close_px, "ellipse")
+        core = closed(morphology.erode(core, morph.erode_px, "ellipse"), morph.close_px)
         small = small_movers(one, grey, warped, seen, self.knobs.small)
         a, b = one.near[-1]
         maps = core, near, wide, texture.to(torch.uint8), warped[a], warped[b]
