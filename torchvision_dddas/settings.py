@@ -183,10 +183,8 @@ class SmallKnobs(Group):
     max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
     max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
     gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
-    hits: int = knob(
-        10, "frames", 2, 60, meaning="frames with a candidate, of three times as many, that confirm a track"
-    )
-    min_travel_px: float = knob(4.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
+    hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate that confirm a track at the earliest")
+    min_travel_px: float = knob(3.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
     sureness: float = knob(8.0, "-", 1, 100, meaning="... at a speed of so many of its standard deviations")
     misses: int = knob(3, "frames", 0, 30, meaning="frames without a candidate after which a track ends")
 

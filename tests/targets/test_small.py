@@ -38,8 +38,8 @@ def test_what_sways_to_and_fro_is_never_confirmed():
     assert follow(lambda k: (50 + 6 * np.sin(k), 60)).confirmed() == []
 
 
-def test_travel_of_less_than_half_its_own_length_is_not_enough():
-    assert follow(lambda k: (50 + 0.5 * k, 60), size=(40, 6)).confirmed() == []
+def test_travel_of_less_than_a_quarter_of_its_own_length_is_not_enough():
+    assert follow(lambda k: (50 + 0.25 * k, 60), size=(40, 6)).confirmed() == []
 
 
 def test_too_few_sightings_confirm_nothing():

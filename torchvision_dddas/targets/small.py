@@ -1,5 +1,6 @@
 """Small slow targets: weak candidates followed over many frames, believed once they have travelled steadily."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,8 +13,11 @@ from torchvision_dddas.targets.projective import transfer
 
 # A track is straight when its points lie this close to a constant velocity, px (root mean square).
 _STRAIGHT_PX = 2.0
-# It has travelled when it has gone this many of its own lengths.
-_LENGTHS = 0.5
+# Its motion is measured over so many frames at most.
+_MEMORY_FRAMES = 30
+# It has travelled when it has gone so many of its own lengths, and more of them for each other candidate in the frame:
+# clutter, parallax above all, drifts too.
+_LENGTHS, _LENGTHS_EACH = 0.25, 0.005
 
 
 @dataclass
@@ -47,11 +51,13 @@ class SmallTracks:
     def __init__(self, knobs: SmallKnobs) -> None:
         self.knobs = knobs
         self.tracks: list[Track] = []
+        self.counts: deque[int] = deque(maxlen=20)
 
     def step(self, frame: int, this_from_last: np.ndarray | None, boxes: Sequence[tuple[int, int, int, int]]) -> None:
         """Take the candidates of one frame. this_from_last: (3, 3) registration, None at a cut."""
         if this_from_last is None:
             self.tracks = []
+        self.counts.append(len(boxes))
         for track in self.tracks:
             tip = np.vstack([track.points_px[-1] - track.velocity_px, track.points_px])
             moved = transfer(this_from_last, tip)  # type: ignore[arg-type]
@@ -84,7 +90,7 @@ class SmallTracks:
 
     def _judge(self, track: Track) -> None:
         """Fit a constant velocity to the latest frames; confirm a track that travels straight, far and surely."""
-        recent = np.array(track.frames) > track.frames[-1] - 3 * self.knobs.hits
+        recent = np.array(track.frames) > track.frames[-1] - _MEMORY_FRAMES
         time, points = np.array(track.frames, float)[recent], track.points_px[recent]
         if len(time) < 2:
             return
@@ -101,7 +107,8 @@ class SmallTracks:
         sigma = max(rms, 0.3) / np.sqrt(spread)
         length = float(np.median([max(w, h) for _, _, w, h in track.boxes]))
         travel = speed * (time[-1] - time[0])
-        far = travel >= max(self.knobs.min_travel_px, _LENGTHS * length)
+        lengths = _LENGTHS + _LENGTHS_EACH * float(np.median(self.counts))
+        far = travel >= max(self.knobs.min_travel_px, lengths * length)
         track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.knobs.sureness)
 
     def confirmed(self) -> list[Track]:
