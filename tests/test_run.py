@@ -32,8 +32,8 @@ class Film:
 
     rate_hz = RATE_HZ
 
-    def __init__(self, images: Sequence[np.ndarray], count: int | None = None) -> None:
-        self.frames, self.count = frames_of(images), count
+    def __init__(self, images: Sequence[np.ndarray], count: int | None = None, last: int = 0) -> None:
+        self.frames, self.count, self.last = frames_of(images), count, last
 
     def __iter__(self):
         return iter(self.frames)
@@ -244,6 +244,14 @@ def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film
         scene = found[number - 1]
         assert (scene.reliable, scene.cause) == (False, "the frame could not be read")
         assert not scene.mask.any() and len(scene.detections) == 0
+
+
+def test_last_frames_that_cannot_be_read_get_their_empty_scenes_too(film):
+    settings = load("fast")
+    told = list(run(Film(film.images[:10], last=12), load_vision("onboard", settings), settings))
+    assert [s.frame.number for s in told] == list(range(1, 13))
+    assert [s.reliable for s in told[-3:]] == [True, False, False]
+    assert not told[-1].mask.any() and len(told[-1].detections) == 0
 
 
 # -- clips too short, telemetry --------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def run(
         yield from loop.feed(frame)
     if telemetry is not None:
         _check_overlap(telemetry, last_s)
-    yield from loop.end()
+    yield from loop.end(getattr(source, "last", 0))
 
 
 def _check_overlap(telemetry: Telemetry, last_s: float) -> None:
@@ -120,8 +120,8 @@ class Loop:
         if self.total - self.registered > self.batch:
             yield from self._advance()
 
-    def end(self) -> Iterator[Scene]:
-        """The clip is over: settle everything that is left."""
+    def end(self, last: int = 0) -> Iterator[Scene]:
+        """The clip is over: settle everything that is left. last: number of the clip's last frame, read or not."""
         wanted = 3
         if self.total < wanted:
             few = "no frame" if self.total == 0 else f"{self.total} frame" + "s" * (self.total > 1)
@@ -130,6 +130,7 @@ class Loop:
             )
         self.ended = True
         yield from self._advance()
+        yield from self._gap(last + 1, self.slots[-1].frame.image)
 
     def _advance(self) -> Iterator[Scene]:
         self._register()
@@ -338,7 +339,7 @@ class Loop:
             slot = self._at(self.emitted)
             if not self._all_observed() and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
                 break
-            yield from self._gap(slot.frame)
+            yield from self._gap(slot.frame.number, slot.frame.image)
             yield self._scene(slot, self.emitted)
             self.emitted += 1
             if (old := self.emitted - 1 - self.settings.difference.wide_frames) >= self.first:
@@ -349,14 +350,13 @@ class Loop:
                 self.slots.popleft()
                 self.first += 1
 
-    def _gap(self, frame: Frame) -> Iterator[Scene]:
-        """Empty scenes for frame numbers that could not be read."""
-        for number in range(self.last_number + 1, frame.number):
-            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros_like(frame.image))
-            height, width = frame.image.shape[:2]
-            detections, mask = table([], (width, height))
+    def _gap(self, until: int, like: np.ndarray) -> Iterator[Scene]:
+        """Empty scenes for the frame numbers below `until` that could not be read."""
+        for number in range(self.last_number + 1, until):
+            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros_like(like))
+            detections, mask = table([], (like.shape[1], like.shape[0]))
             yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
-        self.last_number = frame.number
+        self.last_number = until
 
     def _scene(self, slot: _Slot, index: int) -> Scene:
         observation = slot.observation

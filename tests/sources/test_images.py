@@ -115,6 +115,7 @@ def test_a_damaged_image_is_left_out_and_the_others_keep_their_numbers(
     source = open_source(tmp_path)
     assert [frame.number for frame in source] == [1, 2, 4, 5]
     assert [problem.frame for problem in source.problems] == [3]
+    assert source.last == source.count
     assert damaged.name in str(source.problems[0])
 
 

@@ -62,6 +62,16 @@ def test_an_undecodable_frame_leaves_a_gap_in_the_numbers_and_is_named(tmp_path:
     assert "frames 20 to 21 " in str(source.problems[1])
 
 
+def test_undecodable_frames_at_the_end_are_named_and_still_counted(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "clip.avi", "MJPG")
+    spoil_avi_frame(path, 29)
+    spoil_avi_frame(path, 30)
+    source = open_source(path)
+    assert [frame.number for frame in source] == list(range(1, 29))
+    assert source.last == 30
+    assert [str(problem) for problem in source.problems] == ["frames 29 to 30 could not be decoded and were left out"]
+
+
 def test_problems_do_not_pile_up_when_a_clip_is_read_again(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.avi", "MJPG")
     spoil_avi_frame(path, 12)
@@ -79,6 +89,7 @@ def test_a_truncated_video_gives_what_it_holds_and_says_where_it_ends(tmp_path: 
     assert [frame.number for frame in frames] == list(range(1, len(frames) + 1))
     assert len(source.problems) == 1
     assert f"ends after frame {len(frames)} but announces 30" in str(source.problems[0])
+    assert source.last == len(frames)
 
 
 def test_a_damaged_stretch_of_an_mp4_does_not_shift_the_frames_after_it(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ class ImageSource:
         self.name = name
         self.count: int | None = len(self.files)
         self.rate_hz = rate_hz
+        self.last = 0
         self.problems: list[Problem] = []
         first = read_image(self.files[0])
         if first is None:
@@ -56,6 +57,7 @@ class ImageSource:
         self.problems.clear()
         saturated = False
         for number, file in enumerate(self.files, start=1):
+            self.last = number
             image = read_image(file)
             if image is None:
                 self.problems.append(

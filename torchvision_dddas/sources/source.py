@@ -26,6 +26,8 @@ class Source(Protocol):
 
     name: what to call it in messages and tables. count: frames that it announces, None when unknown (a live stream).
     rate_hz: frames a second. size: (width, height) in px, the same for every frame.
+    last: number of the last frame known to be in the clip, decoded or not, once it has been read to its end; until then
+    that of the last frame read.
     problems: filled while reading; every new iteration starts from the first frame and empties it.
     Iterating yields frames in order, numbered from 1. A frame that cannot be decoded is left out and keeps its number.
     """
@@ -34,6 +36,7 @@ class Source(Protocol):
     count: int | None
     rate_hz: float
     size: tuple[int, int]
+    last: int
     problems: list[Problem]
 
     def __iter__(self) -> Iterator[Frame]: ...

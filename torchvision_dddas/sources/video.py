@@ -38,6 +38,7 @@ class VideoSource:
 
     def __init__(self, target: str | int, name: str, rate_hz: float | None = None, fallback_hz: float = 10.0) -> None:
         self.name = name
+        self.last = 0
         self.problems: list[Problem] = []
         self._target = target
         self._live = isinstance(target, int) or "://" in target
@@ -87,7 +88,7 @@ class VideoSource:
             self._check(image, following)
             if following > number + 1:
                 self.problems.append(Problem(number + 1, _lost_words(number + 1, following - 1)))
-            number = following
+            self.last = number = following
             stamp_s -= start_s
             if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
                 stamp_s = max((number - 1) / self.rate_hz, time_s)
@@ -95,10 +96,15 @@ class VideoSource:
             yield Frame(number, time_s, image)
         # A count guessed from the duration means something only where the rate is constant.
         exact = Path(str(self._target)).suffix.lower() in _EXACT_COUNT
+        if exact and self.count and self.count > number:
+            # Of the frames announced, those whose data are in the file belong to the clip.
+            self.last = max(number, min(self.count, self._stored()))
+            if self.last > number:
+                self.problems.append(Problem(number + 1, _lost_words(number + 1, self.last)))
         allowed = 0 if exact else max(2, number // 50) if regular else number
-        if self.count and self.count - number > allowed:
-            what = f"the clip ends after frame {number} but announces {self.count}: it is cut short or damaged"
-            self.problems.append(Problem(number + 1, what))
+        if self.count and self.count - self.last > allowed:
+            what = f"the clip ends after frame {self.last} but announces {self.count}: it is cut short or damaged"
+            self.problems.append(Problem(self.last + 1, what))
 
     def _read_live(self, capture: cv2.VideoCapture) -> Iterator[Frame]:
         number, lost, start_s = 0, 0, time.monotonic()
@@ -112,12 +118,24 @@ class VideoSource:
                 self.problems.append(Problem(number - lost, _lost_words(number - lost, number - 1)))
                 lost = 0
             self._check(image, number)
+            self.last = number
             start_s = start_s if number > 1 else time.monotonic()
             yield Frame(number, time.monotonic() - start_s, image)
 
     def _patience(self, number: int) -> int:
         """Failed reads in a row that end the clip: as many as it still owes, and a few where it does not say."""
         return min(max((self.count or 0) - number, 0) + 4, _MOST_LOST)
+
+    def _stored(self) -> int:
+        """How many frames a file holds the data of, whether or not they can be decoded."""
+        capture = cv2.VideoCapture(str(self._target), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        try:
+            count = 0
+            while capture.grab():
+                count += 1
+        finally:
+            capture.release()
+        return count
 
     def _open(self) -> cv2.VideoCapture:
         with quiet_opencv():
