@@ -7,6 +7,7 @@ import sys
 
 import cv2
 import numpy as np
+import pytest
 
 from torchvision_dddas.cli import progress as progress_module
 from torchvision_dddas.demo import film_into
@@ -68,6 +69,38 @@ def test_a_terminal_that_knows_only_ascii_is_no_reason_to_crash(dddas, engine, c
     done = subprocess.run(words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"IoU" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["detect"], "Missing argument"),
+        (["detect", "x", "--backend", "gpu"], "'onboard'; see"),
+        (["detect", "x", "--nosuch"], "--nosuch"),
+        (["nosuch"], "'nosuch'"),
+    ],
+)
+def test_a_command_line_that_will_not_do_gets_one_line(words, says):
+    program = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()", *words]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("dddas: ") and says in line
+
+
+def test_no_words_at_all_get_the_help():
+    program = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "detect" in done.stdout + done.stderr
+
+
+def test_a_demo_that_cannot_be_written_is_one_line(dddas, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = dddas("demo", "--out", tmp_path / "file/demo")
+    assert result.exit_code == 2
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("dddas: cannot write")
 
 
 def test_evaluate_of_nothing_is_one_line(dddas, tmp_path):

@@ -10,7 +10,7 @@ from torchvision_dddas import __version__
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
-from torchvision_dddas.cli.mistakes import INTERRUPTED
+from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.settings import settings
 
 app = typer.Typer(
@@ -45,6 +45,15 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show × or ≥ shows a question mark
     try:
-        app()
-    except KeyboardInterrupt:  # outside a command, while Python still loads
+        sys.exit(app(standalone_mode=False))
+    except (KeyboardInterrupt, typer.Abort):  # outside a command, while Python still loads
         sys.exit(INTERRUPTED)
+    except Exception as error:
+        # A word of the command line that will not do; Typer keeps the class of these errors to itself.
+        if not hasattr(error, "format_message"):
+            raise
+        if len(sys.argv) < 2:
+            error.show()  # type: ignore[attr-defined]
+        else:
+            typer.echo(f"dddas: {' '.join(error.format_message().split()).rstrip('.')}; see dddas --help", err=True)
+        sys.exit(BAD_INPUT)
