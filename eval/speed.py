@@ -5,7 +5,8 @@ usage: python eval/speed.py [CLIP...] [--sizes 640x480 1280x720] [--rounds 12] [
 A clip is a video, a folder of pictures, or a folder that holds clips. With none the project's own scene is rendered at
 each of --sizes. All chains go through the same decoded frames, forwards and backwards, in turns of eight frames, so
 that whatever else the machine does meets them all; the first turns are left out. A ratio is the median over the turns
-of a chain's time through the plain chain's in the same turn. Garbage is collected between the turns.
+of a chain's time through the plain chain's in the same turn. Garbage is collected between the turns. The processor's
+time, over all threads, is told as well: it says what a chain costs where other programs want the second core.
 """
 
 import argparse
@@ -96,24 +97,26 @@ def our_turns(frames: list[np.ndarray], backend: str, config: str, batch: int) -
 
 
 def timed(frames: list[np.ndarray], chains: list[str], rounds: int) -> dict[str, np.ndarray]:
-    """Milliseconds a frame, (rounds,) for each chain."""
+    """Milliseconds a frame, (rounds, 2) for each chain: by the clock, and of the processor over all threads."""
     frames = there_and_back(frames, (rounds + WARM_UP) * TURN + 2)
     turns = {"plain": plain_turns(frames)}
     for name in chains:
         backend, config, *batch = name.split()
         turns[name] = our_turns(frames, backend, config, int(batch[0][1:]) if batch else 1)
-    spent: dict[str, list[float]] = {name: [] for name in turns}
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in turns}
     for k in range(rounds + WARM_UP):
         for name, turn in turns.items():
             gc.collect()
-            start = time.perf_counter()
+            start, processor = time.perf_counter(), time.process_time()
             turn(k * TURN)
-            spent[name].append((time.perf_counter() - start) / TURN * 1e3)
+            ms = 1e3 / TURN
+            spent[name].append(((time.perf_counter() - start) * ms, (time.process_time() - processor) * ms))
     return {name: np.array(values[WARM_UP:]) for name, values in spent.items()}
 
 
 def row(spent: np.ndarray, plain: np.ndarray) -> dict[str, float]:
     """The figures of one chain on one clip."""
+    (spent, busy), (plain, plain_busy) = spent.T, plain.T
     ratio = spent / plain
     low, middle, high = np.percentile(ratio, [25, 50, 75])
     return {
@@ -123,6 +126,8 @@ def row(spent: np.ndarray, plain: np.ndarray) -> dict[str, float]:
         "ratio_25": float(low),
         "ratio_75": float(high),
         "ratio_of_means": float(spent.mean() / plain.mean()),
+        "processor_ms": float(np.median(busy)),
+        "processor_ratio": float(np.median(busy / plain_busy)),
     }
 
 
@@ -152,7 +157,8 @@ def main() -> None:
         print(f"\n{name}, {width}x{height}: ms a frame, and the ratio to plain (quartiles; of means)")
         for chain, r in rows.items():
             spread = f"{r['ratio']:5.2f} ({r['ratio_25']:.2f} to {r['ratio_75']:.2f}; {r['ratio_of_means']:.2f})"
-            print(f"  {chain:18} median {r['median_ms']:7.1f}  mean {r['mean_ms']:7.1f}  ratio {spread}")
+            busy = f"processor {r['processor_ms']:6.1f} ratio {r['processor_ratio']:.2f}"
+            print(f"  {chain:18} median {r['median_ms']:6.1f}  mean {r['mean_ms']:6.1f}  ratio {spread}  {busy}")
         for chain, e in errors.items():
             print(
                 f"  registration, {chain:10} median {e['median']:.3f} px  p90 {e['p90']:.3f} px  ({e['pairs']} pairs)"
