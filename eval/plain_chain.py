@@ -32,8 +32,8 @@ def register(grey: np.ndarray, later: np.ndarray, start: np.ndarray) -> np.ndarr
     return np.eye(3) if grey_from_later is None else grey_from_later
 
 
-def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 mask of what moves in the first of three BGR frames."""
+def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) uint8 mask of what moves in the first of three BGR frames, and its (N, 4) boxes x, y, width, height."""
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second, third)]
     height, width = greys[0].shape
     start = keypoints(greys[0])
@@ -56,4 +56,4 @@ def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> np
     hulls = np.zeros((height, width), np.uint8)
     for outline in outlines:
         cv2.fillConvexPoly(hulls, cv2.convexHull(outline), 255)
-    return hulls
+    return hulls, stats[1:, :4][stats[1:, cv2.CC_STAT_AREA] >= LEAST_AREA_PX].astype(float)
