@@ -1,0 +1,74 @@
+"""What a newcomer meets first: the demo with the true engine, and a README whose words hold."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from torchvision_dddas.cli import app
+from torchvision_dddas.demo import film_into
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = [line.partition("#")[0] for line in README.splitlines() if line.startswith("dddas ")]
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_demo_finds_most_movers_and_leaves_the_parked_car_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("torchvision_dddas.demo.film_into.__defaults__", (0, 16, (480, 360)))
+    result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "demo")])
+    assert result.exit_code == 0, result.output
+    scores = json.loads((tmp_path / "demo/metrics.json").read_text())["clips"]["demo"]
+    assert scores["pixels"]["f"] > 0.6
+    assert scores["pixels"]["precision"] > 0.6
+    film = cv2.VideoCapture(str(tmp_path / "demo/overlay.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 16
+
+
+def test_the_python_of_the_readme_runs_and_finds_targets(tmp_path, monkeypatch, capsys):
+    (code,) = blocks("python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    film_into(tmp_path / "demo-out/clip", frames=8, size=(480, 360))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    assert "px a frame over the ground" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_every_command_of_the_readme_exists_with_its_options(line):
+    words = shlex.split(line)[1:]
+    told = CliRunner().invoke(app, [words[0], "--help"])
+    assert told.exit_code == 0
+    for word in words:
+        if word.startswith("--"):
+            assert word in told.output
+
+
+def test_every_file_that_the_readme_names_is_there():
+    package = ROOT / "torchvision_dddas"
+    rows = [line for line in README.splitlines() if line.startswith("|") and ".py`" in line]
+    named = [name for line in rows for name in re.findall(r"`([\w/]+\.py)`", line)]
+    named += re.findall(r"\]\(([^)]+)\)", README)
+    assert len(named) >= 20
+    assert [name for name in named if not ((package / name).exists() or (ROOT / name).exists())] == []
+
+
+def test_the_configuration_of_the_readme_is_taken(tmp_path):
+    from torchvision_dddas.settings import load
+
+    (text,) = blocks("toml")
+    (tmp_path / "own.toml").write_text(text)
+    assert load(tmp_path / "own.toml").gates.min_area_px == 80
+
+
+def test_the_picture_is_small_and_the_tables_have_their_marks():
+    assert (ROOT / "docs/demo.jpg").stat().st_size < 300_000
+    for name in ("accuracy", "speed"):
+        assert README.index(f"<!-- {name} -->") < README.index(f"<!-- /{name} -->")
