@@ -52,6 +52,9 @@ def pairs(
     if not near and (p := _symmetric(at, 1, first, ahead)):
         near = [p]
     near = list(dict.fromkeys(near))
+    # One-sided pairs see a target's next places too, the more of them the longer the gap: only the closest will do,
+    # and only where no pair looks both ways.
+    near = [p for p in near if p[0] < at < p[1]] or near[:1]
     wide = None
     if knobs.wide_frames and near:
         forward = min(knobs.wide_frames, max(2 * interval - 2, 0), ahead - at)
