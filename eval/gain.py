@@ -1,9 +1,9 @@
 """What a jumping exposure costs: `python eval/gain.py DATA_FOLDER [CONFIG]`, for clips with `frames/` and `masks/`.
 
-F over the pixels of a clip's labelled frames, three times: as it is; with the gain of about every fifth frame jumping
-to 1.15, 1 or 0.85 and staying there (steps); and with single frames so much lighter or darker (flashes). Frames are
-multiplied, rounded and cut off at 255; the jumps are drawn from a fixed seed. Prints F and the F that is lost, per clip
-and on average, and how many of the frames' registrations were not trusted.
+F over the pixels of a clip's labelled frames: as it is; with the gain of about every fifth frame jumping to 1.15, 1
+or 0.85 and staying there (steps); with single frames so much lighter or darker (flashes); with a jump between any two
+frames (flicker). Frames are multiplied, rounded and cut off at 255; the jumps are drawn from a fixed seed. Prints F and
+the F that is lost, per clip and on average, and how many of the frames were not to be trusted.
 """
 
 import argparse
@@ -22,9 +22,9 @@ from torchvision_dddas.sources import open_source
 from torchvision_dddas.types import Frame
 from torchvision_dddas.vision import load
 
-KINDS = ("as it is", "steps", "flashes")
+KINDS = ("as it is", "steps", "flashes", "flicker")
 LEVELS = (0.85, 1.0, 1.15)
-SHARE = 0.2
+SHARES = {"steps": 0.2, "flashes": 0.2, "flicker": 1.0}
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     settings = knobs.load(chosen.config)
-    print("clip | F as it is | steps: F, lost | flashes: F, lost | frames without a trusted registration")
+    print("clip | F as it is | " + " | ".join(f"{kind}: F, lost" for kind in KINDS[1:]) + " | frames not trusted")
     rows = []
     for clip in sorted(chosen.folder.iterdir()):
         if not (clip / "frames").is_dir() or not (clip / "masks").is_dir() or (chosen.only or "") not in clip.name:
@@ -60,8 +60,8 @@ def gains(frames: int, kind: str, seed: int) -> np.ndarray:
     if kind == "as it is":
         return gain
     for i in range(1, frames):
-        jumps = random.random() < SHARE
-        if kind == "steps":
+        jumps = random.random() < SHARES[kind]
+        if kind != "flashes":
             gain[i] = random.choice([g for g in LEVELS if g != gain[i - 1]]) if jumps else gain[i - 1]
         elif jumps and gain[i - 1] == 1.0:
             gain[i] = random.choice([LEVELS[0], LEVELS[-1]])

@@ -48,12 +48,14 @@ def test_frames_of_one_light_are_left_as_they_are_however_the_camera_moves(greys
         assert earlier is a and later is b
 
 
-def test_content_that_changes_is_not_taken_for_light(greys) -> None:
-    changed = greys[0].copy()
-    changed[:, :110] = 235
-    assert not np.array_equal(in_one_light(view(greys[0]), view(lit(greys[0], 1.15)))[0], greys[0])
-    earlier, later = in_one_light(view(greys[0]), view(changed))
-    assert earlier is greys[0] and later is changed
+def test_levels_that_change_otherwise_than_by_a_gain_and_an_offset_are_content() -> None:
+    wanted = np.linspace(40, 200, 33)
+    assert exposure(wanted, wanted / 1.1 - 3) == pytest.approx((1.1, 3.3))
+    assert exposure(wanted, wanted + 8 * np.sin(np.linspace(0, 12, 33))) == (1.0, 0.0)
+    # A bright thing that came in moves the upper levels only.
+    assert exposure(wanted, wanted + 30 * (wanted > 160)) == (1.0, 0.0)
+    gain, offset = exposure(wanted, wanted / 1.1 + 30 * (wanted > 160))
+    assert gain * 100 / 1.1 + offset == pytest.approx(100, abs=2)
 
 
 def test_what_white_has_cut_off_is_cut_off_in_both(greys) -> None:
