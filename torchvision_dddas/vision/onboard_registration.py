@@ -70,7 +70,7 @@ def keypoints(grey: np.ndarray, knobs: RegistrationKnobs, halved: bool = False) 
     """
     height, width = grey.shape
     cell = cell_side(width, height, knobs)
-    if halved:
+    if halved and min(width, height) > 1:
         # Half a pixel to the left and top of where the corner stands: a search window does not mind.
         grey = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
         points = _best_of_cells(grey, max(cell // 2, 1), knobs)
