@@ -2,13 +2,14 @@
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 from torchvision_dddas import settings as knobs
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.targets.projective import corner_error
-from torchvision_dddas.vision import View, load
+from torchvision_dddas.vision import View, Window, load
 from torchvision_dddas.vision.exposure import exposure, in_one_light
 
 SIZE = (320, 240)
@@ -89,3 +90,18 @@ def test_a_jumping_gain_does_not_move_the_registration(backend, config) -> None:
     for as_it_is, jumping in zip(*steps, strict=True):
         assert jumping.reliable
         assert corner_error(as_it_is.later_from_earlier, jumping.later_from_earlier, SIZE) < 0.2
+
+
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_what_both_neighbours_cut_off_at_white_does_not_move(backend) -> None:
+    if backend == "torch":
+        pytest.importorskip("torch")
+    pattern = np.random.default_rng(0).integers(40, 200, (240, 320)).astype(np.float32)
+    still = cv2.GaussianBlur(pattern, (0, 0), 3) - 90 + np.linspace(0, 150, 320)
+    still[80:160, 100:220] = np.linspace(205, 250, 120)
+    engine = load(backend, knobs.load())
+    views = [engine.prepare(lit(still, gain)) for gain in (1.2, 1.0, 1.2)]
+    assert (views[0].grey == 255).mean() > 0.05
+    asked = Window(views[1], (views[0], views[2]), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),))
+    (found,) = engine.foreground([asked])
+    assert not found.core.any()

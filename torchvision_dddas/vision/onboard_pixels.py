@@ -5,6 +5,7 @@ import numpy as np
 
 from torchvision_dddas.targets.occupied import occupied
 from torchvision_dddas.targets.projective import transfer
+from torchvision_dddas.vision.protocol import WHITE
 
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
 # round places to 1/32 px.
@@ -132,7 +133,14 @@ def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.n
         if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
             break
     table = np.clip(np.round(gain * x + offset), 0, 255).astype(np.uint8)
-    return warped if (table == x).all() else cv2.LUT(warped, table)
+    if (table == x).all():
+        return warped
+    lit = cv2.LUT(warped, table)
+    if table[255] < WHITE:
+        # Cut off at white, a pixel only tells that the place was at least so bright.
+        cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
+        cv2.copyTo(cv2.max(lit, reference), cut, lit)
+    return lit
 
 
 class _GreyPairs:

@@ -11,6 +11,8 @@ from torchvision_dddas.types import Registration
 # Evidence crosses the seam as 8-bit maps: in sixteenths of the local noise, cut off at 15 noise units.
 EVIDENCE_SCALE = 16.0
 EVIDENCE_CAP = 240
+# From this grey level on a pixel may be cut off.
+WHITE = 248
 
 
 @dataclass

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchvision_dddas.ops import blur, difference, morphology, warp
 from torchvision_dddas.settings import DifferenceKnobs, SmallKnobs
-from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, View, Window
+from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, View, Window
 
 LEVEL = 255.0
 
@@ -116,7 +116,11 @@ def exposed(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> T
     enough = inside.sum((1, 2)) >= 100
     gain, offset = torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
     gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
-    return warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+    darkened = (gain * LEVEL + offset).round() < WHITE
+    # Cut off at white, a pixel only tells that the place was at least so bright.
+    cut = (warped >= WHITE) & darkened if bool(darkened.any()) else None
+    lit = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+    return lit if cut is None else torch.where(cut, torch.maximum(lit, reference), lit)
 
 
 def apart(a: Tensor, b: Tensor) -> Tensor:
