@@ -7,7 +7,6 @@ STAMP := .venv/.installed
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
-	@echo "Look at demo-out/overlay.mp4 (boxes), demo-out/masks/ and demo-out/detections.csv"
 
 test: lint
 	$(BIN)/python -m pytest
