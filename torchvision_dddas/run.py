@@ -37,6 +37,17 @@ def _blank(view: View) -> bool:
     return float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
 
 
+def _memory(settings: Settings) -> int:
+    """How many frames before the one observed may be looked at again."""
+    knobs, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
+    judged = 5  # persistence looks two frames before a frame that is drawn two frames late
+    if knobs.kind == "between_later":
+        return max(longest, judged)
+    # Where a window can look one way only, it looks twice as far.
+    widest = 2 * max(knobs.wide_frames, *knobs.near_frames, settings.small.gap_frames if settings.small.on else 0)
+    return max(min(widest, longest), knobs.wide_frames, 2 * max(knobs.near_frames), judged)
+
+
 @dataclass
 class _Slot:
     """One frame on its way through the loop. step: registration to the next frame; None until known or at the end."""
@@ -94,6 +105,8 @@ class Loop:
         self.vision, self.settings, self.batch = vision, settings, batch
         self.rate_hz, self.telemetry = rate_hz, telemetry
         self.slots: deque[_Slot] = deque()
+        self.memory = _memory(settings)
+        self.shape: tuple[int, ...] = (0, 0)  # of the frames
         self.first = 0  # index of slots[0]; indices count frames read
         self.registered = 0  # slots below this index have their step
         self.observed = 0
@@ -115,6 +128,7 @@ class Loop:
         start = time.perf_counter()
         slot = _Slot(frame, self.vision.prepare(frame.image))
         slot.seconds["prepare"] = time.perf_counter() - start
+        self.shape = frame.image.shape
         self.slots.append(slot)
         self.total += 1
         if self.total - self.registered > self.batch:
@@ -130,7 +144,7 @@ class Loop:
             )
         self.ended = True
         yield from self._advance()
-        yield from self._gap(last + 1, self.slots[-1].frame.image)
+        yield from self._gap(last + 1)
 
     def _advance(self) -> Iterator[Scene]:
         self._register()
@@ -339,22 +353,27 @@ class Loop:
             slot = self._at(self.emitted)
             if not self._all_observed() and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
                 break
-            yield from self._gap(slot.frame.number, slot.frame.image)
+            yield from self._gap(slot.frame.number)
             yield self._scene(slot, self.emitted)
+            # Colour is most of a run's memory: who took the scene has it, and windows look at the view's only.
+            slot.frame = replace(slot.frame, image=slot.view.grey)
             self.emitted += 1
-            if (old := self.emitted - 1 - self.settings.difference.wide_frames) >= self.first:
-                view = self._at(old).view
-                view.image = view.grey  # no window looks at its colours again
-            memory = max(2 * self.settings.interval.maximum_frames, self.settings.difference.wide_frames, 8)
-            while self.first < self.emitted - memory:
-                self.slots.popleft()
-                self.first += 1
+            self._forget()
 
-    def _gap(self, until: int, like: np.ndarray) -> Iterator[Scene]:
+    def _forget(self) -> None:
+        """Let go of what no window looks at again."""
+        if (old := self.emitted - 1 - self.settings.difference.wide_frames) >= self.first:
+            view = self._at(old).view
+            view.image = view.grey
+        while self.first < min(self.emitted - 2, self.observed - self.memory):
+            self.slots.popleft()
+            self.first += 1
+
+    def _gap(self, until: int) -> Iterator[Scene]:
         """Empty scenes for the frame numbers below `until` that could not be read."""
         for number in range(self.last_number + 1, until):
-            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros_like(like))
-            detections, mask = table([], (like.shape[1], like.shape[0]))
+            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros(self.shape, np.uint8))
+            detections, mask = table([], (self.shape[1], self.shape[0]))
             yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
         self.last_number = until
 
@@ -371,6 +390,10 @@ class Loop:
 
     def _small_targets(self, index: int, found: list[Found]) -> list[Found]:
         """Confirmed small tracks seen in this frame, where no other target covers them."""
+        near = range(max(index - 2, self.first), min(index + 3, self.observed))
+        blobs = [len(o.blobs) for i in near if (o := self._at(i).observation) is not None]
+        if np.median(blobs) > self.settings.small.max_blobs:
+            return []
         extra = []
         for track in self.tracks.confirmed():
             if index not in track.frames:

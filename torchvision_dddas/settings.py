@@ -156,7 +156,7 @@ class PersistenceKnobs(Group):
     """What a blob must show over time to be a target: moving as one, steadily, unlike its surroundings."""
 
     on: bool = knob(True, "-", meaning="test blobs by flow and persistence; false passes every blob")
-    flow_share: float = knob(0.4, "-", 0, 1, meaning="share of a blob's core that must move steadily for the test")
+    flow_share: float = knob(0.3, "-", 0, 1, meaning="share of a blob's core that must move steadily for the test")
     sure_share: float = knob(0.7, "-", 0, 1, meaning="share at which a large blob needs no further frames")
     links: int = knob(3, "frames", 1, 5, meaning="of two frames before, itself and two after: seen in so many")
     passes: int = knob(2, "frames", 0, 5, meaning="of those, so many pass the flow test")
@@ -182,6 +182,9 @@ class SmallKnobs(Group):
     min_area_px: int = knob(12, "px", 1, 10_000, meaning="smallest area of a candidate")
     max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
     max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
+    max_blobs: int = knob(
+        4, "blobs", 0, 1000, meaning="with more large blobs than this about, parallax is at work: none is reported"
+    )
     gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
     hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate that confirm a track at the earliest")
     min_travel_px: float = knob(3.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
