@@ -102,7 +102,8 @@ def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(confi
 
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_car_that_drives_under_a_panning_camera_is_found_with_its_heading_and_speed(config, noise):
-    found = detect(frames_of(pan(noise, 14, car=5.0)), load(config))
+    settings = load(config)
+    found = detect(frames_of(pan(noise, 14, car=5.0)), settings)
     hits, headings, speeds = 0, [], []
     for k, scene in enumerate(found):
         assert scene.reliable
@@ -116,6 +117,9 @@ def test_a_car_that_drives_under_a_panning_camera_is_found_with_its_heading_and_
                 speeds.append(speed)
                 break
     assert hits >= 11
+    if not settings.history.on:  # then the quick chain tells none, rather than a guess
+        assert np.isnan(headings).all() and np.isnan(speeds).all()
+        return
     assert abs(np.degrees(np.nanmedian(headings))) < 20
     assert np.nanmedian(speeds) == pytest.approx(5.0, rel=0.4)
 
