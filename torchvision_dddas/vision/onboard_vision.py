@@ -38,15 +38,6 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
     if min(grey.shape) < 2:  # OpenCV takes a single column for a number
         return _nothing(grey)
     normalized = knobs.kind == "normalized"
-    warped = [
-        warp(view.grey, neighbour_from_reference)
-        for view, neighbour_from_reference in zip(window.neighbours, window.neighbour_from_reference, strict=True)
-    ]
-    seen = [inside(m, window.reference.size, knobs.border_px) for m in window.neighbour_from_reference]
-    if normalized:
-        warped = [exposed(grey, picture, mask) for picture, mask in zip(warped, seen, strict=True)]
-    least = _LeastDifference(grey, warped)
-
     if normalized or settings.refine.on:
         texture = texture_of(grey)
     else:  # nobody asks
@@ -58,13 +49,11 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
         textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
     else:
         scale = 1.0
+    neighbours = _Neighbours(window, knobs.border_px, normalized)
 
     def evidence(pair: tuple[int, int]) -> np.ndarray:
-        both = cv2.bitwise_and(seen[pair[0]], seen[pair[1]])
-        if knobs.kind == "between_later":
-            z = cv2.absdiff(warped[pair[0]], warped[pair[1]])
-        else:
-            z = least(pair)
+        both = neighbours.both(pair)
+        z = neighbours.apart(pair) if knobs.kind == "between_later" else neighbours.least(pair)
         if not normalized:
             z = cv2.GaussianBlur(z, (knobs.blur_px,) * 2, 0)
             return cv2.bitwise_and(z, both, dst=z)
@@ -77,19 +66,20 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
     near = evidence(window.near[0])
     for pair in window.near[1:]:
         near = cv2.max(near, evidence(pair), dst=near)
+    a, b = window.near[-1]
+    warped, offsets = (neighbours[a][0], neighbours[b][0]), (window.offsets[a], window.offsets[b])
+    neighbours.keep_for(window.wide, window.small)
     wide = near if window.wide is None else evidence(window.wide)
+    neighbours.keep_for(window.small)
     core = cv2.threshold(near, int(knobs.threshold * scale), 255, cv2.THRESH_BINARY)[1]
     core = closed(cv2.erode(core, ellipse(settings.morphology.erode_px)), settings.morphology.close_px)
     small = None
     if window.small is not None:
-        a, b = window.small
-        small = cv2.GaussianBlur(least(window.small), (5, 5), 0)
-        small = cv2.bitwise_and(cv2.bitwise_and(small, seen[a], dst=small), seen[b], dst=small)
+        small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
+        small = cv2.bitwise_and(small, neighbours.both(window.small), dst=small)
         level = max(settings.small.threshold, settings.small.noise_ratio * cv2.mean(small)[0])
         small = closed(cv2.threshold(small, int(level), 255, cv2.THRESH_BINARY)[1], settings.small.close_px)
-    a, b = window.near[-1]
-    offsets = (window.offsets[a], window.offsets[b])
-    return Foreground(core, near, wide, texture, small, (warped[a], warped[b]), offsets)
+    return Foreground(core, near, wide, texture, small, warped, offsets)
 
 
 def _nothing(grey: np.ndarray) -> Foreground:
@@ -97,15 +87,43 @@ def _nothing(grey: np.ndarray) -> Foreground:
     return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
 
 
-class _LeastDifference:
-    """The smaller difference of the reference to a pair of warped neighbours; each pair is computed once."""
+class _Neighbours:
+    """The neighbours as the reference sees them, each made when it is first asked for.
 
-    def __init__(self, grey: np.ndarray, warped: Sequence[np.ndarray]) -> None:
-        self.grey, self.warped = grey, warped
+    All of a window's at once, with where each is seen, would hold 15 MB at 1280x720.
+    """
+
+    def __init__(self, window: Window, border_px: int, expose: bool) -> None:
+        self.window, self.border_px, self.expose = window, border_px, expose
+        self.made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.known: dict[tuple[int, int], np.ndarray] = {}
 
-    def __call__(self, pair: tuple[int, int]) -> np.ndarray:
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """A neighbour warped, and 255 where it may be compared."""
+        if index not in self.made:
+            reference, neighbour_from_reference = self.window.reference, self.window.neighbour_from_reference[index]
+            warped = warp(self.window.neighbours[index].grey, neighbour_from_reference)
+            seen = inside(neighbour_from_reference, reference.size, self.border_px)
+            self.made[index] = (exposed(reference.grey, warped, seen) if self.expose else warped), seen
+        return self.made[index]
+
+    def both(self, pair: tuple[int, int]) -> np.ndarray:
+        """255 where both of a pair are seen."""
+        return cv2.bitwise_and(self[pair[0]][1], self[pair[1]][1])
+
+    def apart(self, pair: tuple[int, int]) -> np.ndarray:
+        """The difference between the two of a pair."""
+        return cv2.absdiff(self[pair[0]][0], self[pair[1]][0])
+
+    def least(self, pair: tuple[int, int]) -> np.ndarray:
+        """The smaller difference of the reference to the two of a pair, computed once."""
         if pair not in self.known:
-            a, b = (cv2.absdiff(self.grey, self.warped[i]) for i in pair)
+            a, b = (cv2.absdiff(self.window.reference.grey, self[i][0]) for i in pair)
             self.known[pair] = cv2.min(a, b, dst=a)
         return self.known[pair]
+
+    def keep_for(self, *pairs: tuple[int, int] | None) -> None:
+        """Drop what none of these pairs looks at."""
+        wanted = {i for pair in pairs if pair for i in pair}
+        self.made = {i: kept for i, kept in self.made.items() if i in wanted}
+        self.known = {pair: kept for pair, kept in self.known.items() if pair in pairs}
