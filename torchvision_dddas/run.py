@@ -318,6 +318,7 @@ class Loop:
         boxes = []
         if observation is not None and observation.foreground is not None and observation.foreground.small is not None:
             boxes = candidates(observation.foreground.small, self.settings.small)
+            observation.foreground = replace(observation.foreground, small=None)  # nobody looks at it again
         self.tracks.step(index, before.later_from_earlier if before is not None and linked else None, boxes)
         slot.seconds["small"] = time.perf_counter() - start
 
@@ -392,7 +393,9 @@ class Loop:
         """Confirmed small tracks seen in this frame, where no other target covers them."""
         near = range(max(index - 2, self.first), min(index + 3, self.observed))
         blobs = [len(o.blobs) for i in near if (o := self._at(i).observation) is not None]
-        if np.median(blobs) > self.settings.small.max_blobs:
+        misses = [step.error_px for i in near if (step := self._at(i).step) is not None]
+        knobs = self.settings.small
+        if np.median(blobs) > knobs.max_blobs and misses and np.median(misses) > knobs.parallax_px:
             return []
         extra = []
         for track in self.tracks.confirmed():

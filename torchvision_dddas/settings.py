@@ -183,7 +183,10 @@ class SmallKnobs(Group):
     max_box_px: int = knob(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
     max_candidates: int = knob(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
     max_blobs: int = knob(
-        4, "blobs", 0, 1000, meaning="with more large blobs than this about, parallax is at work: none is reported"
+        4, "blobs", 0, 1000, meaning="with more large blobs than this about, parallax may be at work, ..."
+    )
+    parallax_px: float = knob(
+        0.15, "px", 0, 10, meaning="... and is where inliers miss the registration by more: no small target is reported"
     )
     gate_px: float = knob(4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it")
     hits: int = knob(10, "frames", 2, 60, meaning="frames with a candidate that confirm a track at the earliest")
