@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.targets.blobs import Blob, find_blobs, parts_of
+from torchvision_dddas.targets.blobs import Blob, find_blobs, parts_of, weak_blobs
 from torchvision_dddas.targets.gates import Gates
 from torchvision_dddas.targets.grouping import groups
 from torchvision_dddas.targets.history import MotionHistory
@@ -59,6 +59,9 @@ def observe(
         knobs.peak * scale,
         settings.morphology.hull,
     )
+    if settings.persistence.on and _looks_both_ways(window):
+        knobs_of = settings.morphology, settings.gates.min_area_px, knobs.peak * scale
+        blobs += weak_blobs(foreground.wide, blobs, knobs.threshold * scale, *knobs_of)
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)
@@ -70,6 +73,11 @@ def observe(
         parts = [part for blob in blobs for part in moving_parts(blob, history, view.size, settings.history)]
         blobs, motions = [part.blob for part in parts], [only_velocity(part.velocity_px) for part in parts]
     return Observation(window, foreground, blobs, motions)
+
+
+def _looks_both_ways(window: Window) -> bool:
+    """Whether the wide pair shows what is there in the reference frame alone."""
+    return window.wide is not None and window.offsets[window.wide[0]] * window.offsets[window.wide[1]] < 0
 
 
 def draw_targets(

@@ -163,6 +163,8 @@ class PersistenceKnobs(Group):
     large_share: float = knob(
         0.02, "-", 0, 1, meaning="a blob of this share of the picture needs one link and no flow test"
     )
+    weak_links: int = knob(4, "frames", 1, 5, meaning="a blob that only the wide pair shows: seen in so many ...")
+    weak_passes: int = knob(3, "frames", 0, 5, meaning="... and passing the flow test in so many")
     trusted_blobs: int = knob(
         4, "blobs", 0, 1000, meaning="where no more blobs are seen a frame, one link does: parallax comes in crowds"
     )

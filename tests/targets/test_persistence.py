@@ -1,5 +1,7 @@
 """Blobs that stay are targets, blobs that flicker are not. Knobs are given: a new default changes nothing here."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,18 @@ def test_a_blob_that_changes_its_size_too_much_is_not_the_same(box_blob):
 
 def test_no_blobs_give_no_verdicts():
     assert persistent([Sighting([], [], None)], 0, SIZE, STRICT) == []
+
+
+def test_a_weak_blob_must_be_linked_and_steady_however_few_blobs_there_are(sightings):
+    def weak(frames):
+        return [Sighting([replace(b, weak=True) for b in f.blobs], f.motions, f.next_from_this) for f in frames]
+
+    few = STRICT.model_copy(update={"trusted_blobs": 4, "weak_links": 4, "weak_passes": 3})
+    assert persistent(weak(sightings()), 2, SIZE, few) == [True]
+    assert persistent(weak(sightings(steady=0.0)), 2, SIZE, few) == [False]
+    assert persistent(weak(sightings(there=(0, 0, 1, 1, 1))), 2, SIZE, few) == [False]
+    assert persistent(sightings(there=(0, 0, 1, 1, 1)), 2, SIZE, few) == [True]
+
+
+def test_a_large_blob_among_crowds_still_needs_a_link(sightings):
+    assert not verdict(sightings(there=(0, 0, 1, 0, 0), size=(100, 100), steady=0.0))

@@ -1,11 +1,13 @@
 """From a mask to blobs: labelling, gates, hulls."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.settings import MorphologyKnobs
 from torchvision_dddas.targets.occupied import occupied
+from torchvision_dddas.targets.silhouette import closed, ellipse
 
 
 @dataclass(frozen=True)
@@ -13,13 +15,15 @@ class Blob:
     """A connected region of the core mask.
 
     box: x, y, width, height in pixels. mask: (height, width) bool, its region (or its convex hull) inside the box.
-    core: (height, width) bool, the pixels that are certain. peak: largest evidence in it.
+    core: (height, width) bool, the pixels that are certain. peak: largest evidence in it. weak: seen over the wide pair
+    only, where parallax shows too.
     """
 
     box: tuple[int, int, int, int]
     mask: np.ndarray
     core: np.ndarray
     peak: float
+    weak: bool = False
 
     @property
     def area_px(self) -> int:
@@ -64,6 +68,19 @@ def find_blobs(
             blobs.append(Blob((left + x, top + y, width, height), mask, region & (seen > threshold), highest))
     blobs.sort(key=lambda blob: (blob.box[1], blob.box[0]))
     return _without_swallowed(blobs) if hull else blobs
+
+
+def weak_blobs(
+    wide: np.ndarray, found: list[Blob], threshold: float, knobs: MorphologyKnobs, min_area_px: int, peak: float
+) -> list[Blob]:
+    """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour."""
+    core = cv2.threshold(wide, int(threshold), 255, cv2.THRESH_BINARY)[1]
+    core = closed(cv2.erode(core, ellipse(knobs.erode_px)), knobs.close_px)
+    taken = np.zeros(wide.shape, bool)
+    for blob in found:
+        taken[blob.window] |= blob.mask
+    others = find_blobs(core, wide, threshold, min_area_px, peak, knobs.hull)
+    return [replace(blob, weak=True) for blob in others if not taken[blob.window][blob.mask].any()]
 
 
 def parts_of(

@@ -28,31 +28,43 @@ class Sighting:
 def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int], knobs: PersistenceKnobs) -> list[bool]:
     """Which blobs of `sightings[index]` are targets, judged by up to two frames before and after it.
 
+    A blob that is linked over enough frames and moves steadily in enough of them is a target. Where blobs are few, or
+    a blob is large, one link will do: parallax comes in crowds of small blobs. Weak blobs get no such leave.
+
     size: (width, height) of the picture. Source: METHOD.md section 1 asks for independently moving targets; the test
     per blob, not per pixel, is what keeps targets whole.
     """
-    middle = sightings[index]
-    crowded = np.median([len(s.blobs) for s in sightings]) > knobs.trusted_blobs
+    crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > knobs.trusted_blobs
+    possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
     verdicts = []
-    for blob, motion in zip(middle.blobs, middle.motions, strict=True):
-        members, passes = 1, int(motion.steady > knobs.flow_share)
-        for direction in (1, -1):
-            here, at = (blob, motion), index
-            for _ in range(2):
-                found = _follow(here, sightings, at, direction)
-                if found is None:
-                    break
-                here, at = found, at + direction
-                members += 1
-                passes += here[1].steady > knobs.flow_share
-        possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
+    for blob, motion in zip(sightings[index].blobs, sightings[index].motions, strict=True):
+        links, passes = _seen((blob, motion), sightings, index, knobs.flow_share)
+        if blob.weak:
+            verdicts.append(links >= knobs.weak_links and passes >= knobs.weak_passes)
+            continue
+        steady = links >= min(knobs.links, possible) and passes >= min(knobs.passes, possible)
         share = blob.area_px / (size[0] * size[1])
-        steady = members >= min(knobs.links, possible) and passes >= min(knobs.passes, possible)
-        trusted = share >= knobs.large_share if crowded else True
-        large = trusted and (members >= 2 or possible < 2 or share >= knobs.large_share / 5)
+        large = share >= knobs.large_share
+        linked = links >= 2 or possible < 2
+        trusted = (linked and large) if crowded else (linked or share >= knobs.large_share / 5)
         sure = motion.steady > knobs.sure_share and share >= knobs.large_share / 10
-        verdicts.append(bool(steady or large or sure))
+        verdicts.append(steady or trusted or sure)
     return verdicts
+
+
+def _seen(blob: tuple[Blob, Motion], sightings: Sequence[Sighting], index: int, flow_share: float) -> tuple[int, int]:
+    """In how many of up to five frames around `index` a blob is seen, and in how many of those it moves steadily."""
+    links, passes = 1, int(blob[1].steady > flow_share)
+    for direction in (1, -1):
+        here, at = blob, index
+        for _ in range(2):
+            found = _follow(here, sightings, at, direction)
+            if found is None:
+                break
+            here, at = found, at + direction
+            links += 1
+            passes += here[1].steady > flow_share
+    return links, passes
 
 
 def _follow(

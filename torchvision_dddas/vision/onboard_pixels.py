@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 
-from torchvision_dddas.targets.occupied import occupied
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.vision.protocol import WHITE
 
@@ -15,11 +14,6 @@ _MOST_TILES = 6
 _LEAST_DISTANCE = 3 / 3.7
 _LEVELS = np.arange(256)
 _ROWS = 257 * _LEVELS
-
-
-def ellipse(side: int) -> np.ndarray:
-    """A morphological kernel."""
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
 def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
@@ -205,17 +199,3 @@ def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int
     so_far = np.cumsum(cv2.calcHist([values], [0], mask, [256], [0, 256]).ravel())
     low, high = np.searchsorted(so_far, [(count + 1) // 2, count // 2 + 1])
     return max(least, (int(low) + int(high)) / 2)
-
-
-def closed(mask: np.ndarray, side: int) -> np.ndarray:
-    """The mask closed with an ellipse, to the bit as OpenCV closes it, but only where it is set at all."""
-    if side <= 1:
-        return mask
-    kernel = ellipse(side)
-    # A pixel's closing depends on what lies less than 2 x side away.
-    boxes = occupied(mask, 2 * side)
-    out = np.zeros_like(mask)
-    for x, y, w, h in boxes:
-        part = np.s_[y : y + h, x : x + w]
-        cv2.morphologyEx(mask[part], cv2.MORPH_CLOSE, kernel, dst=out[part])
-    return out

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.settings import Settings
+from torchvision_dddas.targets.silhouette import closed, ellipse
 from torchvision_dddas.types import Registration
-from torchvision_dddas.vision.onboard_pixels import closed, ellipse, exposed, inside, median_above, texture_of, warp
+from torchvision_dddas.vision.onboard_pixels import exposed, inside, median_above, texture_of, warp
 from torchvision_dddas.vision.onboard_registration import register
 from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, Foreground, View, Window
 
