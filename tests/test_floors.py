@@ -29,7 +29,7 @@ FLOORS: dict[str, set[str]] = {
     "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},
     "vision.torch_pixels": {"torch", "ops", "settings"},
     "vision.exposure": {"cv2", "numpy"},
-    "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "types", "settings", "errors"},
+    "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "targets.silhouette", "types", "settings", "errors"},
     "vision.onboard_registration": {"cv2", "numpy", "targets.projective", "types", "settings", "errors"},
     "vision.onboard_pixels": {"cv2", "numpy", "targets.occupied", "targets.projective", "types", "settings", "errors"},
     "windows": {"settings"},

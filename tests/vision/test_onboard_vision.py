@@ -10,6 +10,7 @@ from torchvision_dddas.settings import load
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.targets.projective import corner_error, transfer
+from torchvision_dddas.targets.silhouette import closed
 from torchvision_dddas.vision import onboard_pixels, onboard_registration
 from torchvision_dddas.vision.onboard_vision import OnboardVision
 
@@ -80,7 +81,7 @@ def test_closing_only_where_something_is_is_closing_everywhere(seed: int, side: 
         row, column = rng.integers(0, mask.shape[0]), rng.integers(0, mask.shape[1])
         mask[row : row + rng.integers(1, 25), column : column + rng.integers(1, 25)] = 255
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    assert np.array_equal(onboard_pixels.closed(mask, side), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
+    assert np.array_equal(closed(mask, side), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.15, -4.0), (0.85, 6.0), (1.0, 25.0)])
