@@ -25,6 +25,7 @@ _DEEP_WINDOW_PX = 21
 _LEAST_SHARE = 0.4
 # Keypoints are detected anew below this share of those detected, or of the coarse cells that they covered.
 _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
+_STRIP_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def _best_of_cells(grey: np.ndarray, cell: int, knobs: RegistrationKnobs) -> np.
     rows, columns = grey.shape[0] // cell, grey.shape[1] // cell
     if not rows or not columns:
         return np.zeros((0, 2), np.float32)
-    corner = cv2.cornerMinEigenVal(grey, knobs.block_px, ksize=3)
+    corner = _corners(grey, knobs.block_px)
     cells = corner[: rows * cell, : columns * cell].reshape(rows, cell, columns * cell)
     # Down the columns first: that runs along whole rows of memory.
     best = cells.max(axis=1).reshape(rows, columns, cell)
@@ -97,6 +98,17 @@ def _best_of_cells(grey: np.ndarray, cell: int, knobs: RegistrationKnobs) -> np.
     row = at_best.argmax(axis=2) + cell * np.arange(rows)[:, None]
     good = value > max(knobs.quality * float(corner.max()), 1e-7)
     return np.stack([column[good], row[good]], axis=1).astype(np.float32)
+
+
+def _corners(grey: np.ndarray, block: int) -> np.ndarray:
+    """(H, W) float32: `cv2.cornerMinEigenVal`, in strips, because it holds six float pictures of what it is given."""
+    corner = np.empty(grey.shape, np.float32)
+    reach = 1 + block // 2
+    for top in range(0, len(grey), _STRIP_ROWS):
+        above, bottom = min(top, reach), top + _STRIP_ROWS
+        strip = cv2.cornerMinEigenVal(grey[top - above : bottom + reach], block, ksize=3)
+        corner[top:bottom] = strip[above : above + _STRIP_ROWS]
+    return corner
 
 
 def _worn(carried: _Carried, size: tuple[int, int], knobs: RegistrationKnobs) -> bool:
