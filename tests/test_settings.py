@@ -90,6 +90,8 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
         ("registration.keypoints=true", ["True", "a whole number"]),
         ("registration.block_px=4", ["block_px = 4", "3 to 15 px, odd"]),
         ("registration.quality=nan", ["nan", "0.0001 to 0.5"]),
+        ("difference.near_frames=[]", ["near_frames", "a list of 1 to 30 frames"]),
+        ("difference.near_frames=[0]", ["near_frames = 0", "a list of 1 to 30 frames"]),
         ("registration.model=plane", ["'plane'", "homography or affine"]),
         ("interval.rule=1", ["true or false"]),
         ("interval.minimum_frames=50", ["minimum_frames = 50", "above maximum_frames"]),

@@ -112,7 +112,7 @@ class DifferenceKnobs(Group):
         meaning="normalized: the difference to both neighbours in units of local noise, exposure corrected; "
         "to_reference: min(|I(t) - W1|, |I(t) - W2|) in grey levels; between_later: |W2 - W1|, the source's eq. 9",
     )
-    near_frames: tuple[Annotated[int, Field(ge=1, le=30)], ...] = knob(
+    near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = knob(
         (1, 2), "frames", meaning="distances of the neighbours on either side of the reference frame"
     )
     wide_frames: int = knob(6, "frames", 0, 60, meaning="distance of the pair that fills large targets; 0 is none")
