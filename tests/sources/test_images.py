@@ -150,6 +150,7 @@ def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path: Path) -> N
     save(floats / "1.tiff", picture(1).astype(np.float32))
     mistakes: list[tuple[str | Path, str]] = [
         (tmp_path / "absent", "does not exist"),
+        ("", "name is empty"),
         (empty, "holds no images"),
         (outer, f"did you mean {outer / 'frames'}?"),
         (films, f"did you mean {films / 'clip.avi'}?"),

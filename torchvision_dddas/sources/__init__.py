@@ -28,6 +28,10 @@ def open_source(spec: str | Path, *, rate_hz: float | None = None, full_scale: i
         return VideoSource(int(index), text, rate_hz)
     if "://" in text:
         return VideoSource(text, text, rate_hz)
+    if not text:
+        raise InputError(
+            "the input's name is empty; wanted a video file, a folder or glob of images, camera:0, rtsp://..."
+        )
     path = Path(text)
     if path.is_dir():
         return ImageSource(images_of_folder(path), text, rate_hz or 10.0, full_scale)
