@@ -36,6 +36,7 @@ def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path: Pa
         (HEADER + "0,20,5\n1,high,5\n", ["line 3", "altitude_m is 'high'"]),
         (HEADER + "0,20,nan\n", ["line 2", "speed_m_s is 'nan'"]),
         (HEADER + "0,inf,5\n", ["line 2", "altitude_m is 'inf'"]),
+        (HEADER + "0,20,-5\n", ["line 2", "speed_m_s is '-5'", "0 or more"]),
         (HEADER + "0,20\n", ["line 2", "speed_m_s is ''"]),
         (HEADER + "0,20,5\n2,20,5\n1,20,5\n", ["line 4", "runs back from 2 to 1"]),
     ],

@@ -23,7 +23,8 @@ class Flight(NamedTuple):
 def read_telemetry(path: str | Path) -> Telemetry:
     """Read the three columns by name; further columns are ignored, blank lines skipped.
 
-    Raises InputError with file and line: unreadable, a column missing, no rows, not a finite number, time running back.
+    Raises InputError with file and line: unreadable, a column missing, no rows, not a finite number, a
+    negative speed, time running back.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -80,4 +81,8 @@ def _number(row: list[str], place: int, header: list[str], path: str, line: int)
         value = np.nan
     if not np.isfinite(value):
         raise InputError(f"telemetry {path}, line {line}: {header[place]} is '{text}'; wanted a finite number")
+    if value < 0 and header[place] == "speed_m_s":
+        raise InputError(
+            f"telemetry {path}, line {line}: speed_m_s is '{text}'; wanted the speed over ground, 0 or more"
+        )
     return value
