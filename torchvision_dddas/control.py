@@ -16,7 +16,8 @@ _ALTITUDE_STEP = 0.2
 def interval_from_telemetry(altitude_m: float, speed_m_s: float, rate_hz: float, knobs: IntervalKnobs) -> float:
     """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
 
-    Source: appendix B, eq. 2, calibrated as METHOD.md section 1 says; the speed has a floor so that hovering is finite.
+    Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz; the floor of the speed, which keeps
+    hovering finite, is ours.
     """
     speed = max(speed_m_s, knobs.lowest_speed_m_s)
     by_height = altitude_m / knobs.reference_altitude_m * knobs.reference_speed_m_s / speed

@@ -46,7 +46,7 @@ class Group(BaseModel):
 
 
 class RegistrationKnobs(Group):
-    """How the background's motion between two frames is found (METHOD section 1, S1 to S3)."""
+    """How the background's motion between two frames is found (appendix B, steps S1 to S3)."""
 
     model: Literal["homography", "affine"] = knob(
         "homography", "-", meaning="the background's motion: homography, or the earlier affine baseline"
@@ -78,7 +78,7 @@ class RegistrationKnobs(Group):
 
 
 class IntervalKnobs(Group):
-    """The detection interval and the rule that steers it (METHOD section 1; appendix B, eq. 2)."""
+    """The detection interval and the rule that steers it (appendix B, eq. 2)."""
 
     rule: bool = knob(True, "-", meaning="steer the interval by altitude, speed and rate; false keeps `frames`")
     frames: int = knob(3, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
@@ -104,7 +104,7 @@ class IntervalKnobs(Group):
 
 
 class DifferenceKnobs(Group):
-    """What makes a pixel foreground (METHOD section 1, S4)."""
+    """What makes a pixel foreground (appendix B, step S4)."""
 
     kind: Literal["normalized", "to_reference", "between_later"] = knob(
         "normalized",
@@ -129,7 +129,7 @@ class DifferenceKnobs(Group):
 
 
 class MorphologyKnobs(Group):
-    """How the silhouette is cleaned (METHOD section 1, S5)."""
+    """How the silhouette is cleaned (appendix B, step S5)."""
 
     erode_px: int = knob(
         3, "px", 1, 31, meaning="ellipse that erodes the silhouette: precision up, recall down; 1 is none"
@@ -198,7 +198,7 @@ class SmallKnobs(Group):
 
 
 class HistoryKnobs(Group):
-    """The motion history, its gradient and the segmentation by motion (METHOD section 1, S5)."""
+    """The motion history, its gradient and the segmentation by motion (appendix B, step S5)."""
 
     on: bool = knob(
         True, "-", meaning="heading and speed from the history where the chain computes no flow; part touching targets"
@@ -216,7 +216,7 @@ class HistoryKnobs(Group):
 
 
 class GateKnobs(Group):
-    """Which blobs can be targets; the bounds in metres hold when telemetry is given (METHOD section 1)."""
+    """Which blobs can be targets; the bounds in metres hold when telemetry is given (appendix A)."""
 
     min_area_px: int = knob(300, "px", 1, 1_000_000, meaning="smallest foreground area of a target")
     min_size_m: float = knob(0.2, "m", 0, 100, meaning="shortest longer side of a target on the ground")

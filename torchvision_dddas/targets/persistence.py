@@ -31,7 +31,7 @@ def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int],
     A blob that is linked over enough frames and moves steadily in enough of them is a target. Where blobs are few, or
     a blob is large, one link will do: parallax comes in crowds of small blobs. Weak blobs get no such leave.
 
-    size: (width, height) of the picture. Source: METHOD.md section 1 asks for independently moving targets; the test
+    size: (width, height) of the picture. Source: appendix B, S5, asks for independently moving targets; the test
     per blob, not per pixel, is what keeps targets whole.
     """
     crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > knobs.trusted_blobs
