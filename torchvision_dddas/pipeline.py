@@ -39,7 +39,6 @@ class Observation:
     blobs: list[Blob] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     targets: list[Found] | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def observe(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.settings import GateKnobs
-from torchvision_dddas.targets.gates import Gates, gates_at, ground_speed, pixels_per_metre
+from torchvision_dddas.targets.gates import Gates, gates_at, pixels_per_metre
 
 KNOBS = GateKnobs(min_size_m=0.5, max_size_m=10.0, max_speed_m_s=30.0, focal_px=800.0)
 
@@ -24,11 +24,6 @@ def test_twice_as_high_everything_is_half_as_large(altitude):
 
 def test_a_faster_camera_sees_less_movement_a_frame():
     assert gates_at(40.0, 30.0, KNOBS).max_speed_px == pytest.approx(gates_at(40.0, 10.0, KNOBS).max_speed_px / 3)
-
-
-def test_speed_in_pixels_and_over_ground_are_inverse():
-    fastest = gates_at(73.0, 25.0, KNOBS).max_speed_px
-    assert ground_speed(fastest, 73.0, 25.0, KNOBS) == pytest.approx(30.0)
 
 
 @pytest.mark.parametrize("altitude", [0.0, -3.0, 0.5])

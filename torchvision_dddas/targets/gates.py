@@ -34,8 +34,3 @@ def gates_at(altitude_m: float, rate_hz: float, knobs: GateKnobs) -> Gates:
     """The gates at an altitude above ground; rate_hz: frames a second."""
     scale = pixels_per_metre(altitude_m, knobs.focal_px)
     return Gates(knobs.min_size_m * scale, knobs.max_size_m * scale, knobs.max_speed_m_s * scale / rate_hz)
-
-
-def ground_speed(speed_px: float, altitude_m: float, rate_hz: float, knobs: GateKnobs) -> float:
-    """Pixels a frame over the background as metres a second over ground."""
-    return speed_px * rate_hz / pixels_per_metre(altitude_m, knobs.focal_px)
