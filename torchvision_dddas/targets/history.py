@@ -1,9 +1,9 @@
 """Motion history of one clip: when each place last moved, seen from the current frame (appendix B, step S5).
 
 The counterpart of `ops.history` for one 8-bit stream. Stamps are uint8: 255 is now, 254 one frame ago, 0 longer ago
-than the duration. The past silhouettes are kept with their composed registrations and the stamps are made where they
-are asked for: warping stamps on at every step would round to whole pixels each time, so that a camera moving by 0.4 px
-a frame would never move its history at all.
+than the duration. The outlines of past silhouettes are kept with their composed registrations, and the stamps are
+painted once a frame if anyone asks: warping stamps on at every step would round to whole pixels each time, so that a
+camera moving by 0.4 px a frame would never move its history at all.
 """
 
 from collections import deque
@@ -12,14 +12,21 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from torchvision_dddas.targets.projective import transfer
+
 NEWEST = 255
+# Corners are painted to 1/16 px; further off than this they are beyond any picture.
+_SHIFT, _FAR_PX = 4, 1e5
 Box = tuple[int, int, int, int]
 
 
 @dataclass
 class _Past:
+    """outlines: (N, 2) corners of a silhouette's outlines, holes too, one after another. ends: where each ends."""
+
     number: int
-    silhouette: np.ndarray
+    outlines: np.ndarray
+    ends: np.ndarray
     now_from_then: np.ndarray
 
 
@@ -30,10 +37,13 @@ class MotionHistory:
         self.duration_frames = duration_frames
         self.number = 0
         self._past: deque[_Past] = deque()
+        self._shape = (0, 0)
+        self._painted: np.ndarray | None = None
 
     def move(self, number: int, this_from_last: np.ndarray | None) -> None:
         """Go on to a frame. this_from_last: (3, 3) registration from the frame before; None at a cut forgets all."""
         self.number = number
+        self._painted = None
         if this_from_last is None:
             self._past.clear()
         while self._past and number - self._past[0].number > self.duration_frames:
@@ -43,17 +53,30 @@ class MotionHistory:
 
     def add(self, silhouette: np.ndarray) -> None:
         """Stamp the (H, W) uint8 silhouette of the current frame, nonzero where something moves."""
-        self._past.append(_Past(self.number, silhouette.copy(), np.eye(3)))
+        outlines, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        corners = np.concatenate([np.zeros((0, 2)), *(outline[:, 0] for outline in outlines)])
+        self._past.append(_Past(self.number, corners, np.cumsum([len(o) for o in outlines], dtype=int), np.eye(3)))
+        self._shape = silhouette.shape[:2]
+        self._painted = None
 
     def stamps(self, box: Box) -> np.ndarray:
         """(height, width) uint8 stamps inside a box of the current frame: x, y, width, height."""
         x, y, width, height = box
-        from_picture = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1]], float)
-        stamps = np.zeros((height, width), np.uint8)
+        if not self._past:
+            return np.zeros((height, width), np.uint8)
+        if self._painted is None:
+            self._painted = self._all()
+        return self._painted[y : y + height, x : x + width].copy()
+
+    def _all(self) -> np.ndarray:
+        """The stamps of the whole picture."""
+        stamps = np.zeros(self._shape, np.uint8)
         for past in self._past:  # the newest last: it overwrites
-            matrix = from_picture @ past.now_from_then
-            seen = cv2.warpPerspective(past.silhouette, matrix, (width, height), flags=cv2.INTER_NEAREST)
-            stamps[seen > 0] = NEWEST - (self.number - past.number)
+            if len(past.ends):
+                places = np.clip(transfer(past.now_from_then, past.outlines), -_FAR_PX, _FAR_PX)
+                corners = np.round(places * 2**_SHIFT).astype(np.int32)
+                outlines = np.split(corners, past.ends[:-1])
+                cv2.fillPoly(stamps, outlines, NEWEST - (self.number - past.number), shift=_SHIFT)
         return stamps
 
 

@@ -42,14 +42,14 @@ def regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float) -> l
     wall = np.ones((stamps.shape[0] + 2, stamps.shape[1] + 2), np.uint8)
     wall[1:-1, 1:-1] = stamps == 0
     threshold = int(min(threshold_frames, 254))  # stamps are whole frames
-    found = []
-    for row, column in np.argwhere(seeds & (stamps > 0)):
-        if wall[row + 1, column + 1]:
-            continue
-        flags = 8 | (2 << 8) | cv2.FLOODFILL_MASK_ONLY
+    flags = 8 | (2 << 8) | cv2.FLOODFILL_MASK_ONLY
+    left, found = seeds & (stamps > 0), []
+    while left.any():
+        row, column = np.unravel_index(int(left.argmax()), left.shape)
         cv2.floodFill(stamps, wall, (int(column), int(row)), 0, threshold, threshold, flags)
         region = wall[1:-1, 1:-1] == 2
         wall[1:-1, 1:-1][region] = 1
+        left &= ~region
         found.append(region)
     return found
 
