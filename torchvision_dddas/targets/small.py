@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.settings import SmallKnobs
+from torchvision_dddas.targets.occupied import occupied
 from torchvision_dddas.targets.projective import transfer
 
 # A track is straight when its points lie this close to a constant velocity, px (root mean square).
@@ -36,12 +37,16 @@ class Track:
 
 def candidates(small: np.ndarray, knobs: SmallKnobs) -> list[tuple[int, int, int, int]]:
     """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to be told apart."""
-    count, _, stats, _ = cv2.connectedComponentsWithStats(small, ltype=cv2.CV_32S)
-    stats = stats[1:count]
-    fits = (stats[:, 4] >= knobs.min_area_px) & (stats[:, 2] * stats[:, 3] <= knobs.max_box_px)
-    if fits.sum() > knobs.max_candidates:
-        return []
-    return [(int(x), int(y), int(w), int(h)) for x, y, w, h, _ in stats[fits]]
+    boxes: list[tuple[int, int, int, int]] = []
+    for left, top, wide, high in occupied(small, 2):
+        part = small[top : top + high, left : left + wide]
+        count, _, stats, _ = cv2.connectedComponentsWithStats(part, ltype=cv2.CV_32S)
+        boxes += [
+            (left + x, top + y, w, h)
+            for x, y, w, h, area in stats[1:count].tolist()
+            if area >= knobs.min_area_px and w * h <= knobs.max_box_px
+        ]
+    return sorted(boxes, key=lambda box: (box[1], box[0])) if len(boxes) <= knobs.max_candidates else []
 
 
 class SmallTracks:
