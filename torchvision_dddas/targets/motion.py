@@ -13,6 +13,9 @@ _LEAST_SPEED_PX = 0.5
 # Disagreement that is still steady, and difference from the surroundings that counts: shares of the own speed.
 _STEADY, _UNLIKE = 0.5, 0.25
 _RING_NEAR_PX, _RING_FAR_PX = 5, 15
+# So many pixels of a blob are enough for its affine motion, which has settled once no term changes by more than this.
+_SAMPLES, _SETTLED_PX = 300, 0.01
+_PULL = np.diag([1e-9, 0.02, 0.02])
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int
     unlike = np.linalg.norm(v - around, axis=1) > _UNLIKE * speed
     steady = float((alike & unlike & (speed > _LEAST_SPEED_PX)).mean())
     row, column = np.nonzero(core)
-    step = max(1, len(row) // 1000)
+    step = max(1, len(row) // _SAMPLES)
     row, column = row[::step], column[::step]
     centre_u, centre_v = 2 * (left + column.mean()) + 0.5, 2 * (top + row.mean()) + 0.5
     scale = float(max(width, height))
@@ -106,13 +109,17 @@ def _at_half(blob: Blob, mask: np.ndarray, shape: tuple[int, int], left: int, to
 
 def robust_affine(u: np.ndarray, v: np.ndarray, flow_px: np.ndarray, rounds: int = 5) -> np.ndarray:
     """(3, 2) affine motion by reweighted least squares; a small pull towards pure translation keeps slim blobs sane."""
-    columns = np.c_[np.ones(len(u)), u, v]
+    columns = np.stack([np.ones(len(u)), u, v], axis=1)
     median = np.median(flow_px, axis=0)
     weight = 1 / (1 + ((flow_px - median) ** 2).sum(axis=1) / max(1.0, 0.1 * float(median @ median)))
     fit = np.zeros((3, 2))
     for _ in range(rounds):
-        weighted = columns * weight[:, None]
-        normal = weighted.T @ columns + np.diag([1e-9, 0.02, 0.02]) * max(float(weight.sum()), 1e-9)
-        fit = np.linalg.solve(normal, weighted.T @ flow_px)
-        weight = 1 / (1 + ((flow_px - columns @ fit) ** 2).sum(axis=1) / 0.5)
+        before = fit
+        weighted = columns.T * weight
+        normal = weighted @ columns + _PULL * max(float(weight.sum()), 1e-9)
+        fit = np.linalg.solve(normal, weighted @ flow_px)
+        if np.abs(fit - before).max() < _SETTLED_PX:
+            break
+        miss = flow_px - columns @ fit
+        weight = 1 / (1 + 2 * (miss[:, 0] ** 2 + miss[:, 1] ** 2))
     return fit
