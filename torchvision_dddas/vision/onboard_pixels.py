@@ -9,7 +9,7 @@ from torchvision_dddas.vision.protocol import WHITE
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
 # round places to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
-_MOST_TILES = 6
+_MOST_TILES = 16
 _STRIP_ROWS = 64
 # The least median distance between grey levels that exposures are trimmed by; times 3.7 it is 3 levels.
 _LEAST_DISTANCE = 3 / 3.7
