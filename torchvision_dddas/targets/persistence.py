@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -23,6 +24,26 @@ class Sighting:
     blobs: Sequence[Blob]
     motions: Sequence[Motion]
     next_from_this: np.ndarray | None
+
+    @cached_property
+    def areas_px(self) -> np.ndarray:
+        """(N,) of the blobs."""
+        return np.array([blob.area_px for blob in self.blobs])
+
+    @cached_property
+    def centres_px(self) -> np.ndarray:
+        """(N, 2)."""
+        return np.array([blob.centre_px for blob in self.blobs])
+
+    @cached_property
+    def sizes_px(self) -> np.ndarray:
+        """(N, 2) widths and heights."""
+        return np.array([blob.box[2:] for blob in self.blobs])
+
+    @cached_property
+    def velocities_px(self) -> np.ndarray:
+        """(N, 2), 0 where unknown."""
+        return np.nan_to_num([motion.velocity_px for motion in self.motions])
 
 
 def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int], knobs: PersistenceKnobs) -> list[bool]:
@@ -81,27 +102,22 @@ def _follow(
     there_from_here = step if direction > 0 else np.linalg.inv(step)
     # Where it is by its own motion, and where it is if that was measured wrongly.
     centre, unmoved = transfer(there_from_here, np.vstack([blob.centre_px + direction * velocity, blob.centre_px]))
-    best, best_score = None, 0.0
     there = sightings[at + direction]
-    for other, its in zip(there.blobs, there.motions, strict=True):
-        ratio = other.area_px / max(blob.area_px, 1)
-        if not 1 / _SIZE_RATIO < ratio < _SIZE_RATIO:
-            continue
-        overlap = max(_iou(c, blob.box[2:], other.centre_px, other.box[2:]) for c in (centre, unmoved))
-        reach = 0.5 * float(np.hypot(*blob.box[2:]))
-        alike = float(np.linalg.norm(velocity - np.nan_to_num(its.velocity_px)))
-        near = float(np.linalg.norm(other.centre_px - centre)) < reach and alike < _VELOCITY_PX
-        if (overlap >= _LEAST_IOU or near) and overlap + 0.01 > best_score:
-            best, best_score = (other, its), overlap + 0.01
-    return best
+    if not there.blobs:
+        return None
+    ratio = there.areas_px / max(blob.area_px, 1)
+    size = np.array(blob.box[2:])
+    overlap = np.maximum(*(_ious(place, size, there.centres_px, there.sizes_px) for place in (centre, unmoved)))
+    away, unlike = there.centres_px - centre, there.velocities_px - velocity
+    near = (np.hypot(*away.T) < 0.5 * np.hypot(*size)) & (np.hypot(*unlike.T) < _VELOCITY_PX)
+    fits = (ratio > 1 / _SIZE_RATIO) & (ratio < _SIZE_RATIO) & ((overlap >= _LEAST_IOU) | near)
+    best = int(np.argmax(np.where(fits, overlap, -1.0)))
+    return (there.blobs[best], there.motions[best]) if fits[best] else None
 
 
-def _iou(a: np.ndarray, a_size: Sequence[int], b: np.ndarray, b_size: Sequence[int]) -> float:
-    """IoU of two boxes given by centre and (width, height)."""
-    overlap = np.minimum(a + np.array(a_size) / 2, b + np.array(b_size) / 2) - np.maximum(
-        a - np.array(a_size) / 2, b - np.array(b_size) / 2
-    )
-    if (overlap <= 0).any():
-        return 0.0
-    both = float(overlap[0] * overlap[1])
-    return both / (a_size[0] * a_size[1] + b_size[0] * b_size[1] - both)
+def _ious(centre: np.ndarray, size: np.ndarray, centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """(N,) IoU of a box with others, all by centre and (width, height)."""
+    common = np.minimum(centre + size / 2, centres + sizes / 2) - np.maximum(centre - size / 2, centres - sizes / 2)
+    both = np.prod(np.maximum(common, 0), axis=1)
+    shares: np.ndarray = both / (np.prod(size) + np.prod(sizes, axis=1) - both)
+    return shares
