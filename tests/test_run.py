@@ -206,6 +206,9 @@ def test_a_cut_gives_no_full_mask_and_is_not_looked_across(config, noise):
     settings = load(config)
     found = detect(frames_of(one + two), settings)
     assert max((s.mask > 0).mean() for s in found) < 0.25
+    # The first frame after it is flagged, and nothing else.
+    assert [s.frame.number for s in found if not s.reliable] == [9]
+    assert found[8].cause and not found[8].mask.any() and len(found[8].detections) == 0
     # Each side is as if it were alone.
     alone = detect(frames_of(one), settings)
     assert all(np.array_equal(a.mask, b.mask) for a, b in zip(found[:8], alone, strict=True))

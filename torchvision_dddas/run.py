@@ -271,6 +271,10 @@ class Loop:
 
     def _window(self, index: int) -> Window | None:
         slot = self._at(index)
+        before = self._at(index - 1).step if index > self.first else None
+        if before is not None and not before.reliable:  # a cut, or a picture that shows nothing: said once, here
+            slot.cause = before.cause
+            return None
         back = max(
             self.settings.difference.wide_frames, 2 * slot.interval, 2 * max(self.settings.difference.near_frames)
         )
@@ -299,13 +303,8 @@ class Loop:
         return high_from_low if other > index else np.linalg.inv(high_from_low)
 
     def _why_alone(self, index: int) -> str:
-        step = self._at(index).step or (self._at(index - 1).step if index > self.first else None)
-        if step is not None and not step.reliable:
-            return step.cause
-        before = self._at(index - 1).step if index > self.first else None
-        if before is not None and not before.reliable:
-            return before.cause
-        return "too few frames hang together with it"
+        step = self._at(index).step
+        return step.cause if step is not None and not step.reliable else "too few frames hang together with it"
 
     def _follow_small(self, index: int) -> None:
         slot = self._at(index)
