@@ -1,5 +1,7 @@
 """The whole loop on small films: what comes out, when, and what happens where the film is bad."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 
 import cv2
@@ -12,6 +14,7 @@ from torchvision_dddas.settings import Settings, load, with_knobs
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.types import Frame, Scene, Telemetry
 from torchvision_dddas.vision import load as load_vision
+from torchvision_dddas.windows import delay, reach
 
 SIZE = (240, 180)
 CONFIGS = (None, "source", "fast")
@@ -341,3 +344,26 @@ def test_scenes_of_frames_at_hand_are_those_of_a_run(film):
     vision = load_vision("onboard", settings)
     at_hand = list(scenes(frames_of(film.images), vision, settings, RATE_HZ))
     assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), vision, settings), strict=True))
+
+
+@pytest.mark.parametrize("config", [None, "fast"])
+def test_what_no_window_looks_at_again_is_let_go(config, film):
+    """No more colour pictures are held than a window spans, however long the clip; a settled frame's is not."""
+    settings = with_knobs(load(config), {"interval.rule": False})
+    loop, there_and_back = Loop(load_vision("onboard", settings), settings, RATE_HZ), [*film.images, *film.images[::-1]]
+    held = []
+    for frame in frames_of(there_and_back * 2):
+        for _ in loop.feed(frame):
+            pass
+        colours = {id(picture) for slot in loop.slots for picture in (slot.frame.image, slot.view.image)}
+        colours -= {id(slot.view.grey) for slot in loop.slots}
+        held.append((len(loop.slots), len(colours)))
+    assert max(held) == max(held[-10:])
+    knobs = settings.difference
+    ahead = reach(settings.interval.frames, settings) + delay(settings.interval.frames, settings)
+    assert max(colours for _, colours in held) <= knobs.wide_frames + ahead + 1
+
+
+def test_a_run_loads_neither_scipy_nor_torch():
+    code = "import sys, torchvision_dddas.run; print([m for m in ('scipy', 'torch') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

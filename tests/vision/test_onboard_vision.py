@@ -72,6 +72,17 @@ def test_the_view_as_a_polygon_is_the_view_of_every_pixel_but_for_its_border(per
     assert not (ours & (cv2.dilate(each, cross) == 0)).any()
 
 
+@pytest.mark.parametrize("size", [(320, 240), (33, 64), (40, 65), (50, 129), (3, 3)])
+def test_gradients_and_corners_in_strips_are_those_of_the_whole(size: tuple[int, int]) -> None:
+    grey = textured(size)
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.5) for order in ((1, 0), (0, 1)))
+    whole = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
+    assert np.array_equal(onboard_pixels.texture_of(grey), whole)
+    for block in (3, 5, 7):
+        corners = cv2.cornerMinEigenVal(grey, block, ksize=3)
+        np.testing.assert_allclose(onboard_registration._corners(grey, block), corners, rtol=1e-3, atol=1e-8)
+
+
 @pytest.mark.parametrize("side", [1, 3, 4, 15, 25])
 @pytest.mark.parametrize("seed", range(6))
 def test_closing_only_where_something_is_is_closing_everywhere(seed: int, side: int) -> None:
