@@ -1,5 +1,6 @@
 """Back ends: the same maps of what moves, from torch tensors or from OpenCV."""
 
+import os
 from importlib.util import find_spec
 
 from torchvision_dddas.errors import InputError
@@ -25,6 +26,8 @@ def load(backend: str, settings: Settings) -> Vision:
             f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
             "or take --backend onboard"
         )
+    # Waiting threads that spin take the cores from the threads they wait for, minutes a frame on a busy machine.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from torchvision_dddas.vision.torch_vision import TorchVision
 
     return TorchVision(settings)
