@@ -10,7 +10,7 @@ from torchvision_dddas import settings as knobs
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.targets.projective import corner_error
 from torchvision_dddas.vision import View, Window, load
-from torchvision_dddas.vision.exposure import exposure, in_one_light
+from torchvision_dddas.vision.exposure import exposure, in_one_light, to_light_of
 
 SIZE = (320, 240)
 GAIN = [1.0, 1.15, 0.85, 0.85, 1.0, 1.15]
@@ -47,6 +47,14 @@ def test_frames_of_one_light_are_left_as_they_are_however_the_camera_moves(greys
     for a, b in [*pairwise(greys), (greys[0], greys[5])]:
         earlier, later = in_one_light(view(a), view(b))
         assert earlier is a and later is b
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_pan_over_an_enlarged_picture_is_no_change_of_light(scale) -> None:
+    coarse = np.random.default_rng(5).integers(0, 256, (360 // scale, 480 // scale)).astype(np.uint8)
+    ground = cv2.resize(coarse, (480, 360), interpolation=cv2.INTER_CUBIC)
+    views = [view(ground[k : k + 240, k : k + 320]) for k in range(8)]
+    assert {to_light_of(views[0], other) for other in views} == {(1.0, 0.0)}
 
 
 def test_levels_that_change_otherwise_than_by_a_gain_and_an_offset_are_content() -> None:
