@@ -104,6 +104,27 @@ def test_on_the_same_registrations_only_ties_of_rounding_differ_even_where_the_l
     assert onboard.core.any() and onboard.small is not None and onboard.small.any()
 
 
+def test_plain_differences_show_the_same_in_both_engines_whether_or_not_the_light_jumps() -> None:
+    size, settings = SIZES[0], knobs.load("fast")
+    ground = [view.image_from_ground for view in flight(1, FRAMES, size, RATE_HZ)]
+    steps = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
+    found = {}
+    for name in ("onboard", "torch"):
+        for jumps in (False, True):
+            engine = load(name, settings)
+            views = [engine.prepare(image) for image in film(size, jumps)]
+            (found[name, jumps],) = engine.foreground([window(views, steps, 3, [(2, 4)], False)])
+    steady = found["onboard", False]
+    assert steady.core.any()
+    for name in ("onboard", "torch"):
+        jumped = found[name, True]
+        core, wanted = jumped.core > 0, steady.core > 0
+        assert (core & wanted).sum() / (core | wanted).sum() > 0.9
+        assert (np.abs(jumped.evidence.astype(int) - steady.evidence) > 6).mean() < 0.02
+    apart = np.abs(found["torch", True].evidence.astype(int) - found["onboard", True].evidence)
+    assert (apart > 2).mean() < 0.002
+
+
 @pytest.mark.parametrize("shape", [(96, 128), (9, 11), (1, 1)])
 def test_blank_frames_are_flagged_by_both_and_break_neither(engines, shape) -> None:
     causes = set()

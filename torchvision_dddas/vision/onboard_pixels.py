@@ -134,15 +134,20 @@ def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.n
         offset = float(mean_y - gain * mean_x)
         if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
             break
-    table = np.clip(np.round(gain * x + offset), 0, 255).astype(np.uint8)
-    if (table == x).all():
+    return lit(reference, warped, gain, offset)
+
+
+def lit(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
+    """The warped picture through gain and offset; what it has cut off at white agrees with anything brighter."""
+    table = np.clip(np.round(gain * _LEVELS + offset), 0, 255).astype(np.uint8)
+    if (table == _LEVELS).all():
         return warped
-    lit = cv2.LUT(warped, table)
+    through = cv2.LUT(warped, table)
     if table[255] < WHITE:
         # Cut off at white, a pixel only tells that the place was at least so bright.
         cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
-        cv2.copyTo(cv2.max(lit, reference), cut, lit)
-    return lit
+        cv2.copyTo(cv2.max(through, reference), cut, through)
+    return through
 
 
 class _GreyPairs:

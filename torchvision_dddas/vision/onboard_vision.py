@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from torchvision_dddas.settings import Settings
+from torchvision_dddas.settings import DifferenceKnobs, Settings
 from torchvision_dddas.targets.silhouette import closed, ellipse
 from torchvision_dddas.types import Registration
-from torchvision_dddas.vision.onboard_pixels import exposed, inside, median_above, texture_of, warp
+from torchvision_dddas.vision.exposure import to_light_of
+from torchvision_dddas.vision.onboard_pixels import exposed, inside, lit, median_above, texture_of, warp
 from torchvision_dddas.vision.onboard_registration import register
 from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, Foreground, View, Window
 
@@ -50,7 +51,7 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
         textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
     else:
         scale = 1.0
-    neighbours = _Neighbours(window, knobs.border_px, normalized)
+    neighbours = _Neighbours(window, knobs)
 
     def evidence(pair: tuple[int, int]) -> np.ndarray:
         both = neighbours.both(pair)
@@ -94,8 +95,8 @@ class _Neighbours:
     All of a window's at once, with where each is seen, would hold 15 MB at 1280x720.
     """
 
-    def __init__(self, window: Window, border_px: int, expose: bool) -> None:
-        self.window, self.border_px, self.expose = window, border_px, expose
+    def __init__(self, window: Window, knobs: DifferenceKnobs) -> None:
+        self.window, self.knobs = window, knobs
         self.made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.known: dict[tuple[int, int], np.ndarray] = {}
 
@@ -103,9 +104,14 @@ class _Neighbours:
         """A neighbour warped, and 255 where it may be compared."""
         if index not in self.made:
             reference, neighbour_from_reference = self.window.reference, self.window.neighbour_from_reference[index]
-            warped = warp(self.window.neighbours[index].grey, neighbour_from_reference)
-            seen = inside(neighbour_from_reference, reference.size, self.border_px)
-            self.made[index] = (exposed(reference.grey, warped, seen) if self.expose else warped), seen
+            neighbour = self.window.neighbours[index]
+            warped = warp(neighbour.grey, neighbour_from_reference)
+            seen = inside(neighbour_from_reference, reference.size, self.knobs.border_px)
+            if self.knobs.kind == "normalized":
+                warped = exposed(reference.grey, warped, seen)
+            elif self.knobs.kind == "to_reference":
+                warped = lit(reference.grey, warped, *to_light_of(reference, neighbour))
+            self.made[index] = warped, seen
         return self.made[index]
 
     def both(self, pair: tuple[int, int]) -> np.ndarray:

@@ -114,13 +114,20 @@ def exposed(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> T
     wanted, given = (picture[..., ::4, ::4] / LEVEL for picture in (reference, warped))
     gain, offset = difference.exposure(wanted, given, inside[:, None], stride=1)
     enough = inside.sum((1, 2)) >= 100
-    gain, offset = torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
+    return lit(reference, warped, torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0))
+
+
+def lit(reference: Tensor, warped: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
+    """The warped pictures through their gains and offsets, (B,) each, in whole levels.
+
+    What they have cut off at white agrees with anything brighter.
+    """
     gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
     darkened = (gain * LEVEL + offset).round() < WHITE
     # Cut off at white, a pixel only tells that the place was at least so bright.
     cut = (warped >= WHITE) & darkened if bool(darkened.any()) else None
-    lit = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
-    return lit if cut is None else torch.where(cut, torch.maximum(lit, reference), lit)
+    through = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+    return through if cut is None else torch.where(cut, torch.maximum(through, reference), through)
 
 
 def apart(a: Tensor, b: Tensor) -> Tensor:

@@ -15,8 +15,9 @@ from torch import Tensor
 from torchvision_dddas.ops import difference, morphology, warp
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.types import Registration
+from torchvision_dddas.vision.exposure import to_light_of
 from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, View, Window
-from torchvision_dddas.vision.torch_pixels import closed, evidence, exposed, joined, levels_of, small_movers
+from torchvision_dddas.vision.torch_pixels import closed, evidence, exposed, joined, levels_of, lit, small_movers
 from torchvision_dddas.vision.torch_registration import register
 
 Item = TypeVar("Item")
@@ -83,6 +84,10 @@ class TorchVision:
             run = warp.seen_columns(matrices[:, k], (height, width), frame_size, knobs.border_px)
             if knobs.kind == "normalized":
                 sampled = exposed(levels, sampled, run)
+            elif knobs.kind == "to_reference":
+                light = np.array([to_light_of(window.reference, window.neighbours[k]) for window in windows])
+                if (light != (1.0, 0.0)).any():
+                    sampled = lit(levels, sampled, *torch.from_numpy(light.T).to(levels))
             warped.append(sampled.to(torch.uint8))
             seen.append(run)
         # Without either nobody asks for the texture.
