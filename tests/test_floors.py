@@ -27,6 +27,7 @@ FLOORS: dict[str, set[str]] = {
     "vision": {"numpy", "targets.projective", "types", "settings", "errors"},
     "vision.torch_vision": {"torch", "numpy", "cv2", "ops", "types", "settings", "errors"},
     "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},
+    "vision.torch_following": {"torch", "ops", "types", "settings"},
     "vision.torch_pixels": {"torch", "ops", "settings"},
     "vision.exposure": {"cv2", "numpy"},
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "targets.silhouette", "types", "settings", "errors"},
@@ -48,7 +49,15 @@ FLOORS: dict[str, set[str]] = {
     "cli": {"*"},
 }
 # Only these may need torch to be imported at all.
-NEED_TORCH = ("ops", "vision.torch_vision", "vision.torch_registration", "vision.torch_pixels", "tuning", "exporting")
+NEED_TORCH = (
+    "ops",
+    "vision.torch_vision",
+    "vision.torch_registration",
+    "vision.torch_following",
+    "vision.torch_pixels",
+    "tuning",
+    "exporting",
+)
 BACK_ENDS = ("vision.torch_", "vision.onboard_")
 
 FILES = {
