@@ -110,7 +110,8 @@ class DifferenceKnobs(Group):
         "normalized",
         "-",
         meaning="normalized: the difference to both neighbours in units of local noise, exposure corrected; "
-        "to_reference: min(|I(t) - W1|, |I(t) - W2|) in grey levels; between_later: |W2 - W1|, the source's eq. 9",
+        "to_reference: min(|I(t) - W1|, |I(t) - W2|) in grey levels, a clear change of exposure undone; "
+        "between_later: |W2 - W1|, the source's eq. 9",
     )
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = knob(
         (1, 2), "frames", meaning="distances of the neighbours on either side of the reference frame"

@@ -12,6 +12,7 @@ from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.targets.projective import corner_error, transfer
 from torchvision_dddas.targets.silhouette import closed
 from torchvision_dddas.vision import onboard_pixels, onboard_registration
+from torchvision_dddas.vision.cells import cell_side
 from torchvision_dddas.vision.onboard_vision import OnboardVision
 
 SIZE = (320, 240)
@@ -137,7 +138,7 @@ def test_keypoints_are_the_best_pixel_of_every_cell(images: list[np.ndarray]) ->
             if part.max() > knobs.quality * corner.max():
                 wanted.add((left + int(column), top + int(row)))
     found = onboard_registration.keypoints(grey, knobs)
-    assert onboard_registration.cell_side(320, 240, knobs) == cell
+    assert cell_side(320, 240, knobs) == cell
     assert {(int(u), int(v)) for u, v in found} == wanted
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from torchvision_dddas.settings import RegistrationKnobs
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Registration
+from torchvision_dddas.vision.cells import cell_side
 from torchvision_dddas.vision.exposure import in_one_light
 from torchvision_dddas.vision.judgement import judged
 from torchvision_dddas.vision.protocol import View
@@ -77,11 +78,6 @@ def keypoints(grey: np.ndarray, knobs: RegistrationKnobs, halved: bool = False) 
         points = _best_of_cells(grey, max(cell // 2, 1), knobs)
         return 2 * points
     return _best_of_cells(grey, cell, knobs)
-
-
-def cell_side(width: int, height: int, knobs: RegistrationKnobs) -> int:
-    """Side of the grid cells, in pixels, that keeps the number of keypoints within the budget."""
-    return max(knobs.cell_px, int(np.ceil(np.sqrt(width * height / knobs.keypoints))))
 
 
 def _best_of_cells(grey: np.ndarray, cell: int, knobs: RegistrationKnobs) -> np.ndarray:

@@ -8,6 +8,7 @@ from torchvision_dddas.ops import flow, keypoints
 from torchvision_dddas.settings import RegistrationKnobs
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Registration
+from torchvision_dddas.vision.cells import cell_side
 from torchvision_dddas.vision.exposure import in_one_light
 from torchvision_dddas.vision.judgement import judged
 from torchvision_dddas.vision.protocol import View
@@ -86,11 +87,6 @@ def _detect(view: View, knobs: RegistrationKnobs, device: torch.device) -> None:
         levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
     points, _, valid = keypoints.grid_features(levels, cell, knobs.quality, knobs.block_px, least=1e-7 * LEVEL**2)
     view.kept["points"], view.kept["valid"] = step * points, valid
-
-
-def cell_side(width: int, height: int, knobs: RegistrationKnobs) -> int:
-    """Side of the grid cells, in pixels, that keeps the number of keypoints within the budget."""
-    return max(knobs.cell_px, int(np.ceil(np.sqrt(width * height / knobs.keypoints))))
 
 
 def _judged(found: tuple[np.ndarray, ...], size: tuple[int, int], knobs: RegistrationKnobs) -> Registration:
