@@ -71,6 +71,24 @@ class Detections:
 
 
 @dataclass(frozen=True)
+class Tracks:
+    """The targets of one frame with their identities, one row a target.
+
+    frame: 1-based number. identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
+    row: (N,) int64, which of the frame's detections it is; -1 for a box that bridges a gap between two of them.
+    """
+
+    frame: int
+    identity: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.identity)
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """A knob that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
 
@@ -88,6 +106,7 @@ class Scene:
     mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
     reliable: False when registration could not be trusted: then the mask is empty and `cause` says why.
     interval_frames: the detection interval in force. seconds: time spent per stage on this frame.
+    step: how the background moved since the frame before; None where there is none.
     """
 
     frame: Frame
@@ -98,3 +117,4 @@ class Scene:
     cause: str = ""
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    step: Registration | None = None
