@@ -384,7 +384,7 @@ class Loop:
         found += self._small_targets(index, found)
         found = admitted(found, slot.regime.gates if slot.regime else None)
         detections, mask = table(found, slot.view.size)
-        reliable, step = not slot.cause, self._step(index - 1) if index > self.first else None
+        reliable, step = not slot.cause, self._at(index - 1).step if index > self.first else None
         return Scene(
             *(slot.frame, mask, detections, slot.interval),
             *(reliable, slot.cause, slot.adjustments, slot.seconds, step),
