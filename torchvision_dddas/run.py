@@ -384,10 +384,16 @@ class Loop:
         found += self._small_targets(index, found)
         found = admitted(found, slot.regime.gates if slot.regime else None)
         detections, mask = table(found, slot.view.size)
-        reliable, step = not slot.cause, self._at(index - 1).step if index > self.first else None
         return Scene(
-            *(slot.frame, mask, detections, slot.interval),
-            *(reliable, slot.cause, slot.adjustments, slot.seconds, step),
+            frame=slot.frame,
+            mask=mask,
+            detections=detections,
+            interval_frames=slot.interval,
+            reliable=not slot.cause,
+            cause=slot.cause,
+            adjustments=slot.adjustments,
+            seconds=slot.seconds,
+            step=self._at(index - 1).step if index > self.first else None,
         )
 
     def _small_targets(self, index: int, found: list[Found]) -> list[Found]:

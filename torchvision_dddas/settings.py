@@ -234,6 +234,28 @@ class GateKnobs(Group):
     )
 
 
+class TrackKnobs(Group):
+    """Which detections become tracks, how they are linked, and how long a track lives. Lengths are in box heights."""
+
+    mode: Literal["default", "paper"] = knob(
+        "default", "-", meaning="default: links scored by motion, size and appearance; paper: the source's affinity"
+    )
+    look_ahead: bool = knob(True, "-", meaning="decide with the next frame in view (K = 3); false decides at once")
+    appearance: Literal["always", "ambiguous", "never"] = knob(
+        "always", "-", meaning="compare pictures of targets: always, where locations leave a doubt, or never"
+    )
+    min_score: float = knob(0.7, "-", 0, 1, meaning="detections of a lower score are no part of any track")
+    birth_score: float = knob(0.9, "-", 0, 1, meaning="a detection of at least this score may begin a track")
+    hits: int = knob(3, "frames", 1, 60, meaning="detections that confirm a track")
+    memory_frames: int = knob(125, "frames", 1, 10_000, meaning="how long a track that is not seen is remembered")
+    memory_outside_frames: int = knob(10, "frames", 1, 10_000, meaning="the same once it has left the picture")
+    speed: float = knob(0.07, "heights/frame", 1e-4, 10, meaning="typical speed at the start; adapts to the scene")
+    agility: float = knob(0.009, "heights/frame", 1e-5, 1, meaning="change of velocity in one frame at that speed")
+    scatter: float = knob(0.06, "heights", 1e-3, 1, meaning="scatter of a detection's centre")
+    appearance_weight: float = knob(10.0, "-", 0, 100, meaning="weight of the appearance's likeness")
+    appearance_offset: float = knob(0.86, "-", 0, 1, meaning="likeness that speaks neither for a link nor against it")
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -246,6 +268,7 @@ class Settings(Group):
     small: SmallKnobs = SmallKnobs()
     history: HistoryKnobs = HistoryKnobs()
     gates: GateKnobs = GateKnobs()
+    track: TrackKnobs = TrackKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------
