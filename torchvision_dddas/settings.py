@@ -256,6 +256,43 @@ class TrackKnobs(Group):
     appearance_offset: float = knob(0.86, "-", 0, 1, meaning="likeness that speaks neither for a link nor against it")
 
 
+class PaperKnobs(Group):
+    """The source's association as printed (appendix C, III); each reading that it leaves open is a named option."""
+
+    window: int = knob(3, "frames", 2, 3, meaning="frames associated at once: K of the source")
+    rule: Literal["dispersion", "fixed"] = knob(
+        "dispersion", "-", meaning="the weight of location: chosen by the dispersions (III-D), or `weight` for good"
+    )
+    weight: float = knob(0.7, "-", 0, 1, meaning="share of location in the affinity where the rule is fixed")
+    lowest_dispersion: float = knob(0.65, "-", 0, 1, meaning="a feature above this tells targets apart: LL of III-D")
+    location_cut: float = knob(
+        0.25, "-", 0, 1, meaning="clusters of locations end at this dissimilarity: the normalised G; empirical"
+    )
+    appearance_cut: float = knob(0.25, "-", 0, 1, meaning="clusters of histograms end at this dissimilarity; empirical")
+    dispersion_of: Literal["smallest", "smallest_if_counts_differ", "newest"] = knob(
+        "smallest",
+        "-",
+        meaning="which frame of the window speaks for it; the source: smallest if counts differ",
+    )
+    gate: Literal["one_dummy", "every_dummy", "off"] = knob(
+        "one_dummy",
+        "-",
+        meaning="entries raised to 1 - threshold: with exactly one dummy; with any number, as printed; none",
+    )
+    gated: Literal["features", "affinity"] = knob(
+        "features", "-", meaning="gate location and appearance each before they are weighed, or their weighted sum"
+    )
+    threshold: float = knob(
+        0.4, "-", 0, 1, meaning="an entry with a dummy is raised where all real alternatives are below 1 - threshold"
+    )
+    dummy: Literal["zero", "formula"] = knob(
+        "zero", "-", meaning="affinity with a dummy before the gate: none, or eq. 4 and 5 with a vector of zeros"
+    )
+    histogram: Literal["channel", "count"] = knob(
+        "channel", "-", meaning="histograms add up to 1 in each channel, or hold counts, so that size matters too"
+    )
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -269,6 +306,7 @@ class Settings(Group):
     history: HistoryKnobs = HistoryKnobs()
     gates: GateKnobs = GateKnobs()
     track: TrackKnobs = TrackKnobs()
+    paper: PaperKnobs = PaperKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------
