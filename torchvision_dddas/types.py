@@ -118,3 +118,26 @@ class Scene:
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     step: Registration | None = None
+
+
+@dataclass(frozen=True)
+class Followed:
+    """All that is known of one frame after its targets were given their identities.
+
+    number: 1-based position in the clip. frame: its picture; None where there is none or it could not be read.
+    detections: what was given, with the scores as given. tracks: those of them that have an identity, and the bridges.
+    now_from_before: (3, 3) pixel homography from the frame followed before; None: the camera stood still, or unknown.
+    lines: (N,) int64, where the detections stand in the file that they come from; empty for own ones.
+    cause: why nothing could be seen or concluded from the picture; empty where all is well.
+    adjustments, seconds: as in Scene.
+    """
+
+    number: int
+    frame: Frame | None
+    detections: Detections
+    tracks: Tracks
+    now_from_before: np.ndarray | None = None
+    lines: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,144 @@
+"""Detections from a table: MOTChallenge text of any tool, or the CSV that `dddas detect` writes."""
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Detections
+
+COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
+"""The named columns that a CSV must have; `score` may be there as well, any other is ignored."""
+
+LAST_FRAME = 10_000_000
+"""A higher frame number is taken for a mistake, such as a time stamp: every frame up to the last is gone through."""
+
+
+@dataclass(frozen=True)
+class DetectionTable:
+    """Boxes by frame, sorted by frame; rows of one frame keep the file's order.
+
+    frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
+    line: (N,) int64, where the row stands in the file, from 1.
+    """
+
+    path: str
+    frame: np.ndarray
+    box_px: np.ndarray
+    score: np.ndarray
+    line: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def first(self) -> int:
+        """The lowest frame number; 0 for a table without rows."""
+        return int(self.frame[0]) if len(self) else 0
+
+    @property
+    def last(self) -> int:
+        """The highest frame number; 0 for a table without rows."""
+        return int(self.frame[-1]) if len(self) else 0
+
+    @cached_property
+    def probable(self) -> bool:
+        """Whether the scores can be probabilities: all in [0, 1]. Otherwise every row counts as certain."""
+        return bool(((self.score >= 0) & (self.score <= 1)).all())
+
+    def rows(self, frame: int) -> slice:
+        """Where the rows of a frame are."""
+        return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
+
+    def at(self, frame: int) -> Detections:
+        """The detections of a frame, of kind `given`; their score is 1 where the table's are no probabilities."""
+        here = self.rows(frame)
+        box_px = self.box_px[here]
+        unknown = np.full(len(box_px), np.nan)
+        score = self.score[here] if self.probable else np.ones(len(box_px))
+        return Detections(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
+
+
+def read_detections(path: str | Path) -> DetectionTable:
+    """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names COLUMNS.
+
+    The id and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
+    without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
+    Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
+    below 1 or above LAST_FRAME, a width or height that is not positive.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(f"detections {path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"detections {path} is no text: {error}") from None
+    content = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    if content and _named(content[0][1]):
+        number, header = content.pop(0)
+        rows = _by_name(content, header, f"detections {path}", number)
+    else:
+        rows = _by_place(content, f"detections {path}")
+    table = np.array(list(rows), np.float64).reshape(-1, 7)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return DetectionTable(
+        str(path), table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5], table[:, 6].astype(np.int64)
+    )
+
+
+def _named(line: str) -> bool:
+    """Whether a line names columns: its first cell begins with a letter and is no number such as nan."""
+    first = line.replace(",", " ").split()[:1]
+    return bool(first) and first[0][0].isalpha() and _number(first[0]) is None
+
+
+def _by_place(content: Sequence[tuple[int, str]], name: str) -> Iterator[list[float]]:
+    for number, line in content:
+        cells = [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+        if len(cells) < 6:
+            raise InputError(
+                f"{name}, line {number}: {len(cells)} column{'s' * (len(cells) != 1)}; wanted frame,id,x,y,w,h[,score]"
+            )
+        yield _row((cells[0], *cells[2:6]), cells[6] if len(cells) > 6 else "", number, name)
+
+
+def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: int) -> Iterator[list[float]]:
+    names = [cell.strip() for cell in header.split(",")]
+    if missing := [column for column in COLUMNS if column not in names]:
+        raise InputError(
+            f"{name}, line {line}: its columns are {', '.join(names)}; {', '.join(missing)} missing. Wanted numbers as "
+            f"frame,id,x,y,w,h[,score], or a first line that names {', '.join(COLUMNS)}"
+        )
+    places = [names.index(column) for column in COLUMNS]
+    score = names.index("score") if "score" in names else len(names)
+    for number, text in content:
+        cells = next(csv.reader([text]))
+        if len(cells) != len(names):
+            raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
+        yield _row([cells[place].strip() for place in places], [*cells, ""][score].strip(), number, name)
+
+
+def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
+    """frame, x, y, width, height, score, line: checked."""
+    values = [_number(cell) for cell in cells]
+    values.append(_number(score) if score else 1.0)
+    for value, cell, column in zip(values, (*cells, score), ("frame", "x", "y", "width", "height", "score"), strict=True):
+        if value is None or not math.isfinite(value):
+            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted a finite number")
+        if column == "frame" and not (value == int(value) and 1 <= value <= LAST_FRAME):
+            raise InputError(f"{name}, line {line}: frame is '{cell}'; wanted a whole number from 1 to {LAST_FRAME}")
+        if column in ("width", "height") and value <= 0:
+            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted more than 0 pixels")
+    return [*(value for value in values if value is not None), float(line)]
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
