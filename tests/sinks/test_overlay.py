@@ -18,7 +18,7 @@ ENGINES = [
 def test_film_has_every_frame_and_even_sizes(tmp_path, scene, monkeypatch, engine, size, grey):
     if engine == "mp4v":
         monkeypatch.setitem(sys.modules, "av", None)
-    film = Overlay(tmp_path, rate_hz=12.5)
+    film = Overlay(tmp_path, 12.5, drawn)
     for number in range(1, 8):
         film.write(scene(number, targets=3, size=size, grey=grey))
     assert not (tmp_path / "overlay.mp4").exists()
@@ -53,7 +53,7 @@ def test_the_smallest_pictures_can_be_drawn(scene):
 
 
 def test_discard_leaves_nothing(tmp_path, scene):
-    film = Overlay(tmp_path, rate_hz=10)
+    film = Overlay(tmp_path, 10, drawn)
     film.write(scene(1))
     film.discard()
     assert not list(tmp_path.iterdir())
@@ -61,7 +61,7 @@ def test_discard_leaves_nothing(tmp_path, scene):
 
 def test_a_film_that_cannot_be_opened_again_is_no_film(tmp_path, scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    film = Overlay(tmp_path, rate_hz=10)
+    film = Overlay(tmp_path, 10, drawn)
     film.write(scene(1))
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: type("Broken", (), {"isOpened": lambda _: False})())
     with pytest.raises(OSError, match=r"overlay\.mp4 could not be finished"):

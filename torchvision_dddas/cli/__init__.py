@@ -12,6 +12,7 @@ from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
 from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.settings import settings
+from torchvision_dddas.cli.track import track
 
 app = typer.Typer(
     name="dddas",
@@ -20,7 +21,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (detect, evaluate, demo, settings):
+for command in (detect, track, evaluate, demo, settings):
     app.command()(command)
 
 

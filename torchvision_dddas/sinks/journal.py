@@ -6,6 +6,7 @@ import platform
 import sys
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from torchvision_dddas import __version__
 from torchvision_dddas.sinks.whole import write_whole
-from torchvision_dddas.types import Scene
+from torchvision_dddas.types import Adjustment, Scene
 
 NAME = "run.json"
 _STEP = math.log(1.01)
@@ -42,8 +43,11 @@ class Durations:
         return 0.0
 
 
-class Journal:
-    """Collects the facts of a run. The file says `running` from the first frame on, so that a killed run shows."""
+class Record:
+    """Collects the facts of a run. The file says `running` from the first frame on, so that a killed run shows.
+
+    counts: what a command wants to say beside the frames and targets.
+    """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         """Start a journal; facts are the things known before the run: input, backend, settings, outputs."""
@@ -55,24 +59,33 @@ class Journal:
         self._adjustments: list[dict[str, Any]] = []
         self.frames = self.targets = self.unreliable_frames = 0
         self.problems: list[str] = []
+        self.counts: dict[str, Any] = {}
+        self._last = 0  # number of the frame noted last
 
-    def write(self, scene: Scene) -> None:
-        """Take note of a frame."""
+    def note(
+        self,
+        number: int,
+        targets: int,
+        seconds: Mapping[str, float],
+        adjustments: Sequence[Adjustment] = (),
+        cause: str | None = None,
+    ) -> None:
+        """Take note of a frame. cause: why nothing could be concluded from it; None where all is well."""
         if self.frames == 0:
             self._save("running")
-        number = scene.frame.number
         self.frames += 1
-        self.targets += len(scene.detections)
-        for stage, seconds in scene.seconds.items():
-            self._stages.setdefault(stage, Durations()).add(seconds)
-        self._adjustments += [asdict(a) for a in scene.adjustments]
-        if not scene.reliable:
+        self.targets += targets
+        for stage, spent in seconds.items():
+            self._stages.setdefault(stage, Durations()).add(spent)
+        self._adjustments += [asdict(a) for a in adjustments]
+        if cause is not None:
             self.unreliable_frames += 1
             last = self._unreliable[-1] if self._unreliable else None
-            if last and last["last"] == number - 1 and last["cause"] == scene.cause:
+            if last and last["last"] == self._last and last["cause"] == cause:
                 last["last"] = number
             else:
-                self._unreliable.append({"first": number, "last": number, "cause": scene.cause})
+                self._unreliable.append({"first": number, "last": number, "cause": cause})
+        self._last = number
 
     def close(self, complete: bool) -> None:
         """Write the whole record."""
@@ -93,6 +106,7 @@ class Journal:
             **self._facts,
             "frames": {"written": self.frames, "unreliable": self.unreliable_frames},
             "targets": self.targets,
+            **self.counts,
             "problems": list(self.problems),
             "unreliable": self._unreliable,
             "adjustments": self._adjustments,
@@ -105,6 +119,15 @@ class Journal:
             },
         }
         write_whole(self._path, (json.dumps(finite(record), indent=2) + "\n").encode())
+
+
+class Journal(Record):
+    """The record of a run that gives scenes."""
+
+    def write(self, scene: Scene) -> None:
+        """Take note of a scene."""
+        cause = None if scene.reliable else scene.cause
+        self.note(scene.frame.number, len(scene.detections), scene.seconds, scene.adjustments, cause)
 
 
 def finite(value: Any) -> Any:

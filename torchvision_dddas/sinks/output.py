@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, Protocol
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sinks import journal
-from torchvision_dddas.sinks.journal import Journal
+from torchvision_dddas.sinks.journal import Journal, Record
 from torchvision_dddas.sinks.masks import NAME as MASK_NAME
 from torchvision_dddas.sinks.masks import Masks
-from torchvision_dddas.sinks.overlay import Overlay
+from torchvision_dddas.sinks.overlay import Overlay, drawn
 from torchvision_dddas.sinks.tables import Tables
 from torchvision_dddas.sinks.whole import cannot_write, remove, temporary
 from torchvision_dddas.types import Scene
@@ -21,11 +21,14 @@ from torchvision_dddas.types import Scene
 SAVED = ("masks", "overlay")
 """What --save may name. The tables and run.json are always written."""
 
+Item = TypeVar("Item")
+_Taken = TypeVar("_Taken", contravariant=True)
 
-class Sink(Protocol):
-    """A place where scenes go, one after another."""
 
-    def write(self, scene: Scene) -> None:
+class Sink(Protocol[_Taken]):
+    """A place where scenes, or followed frames, go one after another."""
+
+    def write(self, item: _Taken, /) -> None:
         """Take a scene. Raises OSError if it cannot be kept."""
 
     def close(self, complete: bool) -> None:
@@ -35,44 +38,37 @@ class Sink(Protocol):
         """Leave nothing behind that looks whole and is not. Never raises."""
 
 
-def saved(names: str | None) -> tuple[str, ...]:
-    """What to save, from `masks,overlay`, `all` (or None) or `none`. Raises InputError on another name."""
+def saved(names: str | None, known: Sequence[str] = SAVED) -> tuple[str, ...]:
+    """What to save, from `masks,overlay`, `all` (or None) or `none`. Raises InputError on a name that is not known."""
     chosen = [n.strip() for n in (names or "all").split(",") if n.strip()]
-    unknown = [n for n in chosen if n not in (*SAVED, "all", "none")]
+    unknown = [n for n in chosen if n not in (*known, "all", "none")]
     if unknown:
-        raise InputError(f"--save does not know {unknown[0]!r}; there are {', '.join(SAVED)}, all and none")
-    return SAVED if "all" in chosen else tuple(n for n in SAVED if n in chosen)
+        raise InputError(f"--save does not know {unknown[0]!r}; there are {', '.join(known)}, all and none")
+    return tuple(known) if "all" in chosen else tuple(n for n in known if n in chosen)
 
 
-class Output:
+class RunFolder(Generic[Item]):
     """Everything that one run writes. A context manager: leaving it normally or by Ctrl-C keeps what there is.
 
-    Any other exception discards what is not whole. Files are begun with the first scene, so bad input changes nothing.
+    Any other exception discards what is not whole. Files are begun with the first item, so bad input changes nothing.
+    files: the names of those that a run may leave in the folder.
     """
 
-    def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
+    files: ClassVar[tuple[str, ...]] = ("overlay.mp4", journal.NAME)
+
+    def __init__(self, folder: Path, save: Sequence[str]) -> None:
         """Claim a folder. Raises InputError if it cannot be written, or holds such files of someone else."""
         self.folder = folder
         self._save = tuple(save)
-        self._made = _claim(folder)
-        self._sinks: list[Sink] = []
-        self.journal: Journal | None = None
+        self._made = _claim(folder, self.files)
+        self._sinks: list[Sink[Item]] = []
+        self.journal: Record | None = None
 
-    def begin(self, facts: dict[str, Any], rate_hz: float) -> Journal:
-        """Say what the run is, for run.json, and how fast the overlay plays. Returns the journal that keeps count."""
-        self.journal = Journal(self.folder, {**facts, "outputs": ["tables", *self._save]})
-        self._sinks = [self.journal, Tables(self.folder)]
-        if "masks" in self._save:
-            self._sinks.append(Masks(self.folder))
-        if "overlay" in self._save:
-            self._sinks.append(Overlay(self.folder, rate_hz))
-        return self.journal
-
-    def write(self, scene: Scene) -> None:
-        """Write a scene to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
+    def write(self, item: Item) -> None:
+        """Write an item to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
         with uninterrupted(), self._refusals():
             for sink in self._sinks:
-                sink.write(scene)
+                sink.write(item)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place, run.json last. Raises InputError if the disk refuses."""
@@ -92,7 +88,7 @@ class Output:
                     except OSError:  # not empty: someone else uses it
                         break
 
-    def __enter__(self) -> "Output":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
@@ -118,7 +114,27 @@ class Output:
             raise cannot_write(Path(error.filename or self.folder), error) from error
 
 
-def _claim(folder: Path) -> list[Path]:
+class Output(RunFolder[Scene]):
+    """The folder of a run that gives scenes: tables, masks, overlay."""
+
+    files = ("detections.txt", "detections.csv", *RunFolder.files)
+
+    def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
+        """Claim a folder, as in RunFolder."""
+        super().__init__(folder, save)
+
+    def begin(self, facts: dict[str, Any], rate_hz: float) -> Journal:
+        """Say what the run is, for run.json, and how fast the overlay plays. Returns the journal that keeps count."""
+        self.journal = kept = Journal(self.folder, {**facts, "outputs": ["tables", *self._save]})
+        self._sinks = [kept, Tables(self.folder)]
+        if "masks" in self._save:
+            self._sinks.append(Masks(self.folder))
+        if "overlay" in self._save:
+            self._sinks.append(Overlay(self.folder, rate_hz, drawn))
+        return kept
+
+
+def _claim(folder: Path, ours: Sequence[str]) -> list[Path]:
     """Make the folder and try to write there. Returns the folders made, innermost first."""
     made = []
     for place in (folder, *folder.parents):
@@ -135,7 +151,6 @@ def _claim(folder: Path) -> list[Path]:
         raise InputError(
             f"cannot write into {folder}: {error.strerror or error}. Choose another folder with --out"
         ) from error
-    ours = ("detections.txt", "detections.csv", "overlay.mp4", journal.NAME)
     foreign = [folder / name for name in ours if (folder / name).exists()]
     foreign += [p for p in sorted((folder / "masks").glob("*.png")) if MASK_NAME.fullmatch(p.name)]
     if foreign and journal.read(folder) is None:

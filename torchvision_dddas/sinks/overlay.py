@@ -1,10 +1,11 @@
 """The clip with its targets drawn in: tint and outline, box, heading, and a caption that says when not to trust it."""
 
 import math
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ from torchvision_dddas.types import Scene
 TARGET = (40, 190, 255)  # BGR
 WARNING = (60, 60, 255)
 TEXT = (255, 255, 255)
+
+Item = TypeVar("Item")
 
 
 def drawn(scene: Scene) -> np.ndarray:
@@ -37,7 +40,10 @@ def drawn(scene: Scene) -> np.ndarray:
             middle = np.array([x + w / 2, y + h / 2])
             tip = middle + length * np.array([math.cos(heading), math.sin(heading)])
             cv2.arrowedLine(picture, _pixel(middle), _pixel(tip), TEXT, thick, cv2.LINE_AA, tipLength=0.35)
-    _caption(picture, scene)
+    lines = [(f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(found)}", TEXT)]
+    if not scene.reliable:
+        lines.append((f"registration unreliable: {scene.cause}", WARNING))
+    caption(picture, lines)
     return picture
 
 
@@ -45,12 +51,9 @@ def _pixel(point: np.ndarray) -> tuple[int, int]:
     return round(float(point[0])), round(float(point[1]))
 
 
-def _caption(picture: np.ndarray, scene: Scene) -> None:
-    """Write the frame's number, the interval and any warning along the lower edge, made to fit the width."""
+def caption(picture: np.ndarray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
+    """Write lines, each with its BGR colour, along the lower edge, made to fit the width."""
     height, width = picture.shape[:2]
-    lines = [(f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(scene.detections)}", TEXT)]
-    if not scene.reliable:
-        lines.append((f"registration unreliable: {scene.cause}", WARNING))
     scale, row = height / 1000, max(12, round(height / 28))
     top = max(height - row * len(lines) - row // 3, 0)
     picture[top:] = picture[top:] // 3
@@ -72,18 +75,20 @@ class Writer(Protocol):
         """Finish the file."""
 
 
-class Overlay:
+class Overlay(Generic[Item]):
     """overlay.mp4: H.264, which browsers play, where PyAV is installed (extra `video`); else OpenCV's mp4v."""
 
-    def __init__(self, folder: Path, rate_hz: float) -> None:
+    def __init__(self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray]) -> None:
+        """draw: the picture of a scene or followed frame, (H, W, 3) uint8 BGR."""
         self._path = folder / "overlay.mp4"
         self._part = temporary(self._path)
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
         self._writer: Writer | None = None
+        self._draw = draw
 
-    def write(self, scene: Scene) -> None:
+    def write(self, item: Item) -> None:
         """Draw a frame and add it. Raises OSError if the disk refuses."""
-        picture = drawn(scene)
+        picture = self._draw(item)
         height, width = picture.shape[:2]
         # Colour is stored for blocks of 2×2 pixels: repeat the last row and column of odd sizes.
         picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)

@@ -1,6 +1,7 @@
 """The detections as tables: MOTChallenge text for other tools, and CSV with named columns and the rest."""
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
@@ -51,20 +52,38 @@ class Tables:
     """detections.txt and detections.csv, written as the clip goes by."""
 
     def __init__(self, folder: Path) -> None:
-        self._paths = (folder / "detections.txt", folder / "detections.csv")
-        self._files: list[TextIO] = []
+        self._files = TextFiles({folder / "detections.txt": "", folder / "detections.csv": ",".join(COLUMNS) + "\n"})
 
     def write(self, scene: Scene) -> None:
         """Add the targets of a frame."""
-        text, csv = self._open()
-        text.write(mot_lines(scene))
-        csv.write(csv_lines(scene))
+        self._files.write(mot_lines(scene), csv_lines(scene))
 
     def close(self, complete: bool) -> None:
         """Put the tables in their places. Raises OSError if the last lines cannot be written."""
+        self._files.close()
+
+    def discard(self) -> None:
+        """Remove what was begun."""
+        self._files.discard()
+
+
+class TextFiles:
+    """Text files that grow together and appear whole at the end. content: path -> the line that it begins with."""
+
+    def __init__(self, content: Mapping[Path, str]) -> None:
+        self._content = dict(content)
+        self._files: list[TextIO] = []
+
+    def write(self, *texts: str) -> None:
+        """Add to each file, in the order of the paths."""
+        for file, text in zip(self._open(), texts, strict=True):
+            file.write(text)
+
+    def close(self) -> None:
+        """Put the files in their places, also those to which nothing was added. Raises OSError if they cannot be."""
         for file in self._open():
             file.close()
-        for path in self._paths:
+        for path in self._content:
             temporary(path).replace(path)
 
     def discard(self) -> None:
@@ -72,11 +91,12 @@ class Tables:
         for file in self._files:
             with suppress(OSError):  # a full disk refuses the last lines again
                 file.close()
-        for path in self._paths:
+        for path in self._content:
             remove(temporary(path))
 
     def _open(self) -> list[TextIO]:
         if not self._files:
-            self._files = [temporary(path).open("w", encoding="utf-8", newline="") for path in self._paths]
-            self._files[1].write(",".join(COLUMNS) + "\n")
+            for path, first in self._content.items():
+                self._files.append(temporary(path).open("w", encoding="utf-8", newline=""))
+                self._files[-1].write(first)
         return self._files

@@ -48,7 +48,7 @@ class DetectionTable:
 
     @cached_property
     def probable(self) -> bool:
-        """Whether the scores can be probabilities: all in [0, 1]. Otherwise every row counts as certain."""
+        """Whether the scores can be probabilities: all in [0, 1]. Otherwise every row is as good as certain."""
         return bool(((self.score >= 0) & (self.score <= 1)).all())
 
     def rows(self, frame: int) -> slice:
@@ -56,12 +56,11 @@ class DetectionTable:
         return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
 
     def at(self, frame: int) -> Detections:
-        """The detections of a frame, of kind `given`; their score is 1 where the table's are no probabilities."""
+        """The detections of a frame, of kind `given`."""
         here = self.rows(frame)
         box_px = self.box_px[here]
         unknown = np.full(len(box_px), np.nan)
-        score = self.score[here] if self.probable else np.ones(len(box_px))
-        return Detections(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
+        return Detections(box_px, self.score[here], box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
 
 
 def read_detections(path: str | Path) -> DetectionTable:
@@ -127,7 +126,9 @@ def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
     """frame, x, y, width, height, score, line: checked."""
     values = [_number(cell) for cell in cells]
     values.append(_number(score) if score else 1.0)
-    for value, cell, column in zip(values, (*cells, score), ("frame", "x", "y", "width", "height", "score"), strict=True):
+    for value, cell, column in zip(
+        values, (*cells, score), ("frame", "x", "y", "width", "height", "score"), strict=True
+    ):
         if value is None or not math.isfinite(value):
             raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted a finite number")
         if column == "frame" and not (value == int(value) and 1 <= value <= LAST_FRAME):

@@ -1,0 +1,174 @@
+"""`dddas track`: identities of targets, from frame to frame."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchvision_dddas.cli.detect import Backend
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.sinks.track_output import TrackJournal
+    from torchvision_dddas.sources import Source
+    from torchvision_dddas.sources.detections import DetectionTable
+    from torchvision_dddas.types import Followed
+    from torchvision_dddas.vision import Vision
+
+
+@explained
+def track(
+    clip: Annotated[
+        str | None,
+        typer.Argument(metavar="[INPUT]", help="A video file, a folder or glob of images, camera:0 or rtsp://..."),
+    ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="MOTChallenge text, or detections.csv. [default: detect in INPUT]"),
+    ] = None,
+    interval: Annotated[int, typer.Option(metavar="D", help="Look at every D-th frame: 1, 1+D, 1+2D, ...")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-tracks"),
+    config: Annotated[
+        str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a knob; may be repeated.")
+    ] = None,
+    backend: Annotated[
+        Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")
+    ] = Backend.auto,
+    save: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
+) -> None:
+    """Give the targets of a clip identities that last: its own detections, or those of a table, with or without clip.
+
+    Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 where there is a clip, and run.json under --out.
+    """
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.sinks.track_output import SAVED
+
+    settings, names = load(config, set_ or []), saved(save, SAVED)
+    if clip is None and detections is None:
+        raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
+    if interval < 1:
+        raise InputError(f"--interval is {interval}; wanted 1 or more frames")
+    if clip is None and save and names:
+        raise InputError("--save overlay needs a clip to draw on; give INPUT, or leave --save out")
+    if clip is None:
+        names = ()
+    journal = track_into(out, clip, detections, interval, settings, backend.value, names, rate, quiet)
+    if not quiet:
+        for line in summary(journal, out, names):
+            typer.echo(line)
+
+
+def track_into(
+    folder: Path,
+    clip: str | None,
+    detections: Path | None,
+    interval: int,
+    settings: "Settings",
+    backend: str = "auto",
+    save: Sequence[str] = (),
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> "TrackJournal":
+    """Track and write under a folder; returns the record of the run. One of clip and detections must be given.
+
+    Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
+    """
+    from torchvision_dddas.sinks.track_output import TrackOutput
+
+    with TrackOutput(folder, save) as output:
+        from torchvision_dddas.sources import open_source
+        from torchvision_dddas.sources.detections import read_detections
+        from torchvision_dddas.vision import load
+
+        table = read_detections(detections) if detections is not None else None
+        source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
+        notes = table_notes(table, source, interval) if table is not None else []
+        vision = load(backend, settings) if source is not None else None
+        facts = {
+            "input": clip,
+            "detections": detections,
+            "clip": source
+            and {
+                "name": source.name,
+                "size": source.size,
+                "rate_hz": source.rate_hz,
+                "announced_frames": source.count,
+            },
+            "interval_frames": interval,
+            "backend": vision and vision.name,
+            "settings": settings.model_dump(),
+        }
+        journal = output.begin(
+            facts, (source.rate_hz if source else 10.0) / interval, source.size if source else (1, 1)
+        )
+        journal.notes += notes
+        try:
+            name = source.name if source is not None else str(detections)
+            with progress(name, looks(table, source, interval), quiet) as tick:
+                for followed in _followed(table, source, vision, settings, interval):
+                    output.write(followed)
+                    tick()
+        finally:
+            journal.problems += [str(problem) for problem in source.problems] if source is not None else []
+    return journal
+
+
+def _followed(
+    table: "DetectionTable | None",
+    source: "Source | None",
+    vision: "Vision | None",
+    settings: "Settings",
+    interval: int,
+) -> "Iterator[Followed]":
+    from torchvision_dddas.following import follow_clip, follow_scenes, follow_table
+
+    if source is None or vision is None:
+        assert table is not None
+        return follow_table(table, settings, interval)
+    if table is not None:
+        return follow_clip(source, table, vision, settings, interval)
+    from torchvision_dddas.run import run
+
+    return follow_scenes(run(source, vision, settings), settings, interval, source.size)
+
+
+def looks(table: "DetectionTable | None", source: "Source | None", interval: int) -> int | None:
+    """How many frames will be looked at; None where the end is not known."""
+    last = source.count if source is not None else table.last if table is not None else None
+    return None if last is None else -(-last // interval)
+
+
+def table_notes(table: "DetectionTable", source: "Source | None", interval: int) -> list[str]:
+    """What the user should know of a table before it is tracked.
+
+    Raises InputError where its frames exceed the clip, or none of them is looked at.
+    """
+    return []
+
+
+def summary(journal: "TrackJournal", folder: Path, save: Sequence[str]) -> list[str]:
+    """What to tell the user at the end."""
+    made = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in save), "run.json"]
+    found = f"{journal.frames} frames, {journal.targets} detections, {len(journal.identities)} identities"
+    lines = [
+        f"{found}, {journal.untracked} detections without one",
+        *(f"note: {note}" for note in journal.notes),
+        f"{folder}: {', '.join(made)}",
+    ]
+    if count := len(journal.problems):
+        lines.insert(1, f"{count} problems while reading, the first: {journal.problems[0]} (all in run.json)")
+    return lines

@@ -1,0 +1,179 @@
+"""Identities along a clip: from its own scenes, from its pictures and a table of detections, or from a table alone.
+
+Every function takes each `interval`-th frame, 1, 1 + interval, ..., and yields them in order as they are settled.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.detections import DetectionTable
+from torchvision_dddas.sources.source import Source
+from torchvision_dddas.targets.projective import chain
+from torchvision_dddas.targets.tracks import Tracker
+from torchvision_dddas.types import Detections, Followed, Frame, Scene, Tracks
+from torchvision_dddas.vision.camera import Camera
+from torchvision_dddas.vision.protocol import Vision
+
+
+def used(frame: int, interval: int) -> bool:
+    """Whether a frame is one of 1, 1 + interval, 1 + 2 interval, ..."""
+    return (frame - 1) % interval == 0
+
+
+def follow_scenes(
+    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int]
+) -> Iterator[Followed]:
+    """A clip's own detections. The registrations from frame to frame are chained over the interval.
+
+    Each counts as certain: its score grades its contrast, and it has been confirmed over several frames already.
+    """
+    follower = Follower(settings, interval, size, certain=True)
+    steps: list[np.ndarray | None] = []
+    for scene in scenes:
+        steps.append(scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None)
+        number = scene.frame.number
+        if not used(number, interval):
+            continue
+        known = [step for step in steps if step is not None]
+        now_from_before = chain(known) if known and len(known) == len(steps) else None
+        steps.clear()
+        yield from follower.take(
+            Followed(
+                number,
+                scene.frame,
+                scene.detections,
+                Tracks(number),
+                now_from_before,
+                cause=scene.cause,
+                adjustments=scene.adjustments,
+                seconds=dict(scene.seconds),
+            )
+        )
+    yield from follower.end()
+
+
+def follow_clip(
+    source: Source, table: DetectionTable, vision: Vision, settings: Settings, interval: int
+) -> Iterator[Followed]:
+    """A table of detections along its clip. Frames that cannot be read, or lie after its end, are fed without picture.
+
+    The camera's motion is taken from one picture to the next one that can be read.
+    """
+    follower, camera, number = Follower(settings, interval, source.size, not table.probable), Camera(vision), 1
+    start = time.perf_counter()
+    for frame in source:
+        if not used(frame.number, interval):
+            continue
+        read = time.perf_counter()
+        for missing in range(number, frame.number, interval):
+            yield from follower.take(_unread(table, missing))
+        number = frame.number + interval
+        now_from_before, cause = camera.step(frame.image)
+        seconds = {"read": read - start, "register": time.perf_counter() - read}
+        yield from follower.take(_of(table, frame.number, frame, now_from_before, cause, seconds))
+        start = time.perf_counter()
+    for missing in range(number, max(source.last, table.last) + 1, interval):
+        yield from follower.take(_unread(table, missing))
+    yield from follower.end()
+
+
+def follow_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[Followed]:
+    """A table alone: no registration, no appearance. From its first to its last row, frames without rows are empty."""
+    follower = Follower(settings, interval, None, not table.probable)
+    first = table.first + -(table.first - 1) % interval
+    for number in range(first, table.last + 1, interval) if len(table) else ():
+        yield from follower.take(_of(table, number))
+    yield from follower.end()
+
+
+def _of(
+    table: DetectionTable,
+    number: int,
+    frame: Frame | None = None,
+    now_from_before: np.ndarray | None = None,
+    cause: str = "",
+    seconds: dict[str, float] | None = None,
+) -> Followed:
+    lines = table.line[table.rows(number)]
+    return Followed(
+        number, frame, table.at(number), Tracks(number), now_from_before, lines, cause, seconds=seconds or {}
+    )
+
+
+def _unread(table: DetectionTable, number: int) -> Followed:
+    return _of(table, number, cause="the frame could not be read")
+
+
+class Follower:
+    """The tracker, and the frames it was fed that it has not settled yet."""
+
+    def __init__(self, settings: Settings, interval: int, size: tuple[int, int] | None, certain: bool = False) -> None:
+        """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all."""
+        self.tracker = _tracker(settings, interval, size)
+        self.likeness = _likeness(settings)
+        self.certain = certain
+        self.waiting: deque[Followed] = deque()
+
+    def take(self, followed: Followed) -> Iterator[Followed]:
+        """Feed a frame, whose tracks are not known yet; yields the frames that are settled by it."""
+        detections, frame, spent = followed.detections, followed.frame, 0.0
+        if self.certain:
+            detections = replace(detections, score=np.ones(len(detections)))
+
+        def appearance() -> np.ndarray:
+            nonlocal spent
+            assert frame is not None
+            start = time.perf_counter()
+            found = self.likeness(frame.image, detections.box_px)
+            spent += time.perf_counter() - start
+            return found
+
+        start = time.perf_counter()
+        settled = self.tracker.feed(
+            followed.number, detections, followed.now_from_before, appearance if frame is not None else None
+        )
+        took = {"appearance": spent, "track": time.perf_counter() - start - spent}
+        self.waiting.append(replace(followed, seconds=followed.seconds | took))
+        yield from self._settle(settled)
+
+    def end(self) -> Iterator[Followed]:
+        """The frames that were still waiting."""
+        yield from self._settle(self.tracker.end())
+
+    def _settle(self, settled: list[Tracks]) -> Iterator[Followed]:
+        for tracks in settled:
+            followed = self.waiting.popleft()
+            assert followed.number == tracks.frame, "the tracker settles frames in the order in which they were fed"
+            yield replace(followed, tracks=_as_given(tracks, followed.detections))
+
+
+def _as_given(tracks: Tracks, given: Detections) -> Tracks:
+    """The tracks with the boxes and scores that were given, to the digit, where they are detections."""
+    seen = tracks.row >= 0
+    box_px, score = np.array(tracks.box_px, float), np.array(tracks.score, float)
+    box_px[seen], score[seen] = given.box_px[tracks.row[seen]], given.score[tracks.row[seen]]
+    return replace(tracks, box_px=box_px, score=score)
+
+
+def _tracker(settings: Settings, interval: int, size: tuple[int, int] | None) -> Tracker:
+    if settings.track.mode == "paper":
+        from torchvision_dddas.targets.paper import PaperTracker
+
+        return PaperTracker(settings, interval, size)
+    return Tracker(settings, interval, size)
+
+
+def _likeness(settings: Settings) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """What the boxes of a picture look like: (image, (N, 4) boxes) -> (N, D)."""
+    if settings.track.mode == "paper":
+        from torchvision_dddas.vision.histograms import rgb_histograms
+
+        return rgb_histograms
+    from torchvision_dddas.vision.appearance import strips
+
+    return strips
