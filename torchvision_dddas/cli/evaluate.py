@@ -3,8 +3,9 @@
 import json
 import math
 import sys
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,6 +18,16 @@ COLUMNS = {
     "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
     "boxes": ("f1", "precision", "recall"),
     "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
+    "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "n_fragmentations"),
+    "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
+}
+
+TITLES = {
+    "pixels": "Pixels",
+    "boxes": "Boxes, IoU ≥ 0.5",
+    "target": "One labelled target",
+    "tracks": "Tracks",
+    "target_track": "The labelled target's track, IoU ≥ 0.3",
 }
 
 # Headings that fit a terminal of 80 columns beside the clips' names.
@@ -29,34 +40,71 @@ SHORT = {
     "gmean": "Gmean",
     "iou_0.3": "IoU ≥ 0.3",
     "other_blobs_per_frame": "other blobs",
+    "hota": "HOTA",
+    "deta": "DetA",
+    "assa": "AssA",
+    "mota": "MOTA",
+    "idf1": "IDF1",
+    "same_identity": "same identity",
+    "n_switches": "IDsw",
+    "n_fragmentations": "frag.",
 }
+
+
+class Ignored(StrEnum):
+    """What becomes of true boxes marked 0."""
+
+    dropped = "dropped"
+    removed = "removed"
 
 
 @explained
 def evaluate(
     truth: Annotated[
-        Path, typer.Argument(help="Masks (a folder of numbered PNGs), a file of boxes, or a folder of such clips.")
+        Path,
+        typer.Argument(help="Masks (a folder of numbered PNGs), a file of boxes or tracks, or a folder of such clips."),
     ],
-    result: Annotated[Path, typer.Argument(help="What dddas detect wrote, or a folder of such results by clip name.")],
+    result: Annotated[
+        Path,
+        typer.Argument(help="What dddas detect or track wrote, MOTChallenge text, or a folder of such by clip name."),
+    ],
     first_frame: Annotated[
         int | None,
         typer.Option(help="Number in a mask's name that is the clip's first frame. [default: 0 if there, else 1]"),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for metrics.json. [default: RESULT]")] = None,
+    interval: Annotated[int, typer.Option(help="Score frames 1, 1 + INTERVAL, ... alone.")] = 1,
+    ignored: Annotated[
+        Ignored,
+        typer.Option(
+            help="True boxes marked 0: dropped as if not labelled (TrackEval, MOT15), "
+            "or removed together with the tracks' boxes that match them."
+        ),
+    ] = Ignored.dropped,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for metrics.json. [default: RESULT, or the folder of that file]")
+    ] = None,
 ) -> None:
-    """Score results: the six pixel measures, and boxes at IoU 0.5; per clip, pooled, and the mean over clips."""
-    report = score(truth, result, first_frame, out or result)
+    """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean."""
+    folder = out or (result.parent if result.is_file() else result)
+    report = score(truth, result, first_frame, folder, interval, ignored.value)
     show(report)
-    typer.echo(f"{(out or result) / 'metrics.json'}: the same with its counts")
+    typer.echo(f"{folder / 'metrics.json'}: the same with its counts")
 
 
-def score(truth: Path, result: Path, first_frame: int | None, out: Path) -> dict[str, Any]:
+def score(
+    truth: Path,
+    result: Path,
+    first_frame: int | None,
+    out: Path,
+    interval: int = 1,
+    ignoring: Literal["dropped", "removed"] = "dropped",
+) -> dict[str, Any]:
     """Evaluate, and write metrics.json into a folder. Raises InputError."""
     from torchvision_dddas.evaluate import evaluate as compare
     from torchvision_dddas.sinks.journal import finite
     from torchvision_dddas.sinks.whole import cannot_write, write_whole
 
-    report = compare(truth, result, first_frame)
+    report = compare(truth, result, first_frame, interval, ignoring)
     path = out / "metrics.json"
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -81,7 +129,7 @@ def show(report: dict[str, Any]) -> None:
 def _table(report: dict[str, Any], group: str) -> "Table":
     from rich.table import Table
 
-    table = Table(title={"pixels": "Pixels", "boxes": "Boxes, IoU ≥ 0.5", "target": "One labelled target"}[group])
+    table = Table(title=TITLES[group])
     table.add_column("clip", no_wrap=True)
     for column in ("frames", *COLUMNS[group]):
         table.add_column(SHORT.get(column, column), justify="right", no_wrap=True)
@@ -96,4 +144,6 @@ def _table(report: dict[str, Any], group: str) -> "Table":
 
 
 def _cell(value: float) -> str:
+    if isinstance(value, int):
+        return str(value)
     return "–" if math.isnan(value) else f"{value:.3f}"

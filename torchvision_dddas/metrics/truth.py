@@ -1,5 +1,6 @@
 """Reading what is true of a clip: masks, one labelled box a frame, or MOTChallenge boxes."""
 
+import configparser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,16 +9,25 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics import mot_text
+from torchvision_dddas.metrics.matching import TrackTable
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each."""
+    """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
+
+    tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
+    length: frames of the clip, 0 where nothing says how many.
+    """
 
     kind: Literal["masks", "one target", "boxes"]
     place: Path
     masks: dict[int, Path]
     boxes: dict[int, np.ndarray]
+    tracks: TrackTable | None = None
+    ignored: TrackTable | None = None
+    length: int = 0
 
     @property
     def frames(self) -> list[int]:
@@ -74,21 +84,46 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 def _boxes(path: Path) -> Truth:
     try:
-        rows = [
-            line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()
-        ]
-        table = np.array([[float(v) for v in row[:7]] for row in rows])
-    except (OSError, ValueError) as error:
+        lines = [x.replace(",", " ").split() for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip()]
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no table of boxes: {error}") from error
-    if len(table) == 0:
+    if not lines:
         raise InputError(f"{path} is empty: wanted one box a line")
-    if table.shape[1] == 4:
-        return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)})
-    if table.shape[1] < 6:
+    if len(lines[0]) == 4:
+        return _one_target(path, lines)
+    if len(lines[0]) < 6:
         raise InputError(
-            f"{path} has {table.shape[1]} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
+            f"{path} has {len(lines[0])} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
         )
+    rows = mot_text.read_rows(path, "truth")
     # MOTChallenge: a 0 in the seventh column marks a box that does not count.
-    kept = table[table[:, 6] != 0] if table.shape[1] > 6 else table
-    frames = {int(f): kept[kept[:, 0] == f, 2:6] for f in np.unique(table[:, 0])}
-    return Truth("boxes", path, {}, frames)
+    counts = rows.mark != 0
+    kept = rows.table.at(counts)
+    boxes = {int(f): kept.box_px[kept.frame == f] for f in np.unique(rows.table.frame)}
+    if not rows.named:
+        return Truth("boxes", path, {}, boxes)
+    table = mot_text.with_identities(rows, path)
+    return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), _length(path))
+
+
+def _one_target(path: Path, lines: list[list[str]]) -> Truth:
+    try:
+        table = np.array([[float(v) for v in row] for row in lines])
+    except ValueError as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from error
+    there = np.flatnonzero(~np.isnan(table).any(axis=1))
+    tracks = TrackTable(there + 1, np.ones(len(there), np.int64), table[there])
+    return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)}, tracks, None, len(table))
+
+
+def _length(path: Path) -> int:
+    """Frames of the clip by MOTChallenge's seqinfo.ini, beside the truth or above its folder; 0 where there is none."""
+    for place in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini"):
+        if place.is_file():
+            ini = configparser.ConfigParser()
+            try:
+                ini.read(place, encoding="utf-8")
+                return ini.getint("Sequence", "seqLength")
+            except (configparser.Error, UnicodeDecodeError, ValueError) as error:
+                raise InputError(f"{place} does not tell seqLength under [Sequence]: {error}") from error
+    return 0

@@ -1,0 +1,78 @@
+"""All measures of tracks: their counts, which add over clips, and the figures that come of them."""
+
+from typing import NamedTuple
+
+from torchvision_dddas.metrics import clear, hota, identity
+from torchvision_dddas.metrics.clear import Clear
+from torchvision_dddas.metrics.hota import Hota
+from torchvision_dddas.metrics.identity import Identity
+from torchvision_dddas.metrics.matching import Ignoring, TrackTable, pair
+from torchvision_dddas.metrics.segmentation import ratio
+
+ONE_TARGET_LEAST = 0.3
+"""IoU from which a box counts as the one labelled target: moving-target detections seldom fit as tightly as labels."""
+
+
+class TrackCounts(NamedTuple):
+    """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are."""
+
+    clear: Clear = Clear()
+    identity: Identity = Identity()
+    hota: Hota = Hota()
+    true: int = 0
+    found: int = 0
+
+    def plus(self, other: "TrackCounts") -> "TrackCounts":
+        """The counts of both."""
+        return TrackCounts(
+            self.clear.plus(other.clear),
+            self.identity.plus(other.identity),
+            self.hota.plus(other.hota),
+            self.true + other.true,
+            self.found + other.found,
+        )
+
+    def by_name(self) -> dict[str, int]:
+        """The counts of boxes and identities; those of HOTA are curves and stay out."""
+        whole = {name: n for name, n in self.clear._asdict().items() if name != "overlap"}
+        return {**whole, **self.identity._asdict(), "true": self.true, "found": self.found}
+
+
+def count(
+    truth: TrackTable, found: TrackTable, ignored: TrackTable | None = None, ignoring: Ignoring = "dropped"
+) -> TrackCounts:
+    """Count one clip's tracks against the truth; `matching.pair` tells what becomes of boxes that do not count."""
+    clip = pair(truth, found, ignored, ignoring)
+    sizes = len(clip.true_boxes), len(clip.found_boxes)
+    return TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip), *sizes)
+
+
+def measures(counts: TrackCounts) -> dict[str, float]:
+    """HOTA, CLEAR and identity measures by name."""
+    return {**hota.measures(counts.hota), **clear.measures(counts.clear), **identity.measures(counts.identity)}
+
+
+class TargetTrack(NamedTuple):
+    """One labelled target among others that are not: frames, those found, switches, gaps, most under one identity."""
+
+    frames: int = 0
+    found: int = 0
+    switches: int = 0
+    fragmentations: int = 0
+    same: int = 0
+
+    def plus(self, other: "TargetTrack") -> "TargetTrack":
+        """The counts of both."""
+        return TargetTrack(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+def count_one_target(truth: TrackTable, found: TrackTable) -> TargetTrack:
+    """Follow the one labelled target (IoU ≥ 0.3). Boxes elsewhere say nothing: other targets are not labelled."""
+    clip = pair(truth, found)
+    counts, right = clear.count(clip, ONE_TARGET_LEAST), identity.count(clip, ONE_TARGET_LEAST)
+    return TargetTrack(int(clip.true_boxes.sum()), counts.tp, counts.switches, counts.fragmentations, right.idtp)
+
+
+def one_target_measures(counts: TargetTrack) -> dict[str, float]:
+    """Share of frames in which the target has a box, and in which it has the identity that it has most."""
+    return {"found": ratio(counts.found, counts.frames), "same_identity": ratio(counts.same, counts.frames)}
