@@ -7,11 +7,13 @@ is fixed by the inputs' shapes, and what is missing is marked by a validity mask
 
 from . import (
     affine,
+    affinity,
     blur,
     borders,
     consensus,
     difference,
     flow,
+    histogram,
     history,
     homography,
     keypoints,
@@ -23,11 +25,13 @@ from . import (
 
 __all__ = [
     "affine",
+    "affinity",
     "blur",
     "borders",
     "consensus",
     "difference",
     "flow",
+    "histogram",
     "history",
     "homography",
     "keypoints",

@@ -1,0 +1,59 @@
+"""How alike the targets of two or three frames are: the generalised Jaccard coefficient (appendix C, eq. 1, 4, 5).
+
+Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), histograms
+(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0. `targets.jaccard` is the twin
+for one window without torch.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def overlap(
+    a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"]
+) -> tuple[Float[Tensor, "B N M"], Float[Tensor, "B N M"]]:
+    """Numerator Σ min(a, b) and denominator Σ max(a, b) of each pair.
+
+    min + max = a + b and max - min = |a - b|: so both follow from one distance, and no (B, N, M, D) is held.
+    """
+    total = a.sum(-1)[..., :, None] + b.sum(-1)[..., None, :]
+    apart = torch.cdist(a, b, p=1.0)
+    return ((total - apart) / 2).clamp(min=0), (total + apart) / 2
+
+
+def pairs(
+    a: Float[Tensor, "B N D"],
+    b: Float[Tensor, "B M D"],
+    a_valid: Bool[Tensor, "B N"],
+    b_valid: Bool[Tensor, "B M"],
+) -> Float[Tensor, "B N M"]:
+    """S = Σ min / Σ max in [0, 1]; 0 for padding, and for two vectors of zeros, which resemble nothing."""
+    smaller, larger = overlap(a, b)
+    return _share(smaller, larger, a_valid[..., :, None] & b_valid[..., None, :])
+
+
+def triplets(
+    a: Float[Tensor, "B N D"],
+    b: Float[Tensor, "B M D"],
+    c: Float[Tensor, "B L D"],
+    a_valid: Bool[Tensor, "B N"],
+    b_valid: Bool[Tensor, "B M"],
+    c_valid: Bool[Tensor, "B L"],
+) -> Float[Tensor, "B N M L"]:
+    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first."""
+    ab_smaller, ab_larger = overlap(a, b)
+    bc_smaller, bc_larger = overlap(b, c)
+    valid = a_valid[..., :, None, None] & b_valid[..., None, :, None] & c_valid[..., None, None, :]
+    return _share(
+        ab_smaller[..., None] + bc_smaller[..., None, :, :], ab_larger[..., None] + bc_larger[..., None, :, :], valid
+    )
+
+
+def _share(
+    smaller: Float[Tensor, "*shape"], larger: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]
+) -> Float[Tensor, "*shape"]:
+    there = valid & (larger > 0)
+    # The inner `where` keeps 0 / 0 out of the gradient.
+    share = smaller / torch.where(there, larger, torch.ones_like(larger))
+    return torch.where(there, share, torch.zeros_like(share))
