@@ -1,0 +1,52 @@
+"""How far apart a frame's targets are in a feature, and the weight of location that follows (appendix C, III-D)."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
+
+from torchvision_dddas.settings import PaperKnobs
+from torchvision_dddas.targets.jaccard import similarity
+
+
+def clusters(dissimilarity: Float[np.ndarray, "N N"], cut: float) -> Int[np.ndarray, "N"]:
+    """A number for each target: average linkage, the tree cut at a dissimilarity (eq. 10 and G)."""
+    if len(dissimilarity) < 2:
+        return np.ones(len(dissimilarity), np.int64)
+    tree = linkage(squareform(dissimilarity, checks=False), "average")
+    return fcluster(tree, cut, "distance").astype(np.int64)
+
+
+def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
+    """Ndm of eq. 9: 1 when every target is a cluster of its own, 0 when all are one; 1 for one target or none."""
+    if len(cluster) < 2:
+        return 1.0
+    share = np.unique(cluster, return_counts=True)[1] / len(cluster)
+    return float(np.abs((share * np.log2(share)).sum()) / np.log2(len(cluster)))
+
+
+def dispersion(feature: Float[np.ndarray, "N D"], cut: float) -> float:
+    """Ndm of a frame's targets by the Jaccard dissimilarity of a feature."""
+    apart = 1 - similarity(feature, feature)
+    np.fill_diagonal(apart, 0.0)
+    return normalized_entropy(clusters(apart, cut))
+
+
+def of_window(of_frames: Sequence[float], counts: Sequence[int], knobs: PaperKnobs) -> float:
+    """The dispersion that speaks for a window, newest frame first, by the reading that `dispersion_of` names."""
+    differ = len(set(counts)) > 1
+    smallest = knobs.dispersion_of == "smallest" or (knobs.dispersion_of == "smallest_if_counts_differ" and differ)
+    return min(of_frames) if smallest else of_frames[0]
+
+
+def location_weight(location: float, appearance: Callable[[], float], lowest: float) -> tuple[float, float | None]:
+    """The weight of location, and the dispersion of appearance where it had to be computed.
+
+    1 while locations tell the targets apart; else 0 if appearance does; else one half. The second feedback rule.
+    """
+    if location > lowest:
+        return 1.0, None
+    found = appearance()
+    return (0.0 if found > lowest else 0.5), found
