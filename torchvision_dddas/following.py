@@ -66,9 +66,7 @@ def follow_clip(
     """
     follower, camera, number = Follower(settings, interval, source.size, not table.probable), Camera(vision), 1
     start = time.perf_counter()
-    for frame in source:
-        if not used(frame.number, interval):
-            continue
+    for frame in source.every(interval):
         read = time.perf_counter()
         for missing in range(number, frame.number, interval):
             yield from follower.take(_unread(table, missing))

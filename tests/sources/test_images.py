@@ -26,6 +26,13 @@ def test_images_come_in_natural_order_with_the_given_rate(tmp_path: Path) -> Non
     assert open_source(tmp_path).rate_hz == 10
 
 
+def test_every_so_many_images_open_no_other_file(tmp_path: Path) -> None:
+    source = open_source(write_images(tmp_path, range(1, 13)))
+    (tmp_path / "frame5.png").unlink()
+    assert [(frame.number, number_of(frame.image)) for frame in source.every(5)] == [(1, 1), (6, 6), (11, 11)]
+    assert (source.last, source.problems, source.exact) == (12, [], True)
+
+
 def test_a_folder_is_read_past_what_is_no_image(tmp_path: Path) -> None:
     write_images(tmp_path, range(1, 4))
     (tmp_path / "notes.txt").write_text("not a frame")

@@ -186,11 +186,12 @@ class ScriptedCapture:
     def __init__(self, script: list[float | None]) -> None:
         self.script, self.stamp = list(script), 0.0
 
-    def read(self) -> tuple[bool, np.ndarray | None]:
+    def grab(self) -> bool:
         stamp = self.script.pop(0) if self.script else None
-        if stamp is None:
-            return False, None
-        self.stamp = stamp
+        self.stamp = self.stamp if stamp is None else stamp
+        return stamp is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
         return True, picture(1)
 
     def get(self, _property: int) -> float:
@@ -223,6 +224,27 @@ def test_frames_are_numbered_by_stamps_where_these_can_be_believed(
         assert words in str(problem)
     times = [frame.time_s for frame in frames]
     assert times == sorted(set(times))
+
+
+@pytest.mark.parametrize("codec", ["avi MJPG", "mp4 mp4v"])
+@pytest.mark.parametrize("interval", [1, 4, 50])
+def test_every_so_many_frames_are_those_of_the_whole_clip(tmp_path: Path, codec: str, interval: int) -> None:
+    suffix, fourcc = codec.split()
+    source = open_source(write_video(tmp_path / f"clip.{suffix}", fourcc))
+    whole = [frame for frame in source if (frame.number - 1) % interval == 0]
+    picked = list(source.every(interval))
+    assert [(frame.number, frame.time_s) for frame in picked] == [(frame.number, frame.time_s) for frame in whole]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(picked, whole, strict=True))
+    assert (source.last, source.problems, source.exact) == (30, [], True)
+
+
+def test_a_damaged_frame_is_named_whether_or_not_it_is_wanted(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "clip.avi", "MJPG", frames=10)
+    spoil_avi_frame(path, 7)
+    source = open_source(path)
+    assert [frame.number for frame in source.every(3)] == [1, 4, 10]
+    assert [problem.frame for problem in source.problems] == [7]
+    assert [frame.number for frame in source.every(4)] == [1, 5, 9]
 
 
 def test_a_camera_that_is_not_there_and_a_name_that_is_no_camera_are_refused() -> None:

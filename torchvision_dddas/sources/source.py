@@ -25,6 +25,7 @@ class Source(Protocol):
     """A clip, read one frame at a time.
 
     name: what to call it in messages and tables. count: frames that it announces, None when unknown (a live stream).
+    exact: whether count is more than a guess from the duration.
     rate_hz: frames a second. size: (width, height) in px, the same for every frame.
     last: number of the last frame known to be in the clip, decoded or not, once it has been read to its end; until then
     that of the last frame read.
@@ -34,12 +35,17 @@ class Source(Protocol):
 
     name: str
     count: int | None
+    exact: bool
     rate_hz: float
     size: tuple[int, int]
     last: int
     problems: list[Problem]
 
     def __iter__(self) -> Iterator[Frame]: ...
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Frames 1, 1 + interval, ... alone: the others are not decoded as far as that can be had."""
+        ...
 
 
 @contextmanager

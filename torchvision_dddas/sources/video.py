@@ -56,20 +56,24 @@ class VideoSource:
         self._given_hz = rate_hz
         self.rate_hz = rate_hz or self._own_hz
         self.count: int | None = int(count) if not self._live and 0 < count < 1e8 else None
+        self.exact = self.count is not None and Path(str(target)).suffix.lower() in _EXACT_COUNT
 
     def __iter__(self) -> Iterator[Frame]:
+        return self.every(1)
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
         self.problems.clear()
         capture = self._open()
         try:
-            yield from self._read_live(capture) if self._live else self._read_file(capture)
+            yield from self._read_live(capture, interval) if self._live else self._read_file(capture, interval)
         finally:
             capture.release()
 
-    def _read_file(self, capture: cv2.VideoCapture) -> Iterator[Frame]:
+    def _read_file(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
         number, lost, start_s, time_s, regular, damaged = 0, 0, 0.0, 0.0, True, False
         while lost < self._patience(number):
-            decoded, image = capture.read()
-            if not decoded:
+            if not capture.grab():
                 lost += 1
                 continue
             damaged = damaged or lost > 0
@@ -85,7 +89,6 @@ class VideoSource:
                 what = f"after frame {number} a frame came out of order and was left out"
                 self.problems.append(Problem(number, what))
                 continue
-            self._check(image, following)
             if following > number + 1:
                 self.problems.append(Problem(number + 1, _lost_words(number + 1, following - 1)))
             self.last = number = following
@@ -93,9 +96,16 @@ class VideoSource:
             if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
                 stamp_s = max((number - 1) / self.rate_hz, time_s)
             time_s = stamp_s
+            if (number - 1) % interval:
+                continue
+            decoded, image = capture.retrieve()
+            if not decoded:
+                self.problems.append(Problem(number, _lost_words(number, number)))
+                continue
+            self._check(image, number)
             yield Frame(number, time_s, image)
         # A count guessed from the duration means something only where the rate is constant.
-        exact = Path(str(self._target)).suffix.lower() in _EXACT_COUNT
+        exact = self.exact
         if exact and self.count and self.count > number:
             # Of the frames announced, those whose data are in the file belong to the clip.
             self.last = max(number, min(self.count, self._stored()))
@@ -106,10 +116,11 @@ class VideoSource:
             what = f"the clip ends after frame {self.last} but announces {self.count}: it is cut short or damaged"
             self.problems.append(Problem(self.last + 1, what))
 
-    def _read_live(self, capture: cv2.VideoCapture) -> Iterator[Frame]:
+    def _read_live(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
         number, lost, start_s = 0, 0, time.monotonic()
         while lost < _MOST_LOST_LIVE:
-            decoded, image = capture.read()
+            wanted = number % interval == 0
+            decoded, image = capture.read() if wanted else (capture.grab(), np.zeros((0, 0), np.uint8))
             number += 1
             if not decoded:
                 lost += 1
@@ -117,9 +128,11 @@ class VideoSource:
             if lost:
                 self.problems.append(Problem(number - lost, _lost_words(number - lost, number - 1)))
                 lost = 0
-            self._check(image, number)
             self.last = number
             start_s = start_s if number > 1 else time.monotonic()
+            if not wanted:
+                continue
+            self._check(image, number)
             yield Frame(number, time.monotonic() - start_s, image)
 
     def _patience(self, number: int) -> int:
