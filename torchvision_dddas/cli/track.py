@@ -91,12 +91,13 @@ def track_into(
 
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.sources import open_source
+        from torchvision_dddas.sources.agreement import agreed, looked_at
         from torchvision_dddas.sources.detections import read_detections
         from torchvision_dddas.vision import load
 
         table = read_detections(detections) if detections is not None else None
         source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
-        notes = table_notes(table, source, interval) if table is not None else []
+        notes = agreed(table, interval, source) if table is not None else []
         vision = load(backend, settings) if source is not None else None
         facts = {
             "input": clip,
@@ -108,6 +109,7 @@ def track_into(
                 "rate_hz": source.rate_hz,
                 "announced_frames": source.count,
             },
+            "rows": None if table is None else {"given": len(table), "used": int(looked_at(table, interval).sum())},
             "interval_frames": interval,
             "backend": vision and vision.name,
             "settings": settings.model_dump(),
@@ -122,6 +124,8 @@ def track_into(
                 for followed in _followed(table, source, vision, settings, interval):
                     output.write(followed)
                     tick()
+            if source is not None and table is not None and table.last > source.last:
+                journal.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
         finally:
             journal.problems += [str(problem) for problem in source.problems] if source is not None else []
     return journal
@@ -150,14 +154,6 @@ def looks(table: "DetectionTable | None", source: "Source | None", interval: int
     """How many frames will be looked at; None where the end is not known."""
     last = source.count if source is not None else table.last if table is not None else None
     return None if last is None else -(-last // interval)
-
-
-def table_notes(table: "DetectionTable", source: "Source | None", interval: int) -> list[str]:
-    """What the user should know of a table before it is tracked.
-
-    Raises InputError where its frames exceed the clip, or none of them is looked at.
-    """
-    return []
 
 
 def summary(journal: "TrackJournal", folder: Path, save: Sequence[str]) -> list[str]:
