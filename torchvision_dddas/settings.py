@@ -291,6 +291,12 @@ class PaperKnobs(Group):
     histogram: Literal["channel", "count"] = knob(
         "channel", "-", meaning="histograms add up to 1 in each channel, or hold counts, so that size matters too"
     )
+    exact_targets: int = knob(
+        12, "targets", 0, 1000, meaning="three frames with no more targets in any are solved exactly, others ..."
+    )
+    gap: float = knob(
+        0.005, "-", 0, 1, meaning="... by relaxation, to within this share of the bound, or exactly if it cannot be met"
+    )
 
 
 class Settings(Group):

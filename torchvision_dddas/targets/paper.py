@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PaperKnobs, Settings
-from torchvision_dddas.targets import assignment, jaccard
+from torchvision_dddas.targets import assignment, jaccard, relaxation
 from torchvision_dddas.targets.dispersion import dispersion, location_weight, of_window
 from torchvision_dddas.targets.gating import gate
 from torchvision_dddas.types import Detections, Tracks
@@ -95,7 +95,11 @@ def assign(
     assert isinstance(score, np.ndarray)
     if not by_feature:
         score = gate(score, knobs.threshold, knobs.gate)
-    return _best_pairs(score) if score.ndim == 2 else assignment.triplets_exact(score)
+    if score.ndim == 2:
+        return _best_pairs(score)
+    if max(score.shape) - 1 <= knobs.exact_targets:
+        return assignment.triplets_exact(score)
+    return relaxation.triplets(score, knobs.gap).triplets
 
 
 def _affinity(features: Sequence[np.ndarray], knobs: PaperKnobs) -> np.ndarray:
