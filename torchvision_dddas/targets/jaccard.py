@@ -20,9 +20,9 @@ def centres(box_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
 
 def per_channel(histogram: Float[np.ndarray, "N 768"]) -> Float[np.ndarray, "N 768"]:
     """Each channel's 256 bins divided by their sum; zeros stay zeros."""
-    channels = np.asarray(histogram, float).reshape(len(histogram), 3, -1)
+    channels = np.asarray(histogram, float).reshape(len(histogram), 3, 256)
     total = channels.sum(axis=-1, keepdims=True)
-    return (channels / np.where(total > 0, total, 1.0)).reshape(len(histogram), -1)
+    return (channels / np.where(total > 0, total, 1.0)).reshape(len(histogram), 768)
 
 
 def similarity(a: Float[np.ndarray, "N D"], b: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N M"]:

@@ -22,4 +22,4 @@ def rgb_histograms(image_bgr: np.ndarray, box_px: np.ndarray) -> np.ndarray:
             crop = image[top:bottom, left:right]
             for place, channel in enumerate((2, 1, 0)):
                 row[place] = cv2.calcHist([crop], [channel], None, [256], [0, 256])[:, 0]
-    return counts.reshape(len(boxes), -1)
+    return counts.reshape(len(boxes), 3 * 256)
