@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test lint
+.PHONY: demo test lint peers
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
@@ -15,6 +15,18 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
+# tracking measures TrackEval's? DATA may name a folder of MOTChallenge 2015 sequences to check them on as well.
+peers: $(STAMP) .venv-peers/.installed .venv-norfair/.installed
+	$(BIN)/python eval/peers/check.py $(DATA)
+
+.venv-peers/.installed: eval/peers/requirements.txt
+.venv-norfair/.installed: eval/peers/requirements-norfair.txt
+.venv-peers/.installed .venv-norfair/.installed:
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
+	@touch $@
 
 # The stamp makes a second run quick; a change of pyproject.toml installs again.
 $(STAMP): pyproject.toml

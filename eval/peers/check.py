@@ -1,0 +1,166 @@
+"""Are our tracking measures TrackEval's? `python eval/peers/check.py [DATA]`, run by `make peers`.
+
+Sets results of many kinds against the truth of made-up walkers, and of the sequences under DATA (folders with
+gt/gt.txt in MOTChallenge 2015 text), and compares every figure of every sequence and of all together with what
+TrackEval gives in its own environment. Prints a table; ends with 1 if any figure differs by more than 1e-6.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.evaluate import evaluate
+
+HERE = Path(__file__).resolve().parent
+PEERS = HERE.parents[1] / ".venv-peers/bin/python"
+MOST = 1e-6
+DISTRACTOR = 8
+
+Tables = dict[str, np.ndarray]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, nargs="?")
+    parser.add_argument("--json", type=Path, help="write TrackEval's figures of the made-up walkers here")
+    options = parser.parse_args()
+    worst = 0.0
+    print("| sequences | rows marked 0 | every | result | figures | largest difference |")
+    print("| --- | --- | ---: | --- | ---: | ---: |")
+    for label, truths, boxes in sets(options.data):
+        found = {name: results(truth) for name, truth in truths.items()}
+        for name, table in sort(truths, boxes).items():
+            found[name]["SORT"] = table
+        for ignoring, interval in (("dropped", 1), ("removed", 1), ("dropped", 5)):
+            with tempfile.TemporaryDirectory() as folder:
+                theirs, ours = both(Path(folder), truths, found, ignoring, interval)
+            for result, clips in theirs.items():
+                gaps = differences(clips, ours[result])
+                worst = max([worst, *gaps])
+                print(f"| {label} | {ignoring} | {interval} | {result} | {len(gaps)} | {max(gaps):.1e} |")
+            if options.json and label == "made up" and ignoring == "dropped" and interval == 1:
+                options.json.write_text(json.dumps(theirs, indent=1) + "\n")
+    print(f"\nlargest difference of all: {worst:.1e}")
+    sys.exit(int(worst > MOST))
+
+
+def sets(data: Path | None) -> Iterator[tuple[str, Tables, Tables]]:
+    """Truths by sequence, (N, 10) each, and the boxes that SORT gets."""
+    made = {f"walkers-{seed}": walkers(seed) for seed in range(3)}
+    yield "made up", made, {name: results(truth)["loose, missed"] for name, truth in made.items()}
+    if data is not None and (files := sorted(data.glob("*/gt/gt.txt"))):
+        real = {f.parents[1].name: np.loadtxt(f, delimiter=",") for f in files}
+        boxes = {name: np.loadtxt(data / name / "det/det.txt", delimiter=",") for name in real}
+        yield f"{len(files)} real", real, boxes
+    elif data is not None:
+        sys.exit(f"{data} holds no SEQUENCE/gt/gt.txt")
+
+
+def sort(truths: Tables, boxes: Tables) -> Tables:
+    """What SORT at its defaults makes of boxes."""
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = []
+        for name, table in boxes.items():
+            given, out = Path(folder, f"{name}-boxes.txt"), Path(folder, f"{name}.txt")
+            write(given, table[table[:, 0] <= truths[name][:, 0].max()])
+            job = {"tracker": "SORT", "settings": {}, "boxes": str(given), "interval": 1, "out": str(out)}
+            jobs.append(job | {"length": int(truths[name][:, 0].max())})
+        Path(folder, "jobs.json").write_text(json.dumps(jobs))
+        subprocess.run([PEERS, HERE / "run_trackers.py", Path(folder, "jobs.json")], check=True, capture_output=True)
+        return {name: np.loadtxt(Path(folder, f"{name}.txt"), delimiter=",", ndmin=2) for name in boxes}
+
+
+def walkers(seed: int, frames: int = 60, people: int = 8) -> np.ndarray:
+    """(N, 10) truth of people who come, stray, hide and go; some of their rows are marked 0."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for person in rng.permutation(3 * people)[:people]:
+        place, speed, size = rng.uniform(0, 300, 2), rng.normal(0, 3, 2), rng.uniform([15, 40], [30, 90])
+        begin, end = np.sort(rng.integers(1, frames + 1, 2))
+        hidden = set(rng.integers(begin, end + 1, 5).tolist())
+        for frame in range(begin, end + 1):
+            place, speed = place + speed, speed + rng.normal(0, 0.5, 2)
+            if frame not in hidden:
+                rows.append([frame, person, *place.round(2), *size.round(2), float(rng.random() > 0.1), -1, -1, -1])
+    return np.array(rows)
+
+
+def results(truth: np.ndarray, seed: int = 0) -> Tables:
+    """Results of many kinds, (M, 10) each."""
+    rng = np.random.default_rng(seed)
+    n, counted = len(truth), truth[truth[:, 6] != 0]
+    loose, hurried, random = truth.copy(), truth.copy(), truth.copy()
+    loose[:, 2:6] += rng.normal(0, 0.12, (n, 4)) * truth[:, [5]]
+    loose[:, 4:6] = np.maximum(loose[:, 4:6], 1)
+    loose[:, 1] = np.where(rng.random(n) < 0.03, 5000 + np.arange(n), loose[:, 1])
+    for frame in np.unique(truth[:, 0]):
+        here = truth[:, 0] == frame
+        random[here, 1] = rng.permutation(2 * here.sum())[: here.sum()]
+        if frame % 7 == 0:  # everyone swaps from here on
+            names = np.unique(truth[:, 1])
+            renamed = dict(zip(names, rng.permutation(names), strict=True))
+            later = hurried[:, 0] >= frame
+            hurried[later, 1] = [renamed[name] for name in truth[later, 1]]
+    found = loose[rng.random(n) < 0.8]
+    return {
+        "perfect": counted,
+        "every row": truth,
+        "other order": truth[rng.permutation(n)],
+        "swaps": hurried,
+        "loose, missed": found[rng.permutation(len(found))],
+        "random ids": random,
+        "empty": truth[:0],
+    }
+
+
+def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, interval: int) -> tuple[dict, dict]:
+    """TrackEval's figures and ours by result and sequence."""
+    lengths = {name: int(truth[:, 0].max()) for name, truth in truths.items()}
+    for name, truth in truths.items():
+        place = folder / "ours" / name / "gt.txt"
+        write(place, truth)
+        marked = truth.copy()
+        if ignoring == "removed":  # how a benchmark that removes distractors says the same
+            marked[:, 7] = np.where(truth[:, 6] == 0, DISTRACTOR, 1)
+        write(folder / "gt" / name / "gt/gt.txt", thinned(marked, interval))
+        for result, table in found[name].items():
+            table = np.c_[table[:, :7], np.full((len(table), 3), -1)]
+            write(folder / "found" / result / f"{name}.txt", table)
+            write(folder / "results" / result / "data" / f"{name}.txt", thinned(table, interval))
+    (folder / "lengths.json").write_text(json.dumps({n: (f - 1) // interval + 1 for n, f in lengths.items()}))
+    benchmark = "MOT17" if ignoring == "removed" else "MOT15"
+    words = [PEERS, HERE / "trackeval_figures.py", folder, folder / "theirs.json", benchmark]
+    subprocess.run([str(w) for w in words], check=True)
+    theirs = json.loads((folder / "theirs.json").read_text())
+    ours = {}
+    for result in theirs:
+        report = evaluate(folder / "ours", folder / "found" / result, interval=interval, ignoring=ignoring)
+        ours[result] = {name: clip["tracks"] for name, clip in report["clips"].items()}
+        ours[result]["COMBINED"] = report["pooled"]["tracks"]
+    return theirs, ours
+
+
+def thinned(table: np.ndarray, interval: int) -> np.ndarray:
+    """Every interval-th frame, renumbered from 1, as TrackEval knows no interval."""
+    kept = table[(table[:, 0] - 1) % interval == 0].copy()
+    kept[:, 0] = (kept[:, 0] - 1) // interval + 1
+    return kept
+
+
+def write(place: Path, table: np.ndarray) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(place, table, delimiter=",", fmt="%.10g")
+
+
+def differences(theirs: dict, ours: dict) -> list[float]:
+    return [abs(ours[clip][name] - value) for clip, by in theirs.items() for name, value in by.items()]
+
+
+if __name__ == "__main__":
+    main()
