@@ -25,7 +25,8 @@ class Look:
     def __init__(self, box_px: Float[np.ndarray, "N 4"], histograms: Callable[[], np.ndarray] | None) -> None:
         """histograms: gives (N, 768) numbers of pixels or shares; None where there is no picture."""
         self.centre_px = jaccard.centres(box_px)
-        self._make, self._made = histograms, None if histograms is not None else np.zeros((len(box_px), 768))
+        self._make = histograms
+        self._made = np.zeros((len(box_px), 768)) if histograms is None or not len(box_px) else None
 
     def __len__(self) -> int:
         return len(self.centre_px)
