@@ -4,9 +4,10 @@ Every function takes each `interval`-th frame, 1, 1 + interval, ..., and yields 
 """
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.sources.source import Source
 from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.tracks import Tracker
-from torchvision_dddas.types import Detections, Followed, Frame, Scene, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Followed, Frame, Scene, Tracks
 from torchvision_dddas.vision.camera import Camera
 from torchvision_dddas.vision.protocol import Vision
 
@@ -34,14 +35,17 @@ def follow_scenes(
     """
     follower = Follower(settings, interval, size, certain=True)
     steps: list[np.ndarray | None] = []
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: Counter[str] = Counter()
     for scene in scenes:
         steps.append(scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None)
+        adjustments += scene.adjustments
+        seconds.update(scene.seconds)
         number = scene.frame.number
         if not used(number, interval):
             continue
         known = [step for step in steps if step is not None]
-        now_from_before = chain(known) if known and len(known) == len(steps) else None
-        steps.clear()
+        now_from_before = chain(known) if len(known) == len(steps) else None
         yield from follower.take(
             Followed(
                 number,
@@ -50,10 +54,11 @@ def follow_scenes(
                 Tracks(number),
                 now_from_before,
                 cause=scene.cause,
-                adjustments=scene.adjustments,
-                seconds=dict(scene.seconds),
+                adjustments=adjustments,
+                seconds=dict(seconds),
             )
         )
+        steps, adjustments, seconds = [], (), Counter()
     yield from follower.end()
 
 
@@ -158,7 +163,21 @@ def _as_given(tracks: Tracks, given: Detections) -> Tracks:
     return replace(tracks, box_px=box_px, score=score)
 
 
-def _tracker(settings: Settings, interval: int, size: tuple[int, int] | None) -> Tracker:
+class _Associates(Protocol):
+    """What the trackers of both modes offer."""
+
+    def feed(
+        self,
+        frame: int,
+        detections: Detections,
+        now_from_before: np.ndarray | None = None,
+        appearance: Callable[[], np.ndarray] | None = None,
+    ) -> list[Tracks]: ...
+
+    def end(self) -> list[Tracks]: ...
+
+
+def _tracker(settings: Settings, interval: int, size: tuple[int, int] | None) -> _Associates:
     if settings.track.mode == "paper":
         from torchvision_dddas.targets.paper import PaperTracker
 

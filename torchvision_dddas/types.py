@@ -141,3 +141,9 @@ class Followed:
     cause: str = ""
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def untracked(self) -> list[int]:
+        """The rows of the detections that have no identity."""
+        tracked = set(self.tracks.row.tolist())
+        return [row for row in range(len(self.detections)) if row not in tracked]

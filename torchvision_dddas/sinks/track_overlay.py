@@ -7,7 +7,7 @@ from torchvision_dddas.sinks.overlay import TEXT, WARNING, caption
 from torchvision_dddas.sinks.trails import Trails
 from torchvision_dddas.types import Followed
 
-LENGTH = 24
+LENGTH = 12
 """Places that a trail shows."""
 UNTRACKED = (150, 150, 150)
 _GOLDEN_DEG = 137.508  # neighbours in number are far apart in hue, for any count of them
@@ -35,7 +35,7 @@ class TrackPictures:
         picture = _picture(followed, self.size)
         thick = max(1, round(picture.shape[0] / 480))
         tracks, given = followed.tracks, followed.detections
-        for row in np.setdiff1d(np.arange(len(given)), tracks.row):
+        for row in followed.untracked:
             _rectangle(picture, given.box_px[row], UNTRACKED, 1)
         for identity, box, row in zip(tracks.identity.tolist(), tracks.box_px, tracks.row, strict=True):
             colour = colour_of(identity)

@@ -43,7 +43,7 @@ def csv_lines(followed: Followed, motions: dict[int, tuple[float, float]]) -> st
         heading, speed = motions.get(identity, (math.nan, math.nan))
         moving = "," if math.isnan(speed) else f"{heading:.1f},{speed:.3f}"
         lines.append(f"{followed.number},{identity},{_box(box)},{score:.6g},{kind},{place},{moving}\n")
-    for row in np.setdiff1d(np.arange(len(given)), tracks.row):
+    for row in followed.untracked:
         box, score = given.box_px[row].tolist(), given.score[row]
         lines.append(f"{followed.number},,{_box(box)},{score:.6g},untracked,{rows[row]},,\n")
     return "".join(lines)
