@@ -1,0 +1,138 @@
+"""True boxes with their histograms, windows of frames, and the affinities of all windows as one padded batch.
+
+A sequence is a folder with gt/gt.txt (MOTChallenge text; rows whose seventh column is 0 are left out) and a video, or a
+folder `img1*` of pictures named by their frame, not necessarily all of them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from torchvision_dddas.metrics.mot_text import read_rows
+from torchvision_dddas.ops import affinity
+from torchvision_dddas.targets import jaccard
+from torchvision_dddas.targets.dispersion import dispersion
+from torchvision_dddas.vision.histograms import rgb_histograms
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true boxes of a sequence, a row a box, and the frames whose pictures there are.
+
+    box_px: (R, 4) as the file has them, pixels from 1. histogram: (R, 768) counts, zeros where there is no picture.
+    """
+
+    name: str
+    frame: np.ndarray
+    identity: np.ndarray
+    box_px: np.ndarray
+    histogram: np.ndarray
+    seen: frozenset[int]
+
+    def rows(self, frame: int) -> np.ndarray:
+        """Where the boxes of a frame are."""
+        return np.flatnonzero(self.frame == frame)
+
+
+def sequences(folder: Path) -> list[Path]:
+    """The folders with truth, by name."""
+    return sorted(path.parent.parent for path in folder.glob("*/gt/gt.txt"))
+
+
+def read(place: Path, pictures: str) -> Truth:
+    """Read a sequence. pictures: video, images, or none."""
+    found = read_rows(place / "gt" / "gt.txt", "truth")
+    real = found.mark != 0
+    frame, box_px = found.table.frame[real], found.table.box_px[real]
+    histogram, seen = np.zeros((len(frame), 768)), set()
+    for number, image in _pictures(place, pictures):
+        rows = np.flatnonzero(frame == number)
+        # MOTChallenge counts pixels from 1.
+        histogram[rows] = rgb_histograms(image, box_px[rows] - (1, 1, 0, 0))
+        seen.add(number)
+    every = frozenset(seen) if pictures != "none" else frozenset(range(1, int(frame.max()) + 1))
+    return Truth(place.name, frame, found.table.identity[real], box_px, histogram, every)
+
+
+def has_pictures(place: Path, pictures: str) -> bool:
+    """Whether a sequence has them."""
+    return bool(_video(place) if pictures == "video" else _images(place))
+
+
+def _pictures(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
+    if pictures == "video":
+        video, number = cv2.VideoCapture(str(_video(place)[0])), 0
+        while (read_one := video.read())[0]:
+            number += 1
+            yield number, read_one[1]
+    elif pictures == "images":
+        for path in _images(place):
+            yield int(path.stem), cv2.imread(str(path))
+
+
+def _video(place: Path) -> list[Path]:
+    return sorted(path for path in place.iterdir() if path.suffix in (".mp4", ".avi", ".webm"))
+
+
+def _images(place: Path) -> list[Path]:
+    return sorted(path for path in place.glob("img1*/*") if path.suffix in (".jpg", ".png"))
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All windows of a sequence: `frames` (W, K), newest first, and what a study needs of each.
+
+    identities: per window those of its frames. location, appearance: per window the affinities with a dummy at index 0.
+    dispersions: (W, K, 2), of locations and of histograms, of each frame.
+    """
+
+    frames: np.ndarray
+    identities: list[list[np.ndarray]]
+    location: list[np.ndarray]
+    appearance: list[np.ndarray]
+    dispersions: np.ndarray
+
+
+def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float]) -> Windows:
+    """The windows of `count` frames, one ending at each frame that has its older ones, with any target in it.
+
+    cuts: the dissimilarities at which clusters of locations and of histograms end.
+    """
+    last = max(int(truth.frame.max()), max(truth.seen, default=1))
+    rows = {number: truth.rows(number) for number in range(1, last + 1)}
+    ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
+    frames = np.array([f for f in ends if truth.seen.issuperset(f) and any(len(rows[t]) for t in f)], int)
+    frames = frames.reshape(-1, count)
+    centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
+    most = max(len(r) for r in rows.values())
+    valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
+    parts = []
+    for feature in (centre, shares):
+        padded = np.zeros((last + 1, most, feature.shape[1]))
+        for number, which in rows.items():
+            padded[number, : len(which)] = feature[which]
+        parts.append(_affinities(torch.from_numpy(padded), torch.from_numpy(valid), torch.from_numpy(frames)))
+    sizes = [tuple(len(rows[t]) for t in f) for f in frames]
+    location, appearance = ([_with_dummies(part[w], sizes[w]) for w in range(len(frames))] for part in parts)
+    of_frame = {t: (dispersion(centre[rows[t]], cuts[0]), dispersion(shares[rows[t]], cuts[1])) for t in rows}
+    return Windows(
+        frames,
+        [[truth.identity[rows[t]] for t in f] for f in frames],
+        location,
+        appearance,
+        np.array([[of_frame[t] for t in f] for f in frames.tolist()]),
+    )
+
+
+def _affinities(feature: torch.Tensor, valid: torch.Tensor, frames: torch.Tensor) -> np.ndarray:
+    """(W, N, M) or (W, N, M, L) of all windows at once."""
+    tables = [feature[column] for column in frames.T] + [valid[column] for column in frames.T]
+    return (affinity.pairs(*tables) if frames.shape[1] == 2 else affinity.triplets(*tables)).numpy()
+
+
+def _with_dummies(padded: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    return np.pad(padded[tuple(slice(n) for n in size)], ((1, 0),) * len(size))
