@@ -7,8 +7,13 @@ heights as distant ones.
 
 import numpy as np
 
-X, Y, VX, VY, WIDTH, HEIGHT, PP, PV, VV, SEEN = range(10)
-COLUMNS = 10
+X, Y, VX, VY, WIDTH, HEIGHT, PP, PV, VV, SEEN, GROWTH, SS, SG, GG = range(14)
+COLUMNS = 14
+_LOOSE = 0.1  # sd of the logarithm of a height
+_GROW0 = 0.03
+_GROWQ = 0.01
+_NEAR = 0.5
+_POW = 2
 
 
 def started(box_px: np.ndarray, frame: int, scatter: float, speed: float) -> np.ndarray:
@@ -18,6 +23,7 @@ def started(box_px: np.ndarray, frame: int, scatter: float, speed: float) -> np.
     state[:, Y] = box_px[:, 1] + box_px[:, 3] / 2
     state[:, WIDTH : HEIGHT + 1] = box_px[:, 2:]
     state[:, PP], state[:, VV], state[:, SEEN] = scatter**2, speed**2, frame
+    state[:, SS], state[:, GG] = _LOOSE**2, (_GROW0*speed/.07)**2
     return state
 
 
@@ -25,11 +31,20 @@ def predicted(state: np.ndarray, frame: int, agility: float) -> np.ndarray:
     """The states at a later frame. agility: sd of the change of velocity in one frame, heights/frame."""
     gap, power = frame - state[:, SEEN], agility**2
     later = state.copy()
-    later[:, X] += gap * state[:, VX]
-    later[:, Y] += gap * state[:, VY]
+    stretch = 1 / (1 - np.clip(gap * state[:, GROWTH], -1, _NEAR))
+    later[:, X] += gap * state[:, VX] * stretch
+    later[:, Y] += gap * state[:, VY] * stretch
+    later[:, VX : VY + 1] *= (stretch**_POW)[:, None]
+    later[:, GROWTH] *= stretch
     later[:, PP] += gap * (2 * state[:, PV] + gap * (state[:, VV] + power * gap / 3))
     later[:, PV] += gap * (state[:, VV] + power * gap / 2)
     later[:, VV] += power * gap
+    later[:, WIDTH] *= stretch
+    later[:, HEIGHT] *= stretch
+    power = (_GROWQ*agility/.009)**2
+    later[:, SS] += gap * (2 * state[:, SG] + gap * (state[:, GG] + power * gap / 3))
+    later[:, SG] += gap * (state[:, GG] + power * gap / 2)
+    later[:, GG] += power * gap
     return later
 
 
@@ -45,7 +60,15 @@ def updated(later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float, s
     new = later.copy()
     new[:, :2] += gain[:, None] * miss
     new[:, VX : VY + 1] += turn[:, None] * miss
-    new[:, WIDTH : HEIGHT + 1] += size_gain * (box_px[:, 2:] - later[:, WIDTH : HEIGHT + 1])
+    sgain = later[:, SS] / (later[:, SS] + _LOOSE**2)
+    sturn = later[:, SG] / (later[:, SS] + _LOOSE**2)
+    off = np.log(box_px[:, 3] / later[:, HEIGHT])
+    new[:, HEIGHT] *= np.exp(sgain * off)
+    new[:, WIDTH] += size_gain * (box_px[:, 2] - later[:, WIDTH])
+    new[:, GROWTH] += sturn * off
+    new[:, GG] -= sturn * later[:, SG]
+    new[:, SG] *= 1 - sgain
+    new[:, SS] *= 1 - sgain
     new[:, VV] -= turn * later[:, PV]
     new[:, PV] *= 1 - gain
     new[:, PP] *= 1 - gain

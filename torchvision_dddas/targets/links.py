@@ -11,9 +11,10 @@ from torchvision_dddas.targets.kalman import HEIGHT, PP, SEEN, WIDTH, X, Y
 _PRIOR = 4.0  # what a detection that continues a track is worth before anything is compared
 _TAIL = 4.0  # freedom of the distance's distribution: people turn and stop more than a normal law allows
 _UPRIGHT = 0.6  # people move less up and down in the picture than across it
-_SIZE_SCATTER = 0.14  # of the logarithm of a height
+_SIZE_SCATTER = 0.1  # of the logarithm of a height
 _SIZE_CHANGE = 0.4  # heights change as far as targets come nearer
 _WORST_SIZE = 8.0
+_GROWK = 1.0
 _REST_DRIFT = 0.03  # heights per square root of a frame
 _REST_PRICE = 1.0
 
@@ -51,11 +52,11 @@ def link_scores(
     missed = gap > sight.interval
     centre_x, centre_y = box_px[:, 0] + box_px[:, 2] / 2, box_px[:, 1] + box_px[:, 3] / 2
     score = _near(later, later[:, PP] + knobs.scatter**2, centre_x, centre_y)
-    score -= _size(state, box_px, gap, sight.speed)
+    score -= _size(later, box_px, np.sqrt(_SIZE_SCATTER**2 + later[:, kalman.SS] * _GROWK))
     if missed.any():
         long = np.maximum(gap[missed] - sight.interval, 0)
         rest = _near(state[missed], knobs.scatter**2 + _REST_DRIFT**2 * gap[missed], centre_x, centre_y)
-        rest -= _size(state[missed], box_px, np.full(missed.sum(), float(sight.interval)), sight.speed) + _REST_PRICE
+        rest -= _size(state[missed], box_px, np.sqrt(_SIZE_SCATTER**2 + state[missed, kalman.SS]*_GROWK)) + _REST_PRICE
         both = np.maximum(score[missed], rest)
         both -= (0.5 + 0.5 * np.log1p(long / 5))[:, None]
         both -= 4.0 * near_border(box_px, sight.size)[None] + 2.0 * left_at_border[missed, None]
@@ -72,11 +73,10 @@ def _near(place: np.ndarray, variance: np.ndarray, centre_x: np.ndarray, centre_
     return _PRIOR - (1 + _TAIL / 2) * np.log1p(distance / _TAIL) - np.log(2 * np.pi * variance * _UPRIGHT)[:, None]
 
 
-def _size(state: np.ndarray, box_px: np.ndarray, gap: np.ndarray, speed: float) -> np.ndarray:
-    """(N, M) price of a change of height."""
-    scatter = np.sqrt(_SIZE_SCATTER**2 + (_SIZE_CHANGE * gap * speed) ** 2)[:, None]
+def _size(state: np.ndarray, box_px: np.ndarray, scatter: np.ndarray) -> np.ndarray:
+    """(N, M) price of a height other than expected. scatter: (N,) sd of its logarithm."""
     change = np.log(box_px[:, 3]) - np.log(state[:, HEIGHT : HEIGHT + 1])
-    return np.minimum(0.5 * (change / scatter) ** 2, _WORST_SIZE) + np.log(scatter / _SIZE_SCATTER)
+    return np.minimum(0.5 * (change / scatter[:, None]) ** 2, _WORST_SIZE) + np.log(scatter / _SIZE_SCATTER)[:, None]
 
 
 def likeness_scores(likeness: np.ndarray, visible: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
