@@ -18,7 +18,7 @@ COLUMNS = {
     "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
     "boxes": ("f1", "precision", "recall"),
     "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
-    "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "n_fragmentations"),
+    "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
     "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
 }
 
@@ -45,6 +45,7 @@ SHORT = {
     "assa": "AssA",
     "mota": "MOTA",
     "idf1": "IDF1",
+    "ar_3": "AR_3",
     "same_identity": "same identity",
     "n_switches": "IDsw",
     "n_fragmentations": "frag.",

@@ -126,7 +126,7 @@ def _by_tracks(
     if truth.kind == "one target":
         return frames, {"target_track": tracking.count_one_target(cut(true), cut(found))}
     ignored = None if truth.ignored is None else cut(truth.ignored)
-    return frames, {"tracks": tracking.count(cut(true), cut(found), ignored, how.ignoring)}
+    return frames, {"tracks": tracking.count(cut(true), cut(found), ignored, how.ignoring, how.interval)}
 
 
 def _of(how: How) -> str:

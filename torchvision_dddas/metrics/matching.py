@@ -45,8 +45,12 @@ class FramePair(NamedTuple):
 
 
 class Paired(NamedTuple):
-    """A clip's frames that hold any box, in order, and the boxes of each true and each found identity, counted."""
+    """A clip's frames that hold any box, in order, and the boxes of each true and each found identity, counted.
 
+    numbers: of the frames.
+    """
+
+    numbers: np.ndarray
     frames: list[FramePair]
     true_boxes: np.ndarray
     found_boxes: np.ndarray
@@ -73,11 +77,11 @@ def pair(
         found = found.at(~_on_ignored(truth, found, ignored))
     _, true_id, true_boxes = np.unique(truth.identity, return_inverse=True, return_counts=True)
     _, found_id, found_boxes = np.unique(found.identity, return_inverse=True, return_counts=True)
-    frames = []
+    frames, numbers = [], np.union1d(truth.frame, found.frame)
     for true_rows, found_rows in _rows_by_frame(truth.frame, found.frame):
         overlap = iou(truth.box_px[true_rows], found.box_px[found_rows])
         frames.append(FramePair(true_id[true_rows], found_id[found_rows], overlap))
-    return Paired(frames, true_boxes, found_boxes)
+    return Paired(numbers, frames, true_boxes, found_boxes)
 
 
 def _check(table: TrackTable, what: str) -> None:

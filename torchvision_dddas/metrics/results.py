@@ -73,18 +73,15 @@ def load(place: Path) -> Result:
         tracks = mot_text.with_identities(mot_text.read_rows(place / TRACKS, "tracks"), place / TRACKS)
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
-        frames, state, outputs = int(record["frames"]["written"]), str(record["state"]), record["outputs"]
+        looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), record["outputs"]
+        # dddas track writes every interval-th frame, dddas detect each.
+        frames = max(looks - 1, 0) * int(record.get("interval_frames", 1)) + min(looks, 1)
     except (OSError, ValueError, KeyError, TypeError):
-        # Tables of another program: the masks and boxes themselves must say how long the clip is.
+        # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
         numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
-        frames = max([*numbers, *(detected or {}), 0 if tracks is None else _last(tracks)])
-        state, outputs = "complete", ["masks"] if numbers else []
+        frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []
     return Result(place, frames, detected, "masks" in outputs, state, tracks)
 
 
 def _by_frame(table: TrackTable) -> dict[int, np.ndarray]:
     return {int(f): table.box_px[table.frame == f] for f in np.unique(table.frame)}
-
-
-def _last(table: TrackTable) -> int:
-    return int(table.frame.max()) if len(table.frame) else 0

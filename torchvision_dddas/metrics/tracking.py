@@ -2,25 +2,31 @@
 
 from typing import NamedTuple
 
-from torchvision_dddas.metrics import clear, hota, identity
+from torchvision_dddas.metrics import clear, hota, identity, windows
 from torchvision_dddas.metrics.clear import Clear
 from torchvision_dddas.metrics.hota import Hota
 from torchvision_dddas.metrics.identity import Identity
 from torchvision_dddas.metrics.matching import Ignoring, TrackTable, pair
 from torchvision_dddas.metrics.segmentation import ratio
+from torchvision_dddas.metrics.windows import Windows
 
 ONE_TARGET_LEAST = 0.3
 """IoU from which a box counts as the one labelled target: moving-target detections seldom fit as tightly as labels."""
 
 
 class TrackCounts(NamedTuple):
-    """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are."""
+    """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are.
+
+    links_2, links_3: the source's accuracy ratio over two and three looks.
+    """
 
     clear: Clear = Clear()
     identity: Identity = Identity()
     hota: Hota = Hota()
     true: int = 0
     found: int = 0
+    links_2: Windows = Windows()
+    links_3: Windows = Windows()
 
     def plus(self, other: "TrackCounts") -> "TrackCounts":
         """The counts of both."""
@@ -30,6 +36,8 @@ class TrackCounts(NamedTuple):
             self.hota.plus(other.hota),
             self.true + other.true,
             self.found + other.found,
+            self.links_2.plus(other.links_2),
+            self.links_3.plus(other.links_3),
         )
 
     def by_name(self) -> dict[str, int]:
@@ -39,17 +47,26 @@ class TrackCounts(NamedTuple):
 
 
 def count(
-    truth: TrackTable, found: TrackTable, ignored: TrackTable | None = None, ignoring: Ignoring = "dropped"
+    truth: TrackTable,
+    found: TrackTable,
+    ignored: TrackTable | None = None,
+    ignoring: Ignoring = "dropped",
+    interval: int = 1,
 ) -> TrackCounts:
-    """Count one clip's tracks against the truth; `matching.pair` tells what becomes of boxes that do not count."""
+    """Count one clip's tracks, of every interval-th frame, against the truth.
+
+    `matching.pair` tells what becomes of boxes that do not count.
+    """
     clip = pair(truth, found, ignored, ignoring)
     sizes = len(clip.true_boxes), len(clip.found_boxes)
-    return TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip), *sizes)
+    links = windows.count(clip, interval, 2), windows.count(clip, interval, 3)
+    return TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip), *sizes, *links)
 
 
 def measures(counts: TrackCounts) -> dict[str, float]:
-    """HOTA, CLEAR and identity measures by name."""
-    return {**hota.measures(counts.hota), **clear.measures(counts.clear), **identity.measures(counts.identity)}
+    """HOTA, CLEAR and identity measures by name, and the source's AR_2 and AR_3."""
+    field = {**hota.measures(counts.hota), **clear.measures(counts.clear), **identity.measures(counts.identity)}
+    return {**field, "ar_2": counts.links_2.mean, "ar_3": counts.links_3.mean}
 
 
 class TargetTrack(NamedTuple):
