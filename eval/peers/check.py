@@ -96,7 +96,7 @@ def results(truth: np.ndarray, seed: int = 0) -> Tables:
     rng = np.random.default_rng(seed)
     n, counted = len(truth), truth[truth[:, 6] != 0]
     loose, hurried, random = truth.copy(), truth.copy(), truth.copy()
-    loose[:, 2:6] += rng.normal(0, 0.12, (n, 4)) * truth[:, [5]]
+    loose[:, 2:6] += rng.normal(0, 0.06, (n, 4)) * truth[:, [5]]
     loose[:, 4:6] = np.maximum(loose[:, 4:6], 1)
     loose[:, 1] = np.where(rng.random(n) < 0.03, 5000 + np.arange(n), loose[:, 1])
     for frame in np.unique(truth[:, 0]):

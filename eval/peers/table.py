@@ -1,0 +1,356 @@
+"""Our tracker beside SORT, ByteTrack, OC-SORT and norfair: `python eval/peers/table.py DATA`, after `make peers`.
+
+DATA holds MOTChallenge 2015 sequences: NAME/gt/gt.txt, NAME/det/det.txt, an optional NAME/*.mp4. Two studies:
+true boxes at an interval (identities stripped, rows shuffled within a frame; switches and IDF1, matched at an IoU of
+0.9, which only the box itself reaches), and detections at interval 1 (HOTA, MOTA, IDF1, switches, all sequences
+pooled). Each peer runs at its defaults and with thresholds tuned for that very study over GRIDS, on the sequences
+that the figures are of: the peers get every advantage; ours runs as it is. Prints Markdown; --write puts it between
+a file's `peers` marks, --json keeps everything.
+"""
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import report
+
+from torchvision_dddas.metrics import mot_text, tracking
+from torchvision_dddas.metrics import truth as truths
+from torchvision_dddas.metrics.clear import count as count_clear
+from torchvision_dddas.metrics.identity import count as count_identity
+from torchvision_dddas.metrics.identity import measures as identity_measures
+from torchvision_dddas.metrics.matching import TrackTable, pair
+from torchvision_dddas.metrics.tracking import TrackCounts
+
+ROOT = Path(__file__).resolve().parents[2]
+TRACKERS, NORFAIR = ROOT / ".venv-peers/bin/python", ROOT / ".venv-norfair/bin/python"
+SAME = 0.9
+
+Settings = dict[str, Any]
+
+# Around each tracker's defaults and towards looser gates, shorter confirmation and longer memory.
+BOXES: dict[str, dict[str, list]] = {
+    "SORT": {
+        "minimum_iou_threshold": [0.01, 0.05, 0.1, 0.3],
+        "lost_track_buffer": [3, 10, 30, 90],
+        "minimum_consecutive_frames": [1, 2, 3],
+    },
+    "ByteTrack": {
+        "minimum_iou_threshold": [0.01, 0.05, 0.1, 0.3],
+        "lost_track_buffer": [3, 10, 30, 90],
+        "minimum_consecutive_frames": [1, 2],
+    },
+    "OC-SORT": {
+        "minimum_iou_threshold": [0.01, 0.1, 0.3],
+        "lost_track_buffer": [10, 30, 90],
+        "minimum_consecutive_frames": [1, 3],
+        "direction_consistency_weight": [0.0, 0.2],
+    },
+    "norfair": {
+        "distance_threshold": [0.7, 0.9, 0.99],
+        "hit_counter_max": [3, 8, 15, 45],
+        "initialization_delay": [0, 1],
+    },
+}
+DETECTIONS: dict[str, dict[str, list]] = {
+    "SORT": {
+        "track_activation_threshold": [0.25, 0.6, 0.8, 0.9],
+        "minimum_iou_threshold": [0.1, 0.3],
+        "lost_track_buffer": [10, 30, 60],
+        "minimum_consecutive_frames": [2, 3],
+    },
+    "ByteTrack": {
+        "track_activation_threshold": [0.7, 0.8, 0.9],
+        "high_conf_det_threshold": [0.5, 0.6, 0.8],
+        "minimum_iou_threshold": [0.1, 0.2],
+        "lost_track_buffer": [10, 30, 60],
+    },
+    "OC-SORT": {
+        "high_conf_det_threshold": [0.5, 0.6, 0.7, 0.8],
+        "minimum_iou_threshold": [0.1, 0.3],
+        "lost_track_buffer": [10, 30, 60],
+        "direction_consistency_weight": [0.0, 0.2],
+    },
+    "norfair": {
+        "distance_threshold": [0.5, 0.7, 0.9],
+        "hit_counter_max": [8, 15, 30],
+        "initialization_delay": [1, 3, 7],
+        "least_score": [0.0, 0.6, 0.8],
+    },
+}
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A sequence of DATA. clip: its video, if it has one. detections: a file with scores in [0, 1], if it has one."""
+
+    name: str
+    truth: truths.Truth
+    length: int
+    clip: Path | None
+    detections: Path | None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--studies", default="boxes,detections,speed")
+    parser.add_argument("--peers", default=",".join(BOXES), help="those to run; the others are left out")
+    parser.add_argument("--json", type=Path, help="write all figures here, and read those of other studies from it")
+    parser.add_argument("--write", type=Path, help="a text file with the peers marks, such as README.md")
+    options = parser.parse_args()
+    sequences = read(options.data)
+    if not sequences:
+        sys.exit(f"{options.data} holds no sequences NAME/gt/gt.txt; nothing was measured")
+    for python in (TRACKERS, NORFAIR):
+        if not python.exists():
+            sys.exit(f"{python} is missing; run make peers first")
+    peers = options.peers.split(",")
+    figures = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
+    for study in options.studies.split(","):
+        figures[study] = {"boxes": on_boxes, "detections": on_detections, "speed": on_speed}[study](sequences, peers)
+        if options.json:
+            options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    text = markdown(figures)
+    print(text)
+    if options.write:
+        report.put(options.write, "peers", text)
+
+
+def read(data: Path) -> list[Sequence]:
+    """The sequences, as long as seqinfo.ini says, or as their truth where there is none."""
+    found = []
+    for file in sorted(data.glob("*/gt/gt.txt")):
+        place, truth = file.parents[1], truths.load(file)
+        given = place / "det/det.txt"
+        scores = mot_text.read_rows(given, "detections").mark if given.exists() else np.full(1, np.nan)
+        probable = bool(((scores >= 0) & (scores <= 1)).all())
+        clip = next(iter(sorted(place.glob("*.mp4"))), None)
+        found.append(Sequence(place.name, truth, truth.length or truth.frames[-1], clip, given if probable else None))
+    return found
+
+
+# -- running -----------------------------------------------------------------------------------------------------------
+
+
+def run_peer(
+    peer: str, settings: Settings, files: list[tuple[Path, int]], interval: int, folder: Path
+) -> list[TrackTable]:
+    """Tracks that a peer makes of each file of boxes, (file, frames of its clip)."""
+    jobs = [
+        {"tracker": peer, "settings": settings, "boxes": str(file), "interval": interval, "length": length}
+        | {"out": str(folder / f"{i}.txt")}
+        for i, (file, length) in enumerate(files)
+    ]
+    seconds_of(peer, jobs, folder)
+    return [mot_text.read_rows(folder / f"{i}.txt", "tracks").table for i in range(len(files))]
+
+
+def seconds_of(peer: str, jobs: list[dict], folder: Path) -> list[float]:
+    (folder / "jobs.json").write_text(json.dumps(jobs))
+    python, script = (NORFAIR, "run_norfair.py") if peer == "norfair" else (TRACKERS, "run_trackers.py")
+    words = [str(python), str(Path(__file__).with_name(script)), str(folder / "jobs.json")]
+    return json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+
+
+def run_ours(boxes: Path, interval: int, folder: Path, clip: Path | None = None) -> TrackTable:
+    """Tracks that `dddas track` makes of a file of boxes, with the clip or without."""
+    words = ["-c", "from torchvision_dddas.cli import main; main()", "track", *([str(clip)] if clip else [])]
+    words += ["--detections", str(boxes), "--interval", str(interval), "--out", str(folder / "ours"), "--quiet"]
+    subprocess.run([sys.executable, *words, *(["--save", "none"] if clip else [])], check=True)
+    return mot_text.read_rows(folder / "ours/tracks.txt", "tracks").table
+
+
+def grid(choices: dict[str, list]) -> Iterable[Settings]:
+    for values in itertools.product(*choices.values()):
+        yield dict(zip(choices, values, strict=True))
+
+
+# -- true boxes --------------------------------------------------------------------------------------------------------
+
+
+def on_boxes(sequences: list[Sequence], peers: list[str]) -> dict:
+    """{interval: {tracker: {"settings": ..., "clips": {name: [switches, IDF1]}}}}: IDF1 in percent."""
+    figures: dict = {}
+    for interval in (1, 5, 10, 15):
+        chosen = sequences if interval < 10 else [s for s in sequences if s.clip]
+        rows: dict = {}
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            files = [(stripped(s, interval, folder), s.length) for s in chosen]
+            for peer in peers:
+                tried = []
+                for settings in [{}, *grid(BOXES[peer])]:
+                    tracks = run_peer(peer, settings, files, interval, folder)
+                    tried.append({"settings": settings, "clips": by_clip(chosen, tracks, interval)})
+                rows[f"{peer}, defaults"] = tried[0]
+                rows[f"{peer}, tuned"] = max(tried, key=mean_idf1)
+                say(interval, peer, rows)
+            tracks = [run_ours(file, interval, folder) for file, _ in files]
+            rows["ours"] = {"settings": {}, "clips": by_clip(chosen, tracks, interval)}
+            filmed = [(s, f) for s, (f, _) in zip(chosen, files, strict=True) if s.clip]
+            tracks = [run_ours(file, interval, folder, s.clip) for s, file in filmed]
+            rows["ours, with the clip"] = {"settings": {}, "clips": by_clip([s for s, _ in filmed], tracks, interval)}
+            say(interval, "ours", rows)
+        figures[str(interval)] = rows
+    return figures
+
+
+def stripped(sequence: Sequence, interval: int, folder: Path) -> Path:
+    """The true boxes of every interval-th frame without identities, shuffled within a frame."""
+    assert sequence.truth.tracks is not None
+    table = sequence.truth.tracks.every(interval)
+    order = np.random.default_rng(7).permutation(len(table.frame))
+    table = table.at(order[np.argsort(table.frame[order], kind="stable")])
+    blank = -np.ones(len(order))
+    path = folder / f"{sequence.name}-boxes.txt"
+    np.savetxt(path, np.c_[table.frame, blank, table.box_px, -blank, blank, blank, blank], delimiter=",", fmt="%.10g")
+    return path
+
+
+def by_clip(sequences: list[Sequence], tracks: list[TrackTable], interval: int) -> dict[str, list[float]]:
+    """Switches, and IDF1 in percent, of each sequence."""
+    scores = {}
+    for sequence, found in zip(sequences, tracks, strict=True):
+        assert sequence.truth.tracks is not None
+        clip = pair(sequence.truth.tracks.every(interval), found)
+        idf1 = identity_measures(count_identity(clip, SAME))["idf1"]
+        scores[sequence.name] = [count_clear(clip, SAME).switches, 100 * idf1]
+    return scores
+
+
+def mean_idf1(row: dict) -> float:
+    return float(np.mean([idf1 for _, idf1 in row["clips"].values()]))
+
+
+def say(interval: int, peer: str, rows: dict) -> None:
+    for name, row in rows.items():
+        if name.startswith(peer):
+            print(f"D={interval} {name}: {mean_idf1(row):.1f} {row['settings']}", file=sys.stderr, flush=True)
+
+
+# -- detections --------------------------------------------------------------------------------------------------------
+
+
+def on_detections(sequences: list[Sequence], peers: list[str]) -> dict:
+    """{tracker: {"settings": ..., HOTA and the other measures of all sequences pooled, "clips": {name: ...}}}."""
+    chosen = [s for s in sequences if s.detections]
+    files = [(s.detections, s.length) for s in chosen if s.detections]
+    rows = {}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for peer in peers:
+            tried = [
+                {"settings": settings, **pooled(chosen, run_peer(peer, settings, files, 1, folder))}
+                for settings in ({}, *grid(DETECTIONS[peer]))
+            ]
+            rows[f"{peer}, defaults"], rows[f"{peer}, tuned"] = tried[0], max(tried, key=lambda row: row["hota"])
+            for name in (f"{peer}, defaults", f"{peer}, tuned"):
+                print(name, f"HOTA {rows[name]['hota']:.4f}", rows[name]["settings"], file=sys.stderr, flush=True)
+        rows["ours"] = {"settings": {}, **pooled(chosen, [run_ours(file, 1, folder) for file, _ in files])}
+    return rows
+
+
+def pooled(sequences: list[Sequence], tracks: list[TrackTable]) -> dict:
+    clips, total = {}, TrackCounts()
+    for sequence, found in zip(sequences, tracks, strict=True):
+        assert sequence.truth.tracks is not None
+        counts = tracking.count(sequence.truth.tracks, found)
+        clips[sequence.name] = figures_of(counts)
+        total = total.plus(counts)
+    return {**figures_of(total), "clips": clips}
+
+
+def figures_of(counts: TrackCounts) -> dict[str, float]:
+    kept = ("hota", "deta", "assa", "mota", "idf1")
+    return {k: v for k, v in tracking.measures(counts).items() if k in kept} | {"switches": counts.clear.switches}
+
+
+# -- speed -------------------------------------------------------------------------------------------------------------
+
+
+def on_speed(sequences: list[Sequence], peers: list[str], turns: int = 5) -> dict[str, float]:
+    """Frames a second on PETS09-S2L1's detections at interval 1, reading and writing left out: medians over turns."""
+    sequence = next(s for s in sequences if s.detections and "S2L1" in s.name)
+    seconds: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as place:
+        job = {"settings": {}, "boxes": str(sequence.detections), "interval": 1, "length": sequence.length, "out": None}
+        for _ in range(turns):
+            for peer in peers:
+                seconds.setdefault(peer, []).append(seconds_of(peer, [job | {"tracker": peer}], Path(place))[0])
+            seconds.setdefault("ours", []).append(our_seconds(sequence))
+    return {name: sequence.length / float(np.median(s)) for name, s in seconds.items()}
+
+
+def our_seconds(sequence: Sequence) -> float:
+    """Time of our tracker in a fresh process, as the peers have it."""
+    program = (
+        "import sys, time\n"
+        "from torchvision_dddas.settings import load\n"
+        "from torchvision_dddas.sources.detections import read_detections\n"
+        "from torchvision_dddas.targets.tracks import Tracker\n"
+        "table, tracker = read_detections(sys.argv[1]), Tracker(load(), 1)\n"
+        "given = [table.at(f) for f in range(1, int(sys.argv[2]) + 1)]\n"
+        "begun = time.perf_counter()\n"
+        "for f, detections in enumerate(given, 1): tracker.feed(f, detections)\n"
+        "tracker.end()\n"
+        "print(time.perf_counter() - begun)"
+    )
+    words = [sys.executable, "-c", program, str(sequence.detections), str(sequence.length)]
+    return float(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+
+
+def markdown(figures: dict) -> str:
+    lines: list[str] = []
+    for interval, rows in figures.get("boxes", {}).items():
+        clips = next(iter(rows.values()))["clips"]
+        lines += [f"True boxes at an interval of {interval}: switches / IDF1 in percent.", ""]
+        lines += ["| tracker | mean | " + " | ".join(clips) + " |", "| --- |" + " ---: |" * (len(clips) + 1)]
+        for name, row in rows.items():
+            total = sum(switches for switches, _ in row["clips"].values())
+            cells = [f"{row['clips'][c][0]} / {row['clips'][c][1]:.1f}" if c in row["clips"] else "–" for c in clips]
+            mean = f"{total} / {mean_idf1(row):.1f}" if len(row["clips"]) == len(clips) else "–"
+            lines.append(f"| {name} | {mean} | " + " | ".join(cells) + " |")
+        lines.append("")
+    if rows := figures.get("detections", {}):
+        lines += [f"Detections of {len(rows['ours']['clips'])} sequences at interval 1, pooled; in percent.", ""]
+        lines += ["| tracker | HOTA | DetA | AssA | MOTA | IDF1 | switches |", "| --- |" + " ---: |" * 6]
+        for name, row in rows.items():
+            cells = " | ".join(f"{100 * row[k]:.1f}" for k in ("hota", "deta", "assa", "mota", "idf1"))
+            lines.append(f"| {name} | {cells} | {row['switches']} |")
+        lines.append("")
+    if figures.get("speed"):
+        speeds = ", ".join(f"{name} {round(s, -1):.0f}" for name, s in figures["speed"].items())
+        lines += [f"Frames a second on the detections of PETS09-S2L1, one process each, medians: {speeds}.", ""]
+    if tuned := settings_of(figures):
+        lines += ["Tuned settings:", "", *tuned]
+    return "\n".join(lines)
+
+
+def settings_of(figures: dict) -> list[str]:
+    studies = {f"true boxes at {i}": rows for i, rows in figures.get("boxes", {}).items()}
+    studies |= {"detections": figures["detections"]} if figures.get("detections") else {}
+    lines = []
+    for study, rows in studies.items():
+        for name, row in rows.items():
+            if name.endswith(", tuned"):
+                words = ", ".join(f"{k} {v}" for k, v in row["settings"].items()) or "the defaults"
+                lines.append(f"- {study}, {name.removesuffix(', tuned')}: {words}")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
