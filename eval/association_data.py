@@ -118,14 +118,21 @@ def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float]) 
         parts.append(_affinities(torch.from_numpy(padded), torch.from_numpy(valid), torch.from_numpy(frames)))
     sizes = [tuple(len(rows[t]) for t in f) for f in frames]
     location, appearance = ([_with_dummies(part[w], sizes[w]) for w in range(len(frames))] for part in parts)
-    of_frame = {t: (dispersion(centre[rows[t]], cuts[0]), dispersion(shares[rows[t]], cuts[1])) for t in rows}
     return Windows(
         frames,
         [[truth.identity[rows[t]] for t in f] for f in frames],
         location,
         appearance,
-        np.array([[of_frame[t] for t in f] for f in frames.tolist()]),
+        dispersions(truth, frames, cuts),
     )
+
+
+def dispersions(truth: Truth, frames: np.ndarray, cuts: tuple[float, float]) -> np.ndarray:
+    """(W, K, 2) of the locations and of the histograms of each frame of the windows, at these cuts."""
+    centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
+    rows = {number: truth.rows(number) for number in np.unique(frames).tolist()}
+    found = {t: (dispersion(centre[rows[t]], cuts[0]), dispersion(shares[rows[t]], cuts[1])) for t in rows}
+    return np.array([[found[t] for t in f] for f in frames.tolist()]).reshape(*frames.shape, 2)
 
 
 def _affinities(feature: torch.Tensor, valid: torch.Tensor, frames: torch.Tensor) -> np.ndarray:

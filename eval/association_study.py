@@ -7,6 +7,7 @@ reference   AR_2 against five weights, gated and not, beside the project's refer
 weight      AR_K against the weight of location, K = 2 and 3 (appendix C, Fig. 4a), and where the dispersions choose it
 threshold   AR_2 against threshold × weight (Fig. 6)
 dispersion  the dispersions and the chosen weight over time (Fig. 4b and 5)
+cuts        AR_2 by the dispersions, with clusters that end earlier or later
 readings    AR_3 in every reading of the gate and of the dummy
 
 Prints Markdown: mean / standard deviation over the windows, in percent. `--out` gets the plots (extra `report`) and
@@ -17,6 +18,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +63,8 @@ REFERENCE: dict[str, dict[str, dict[float | None, str]]] = {
     },
 }
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
-STUDIES = ("reference", "weight", "threshold", "dispersion", "readings")
+LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.25, 0.34, 0.5, 0.6, 0.75)
+STUDIES = ("reference", "weight", "threshold", "dispersion", "cuts", "readings")
 Figures = dict[str, Any]
 
 
@@ -219,6 +222,30 @@ def by_dispersion(place: Path, interval: int) -> Figures:
         "best": WEIGHTS[best],
         "lowest": knobs.lowest_dispersion,
     }
+
+
+def by_cuts(place: Path, interval: int) -> Figures:
+    """AR_2 by the rule for cuts of the clusters of locations and of histograms, beside the best fixed weight."""
+    windows, truth = _windows(place, 2, interval), data.read(place, "video")
+    found: Figures = {}
+    for gate in ("one_dummy", "off"):
+        knobs = _knobs(window=2, gate=gate)
+        fixed = {weight: ratios(windows, knobs, weight) for weight in WEIGHTS}
+        best = max(fixed, key=lambda weight: fixed[weight].mean())
+        print(f"\n{place.name}, K = 2, gate {gate}: best fixed weight {best:g}, {_words(fixed[best])}\n")
+        print("| G of locations | " + " | ".join(f"G of histograms {cut:g}" for cut in APPEARANCE_CUTS) + " |")
+        print("| --- " + "| ---: " * len(APPEARANCE_CUTS) + "|")
+        for location_cut in LOCATION_CUTS:
+            words = []
+            for appearance_cut in APPEARANCE_CUTS:
+                at = data.dispersions(truth, windows.frames, (location_cut, appearance_cut))
+                chosen = weights(replace(windows, dispersions=at), knobs)
+                words.append(
+                    _words(np.select([chosen == w for w in (0.0, 0.5, 1.0)], [fixed[w] for w in (0.0, 0.5, 1.0)]))
+                )
+            print(f"| {location_cut:g} | " + " | ".join(words) + " |", flush=True)
+            found[f"{gate} {location_cut:g}"] = words
+    return found
 
 
 def by_readings(place: Path, interval: int) -> Figures:
