@@ -1,16 +1,14 @@
 """Identities along a clip, a clip with a table, and a table alone."""
 
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.following import follow_clip, follow_scenes, follow_table
-from torchvision_dddas.metrics.detection import iou
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import load
-from torchvision_dddas.simulation.scene import render
+from torchvision_dddas.simulation.scene import LEAST_PX, render
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.types import Adjustment, Detections, Frame, Registration, Scene
 from torchvision_dddas.vision import load as load_vision
@@ -21,7 +19,7 @@ SIZE = (320, 240)
 
 
 def walkers(frames, lanes=(60, 140), speed=2.0):
-    """(frame, box) rows: one walker a lane, who walks to the right; those of a frame in turned order every other time."""
+    """(frame, box) rows: one walker a lane, who walks to the right; in odd frames the other way round."""
     rows = []
     for frame in frames:
         boxes = [(20 + speed * (frame - 1), y, 12.0, 40.0) for y in lanes]
@@ -140,7 +138,8 @@ def test_what_is_settled_while_a_clip_runs_is_what_the_whole_run_gives():
     vision = load_vision("onboard", SETTINGS)
     whole = all_of(follow_clip(Clip(40), table, vision, SETTINGS, 1))
     for end in (3, 11, 25):
-        clip, early = Clip(40), {}
+        clip = Clip(40)
+        early: dict[int, dict] = {}
         for followed in follow_clip(clip, table, vision, SETTINGS, 1):
             if clip.given > end:
                 break
@@ -243,26 +242,62 @@ def film():
     return render(0, 40, (480, 360))
 
 
-def test_the_simulated_movers_keep_their_identities_end_to_end(film):
-    """Detected, registered and followed: no mover of the simulator has two identities, no identity two movers."""
-    clip = SimpleNamespace(rate_hz=10.0, __iter__=None)
+class Film(Clip):
+    """The simulator's clip in place of the wall."""
 
-    class Film:
-        rate_hz = 10.0
+    def __init__(self, film):
+        super().__init__(len(film.images))
+        self.images, self.size = film.images, (480, 360)
 
-        def __iter__(self):
-            yield from (Frame(n, n / 10, image) for n, image in enumerate(film.images, 1))
+    def every(self, interval):
+        for number, image in enumerate(self.images, 1):
+            self.last = number
+            if (number - 1) % interval == 0:
+                yield Frame(number, number / 10, image)
 
-    del clip
-    settings = load(overrides=["gates.min_area_px=80"])
-    together: dict[tuple[int, int], int] = {}
-    for f in follow_scenes(run(Film(), load_vision("onboard", settings), settings), settings, 1, (480, 360)):
-        mask = film.masks[f.number - 1]
-        for identity, (x, y, w, h) in zip(f.tracks.identity.tolist(), f.tracks.box_px.astype(int), strict=True):
-            inside = mask[max(y, 0) : y + h, max(x, 0) : x + w]
-            counts = np.bincount(inside[inside > 0].ravel(), minlength=1)
-            if counts.sum():
-                together[int(counts.argmax()), identity] = together.get((int(counts.argmax()), identity), 0) + 1
-    movers, ids = {m for m, _ in together}, {i for _, i in together}
-    assert len(movers) >= 4
-    assert len(together) == len(movers) == len(ids), together
+
+def movers_of(film):
+    """Frame -> {mover: its true box}."""
+    values = [np.unique(mask[mask > 0]) for mask in film.masks]
+    seen = [[v for v in some if (mask == v).sum() >= LEAST_PX] for some, mask in zip(values, film.masks, strict=True)]
+    pairs = zip(seen, film.boxes_px, strict=True)
+    return {n: dict(zip(some, boxes, strict=True)) for n, (some, boxes) in enumerate(pairs, 1)}
+
+
+def together(followed, movers, least_iou):
+    """How often each mover and each identity were seen together: counts (movers, identities)."""
+    counts: dict[tuple[int, int], int] = {}
+    for f in followed:
+        for identity, box in zip(f.tracks.identity.tolist(), f.tracks.box_px, strict=True):
+            mover = max(movers[f.number], key=lambda m: iou(box, movers[f.number][m]))
+            if iou(box, movers[f.number][mover]) >= least_iou:
+                counts[mover, identity] = counts.get((mover, identity), 0) + 1
+    table = np.zeros((max(m for m, _ in counts) + 1, max(i for _, i in counts) + 1), int)
+    for place, count in counts.items():
+        table[place] = count
+    return table
+
+
+def iou(a, b):
+    width, height = np.minimum(a[:2] + a[2:], b[:2] + b[2:]) - np.maximum(a[:2], b[:2])
+    both = max(width, 0) * max(height, 0)
+    return both / (a[2] * a[3] + b[2] * b[3] - both)
+
+
+@pytest.mark.parametrize("interval", [1, 5])
+def test_the_true_boxes_of_the_simulated_clip_get_one_identity_a_mover(film, interval):
+    movers = movers_of(film)
+    table = table_of([(n, tuple(box)) for n, boxes in movers.items() for box in boxes.values()])
+    followed = follow_clip(Film(film), table, load_vision("onboard", SETTINGS), SETTINGS, interval)
+    counts = together(followed, movers, 0.99)
+    assert counts.sum() == ((table.frame - 1) % interval == 0).sum()
+    assert counts[linear_sum_assignment(-counts)].sum() > 0.97 * counts.sum()
+
+
+def test_the_simulated_clip_s_own_detections_are_followed_end_to_end(film):
+    """Walkers that cross become one blob and part again; most of every mover's boxes are of one identity even so."""
+    settings = load(overrides=["gates.min_area_px=150"])
+    scenes = run(Film(film), load_vision("onboard", settings), settings)
+    counts = together(follow_scenes(scenes, settings, 1, (480, 360)), movers_of(film), 0.3)
+    assert (counts.max(axis=1) > 5).sum() >= 4
+    assert counts[linear_sum_assignment(-counts)].sum() > 0.6 * counts.sum()

@@ -23,7 +23,7 @@ def test_help_loads_nothing_heavy():
 
 def test_version_and_help(dddas):
     assert dddas("--version").stdout.startswith("dddas ")
-    for command in ("detect", "evaluate", "demo", "settings"):
+    for command in ("detect", "track", "evaluate", "demo", "settings"):
         assert dddas(command, "--help").exit_code == 0
         assert command in dddas("--help").stdout
 
