@@ -5,6 +5,8 @@ others, fall into groups that are solved one by one: small ones by trying, with 
 linear programming, and where that leaves fractions by integer programming (HiGHS).
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import Bounds, LinearConstraint, milp
@@ -27,46 +29,64 @@ def best_columns(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"])
     columns the first is taken.
     Raises InputError if the shapes do not fit, an index is below -1, a column has no node, or a score is NaN or +inf.
     """
+    return good_columns(columns, score, None)[0]
+
+
+def good_columns(
+    columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"], most_branches: int | None
+) -> tuple[Int[np.ndarray, "Z"], bool]:
+    """As `best_columns`, in no more branches of HiGHS than so many, and whether it is certainly the best."""
     columns, score = _checked(columns, score)
     order = np.lexsort((-score, columns[:, 2], columns[:, 1], columns[:, 0]))
     order = order[score[order] > 0]
     if not len(order):
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), True
     kept = columns[order]
     gain = score[order] / score[order].max()
     incidence = _incidence(kept)
     group = _groups(incidence)
     chosen, left_open = _tried(incidence, gain, group)
+    certain = True
     if left_open.any():
-        chosen[left_open] = _programmed(incidence[:, left_open], gain[left_open], group[left_open])
-    return np.sort(order[chosen])
+        parts = (incidence[:, left_open], gain[left_open], group[left_open])
+        chosen[left_open], certain = _programmed(*parts, most_branches)
+    return np.sort(order[chosen]), certain
+
+
+def fractions(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+    """How much of each column the best choice takes if it may take parts: whole ones in most windows."""
+    return _solve(_incidence(columns), score)[0] if len(score) else np.zeros(0)
 
 
 def _programmed(
-    incidence: csc_array, gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"]
-) -> Bool[np.ndarray, "C"]:
+    incidence: csc_array, gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"], most_branches: int | None
+) -> tuple[Bool[np.ndarray, "C"], bool]:
     """Linear first: it is integral in most windows; integers only for the groups where it is not."""
-    solution = _solve(incidence, gain, integral=False)
+    solution, certain = _solve(incidence, gain)
     broken = np.unique(group[np.abs(solution - solution.round()) > 1e-6])
     if len(broken):
         again = np.isin(group, broken)
-        solution[again] = _solve(incidence[:, again], gain[again], integral=True)
-    return solution > 0.5
+        options = {} if most_branches is None else {"node_limit": most_branches}
+        solution[again], certain = _solve(incidence[:, again], gain[again], integral=True, **options)
+    return solution > 0.5, certain
 
 
-def _solve(incidence: csc_array, gain: Float[np.ndarray, "C"], integral: bool) -> Float[np.ndarray, "C"]:
-    """How much of each column the best choice takes: whole ones if `integral`."""
+def _solve(
+    incidence: csc_array, gain: Float[np.ndarray, "C"], integral: bool = False, **options: int
+) -> tuple[Float[np.ndarray, "C"], bool]:
+    """How much of each column the best choice takes, whole ones if `integral`; and whether it is certainly the best."""
+    # Presolving costs more than it saves where the linear programme is the whole work.
+    settings: Any = {"mip_rel_gap": 0.0, "presolve": integral, **options}
     solved = milp(
         -gain,
         constraints=LinearConstraint(incidence, ub=1.0),
         integrality=np.full(len(gain), int(integral)),
         bounds=Bounds(0.0, 1.0),
-        # Presolving costs more than it saves where the linear programme is the whole work.
-        options={"mip_rel_gap": 0.0, "presolve": integral},
+        options=settings,
     )
-    if solved.x is None:
+    if solved.x is None and not options:
         raise RuntimeError(f"HiGHS chose none of {len(gain)} columns: {solved.message}")
-    return solved.x
+    return (np.zeros(len(gain)) if solved.x is None else solved.x), bool(solved.success)
 
 
 def _tried(

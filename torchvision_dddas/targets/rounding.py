@@ -1,0 +1,117 @@
+"""Whole triplets from prices: a choice that shares no target, and better ones nearby."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from torchvision_dddas.targets.columns import fractions, good_columns
+from torchvision_dddas.targets.prices import OTHERS, Prices
+
+# Triplets a target that are rounded from, of those that lose least: whole ones, and pairs with each other layer. Pairs
+# apart, since dummies that all score the same would crowd the whole ones out.
+PER_TARGET = np.array([4, 2, 2])
+# Branches of HiGHS in the search for the best choice among those: where all are alike it would not end.
+WHOLE_BRANCHES = 5
+
+
+def gained(gain: Float[np.ndarray, "N1 M1 L1"], chosen: Int[np.ndarray, "C 3"]) -> float:
+    """What a choice of triplets gains."""
+    return float(gain[tuple(chosen.T)].sum())
+
+
+def rounded(
+    gain: Float[np.ndarray, "N1 M1 L1"],
+    nodes: Int[np.ndarray, "C 3"],
+    share: Float[np.ndarray, "C"],
+    prices: Prices,
+    whole: bool,
+) -> Int[np.ndarray, "Z 3"]:
+    """A choice from some triplets `nodes`, each with its share of the answers of a descent.
+
+    Those in every answer are taken. For the rest a linear programme says how much of each triplet to take, and the most
+    goes first. Or, if `whole`, the best choice of all is looked for, for a while.
+    """
+    agreed = nodes[:0] if whole else nodes[share > 1 - 1e-9]
+    uses = np.bincount(agreed[:, 0], minlength=gain.shape[0])
+    agreed = agreed[(agreed[:, 0] == 0) | (uses[agreed[:, 0]] == 1)]
+    nodes = nodes[_free_of(agreed, nodes, gain.shape)]
+    loss = prices[0][nodes[:, 0]] + prices[1][nodes[:, 1]] + prices[2][nodes[:, 2]] - gain[tuple(nodes.T)]
+    # Among ties anyone, but not the first of each target: they would all want the same partners.
+    nodes = nodes[np.argsort(loss + 1e-9 * np.random.default_rng(0).random(len(loss)))]
+    nodes = nodes[_first_of_each_kind(nodes)]
+    worth = gain[tuple(nodes.T)]
+    if whole:
+        return np.concatenate([agreed, nodes[good_columns(nodes - 1, worth, WHOLE_BRANCHES)[0]]])
+    parts = fractions(nodes - 1, worth)
+    used: tuple[set[int], set[int], set[int]] = ({0}, {0}, {0})
+    taken = []
+    for column in np.argsort(-parts, kind="stable").tolist():
+        held = nodes[column].tolist()
+        if parts[column] > 1e-6 and not any(n and n in layer for n, layer in zip(held, used, strict=True)):
+            taken.append(column)
+            for node, layer in zip(held, used, strict=True):
+                layer.add(node)
+    return np.concatenate([agreed, nodes[taken]])
+
+
+def improved(gain: Float[np.ndarray, "N1 M1 L1"], chosen: Int[np.ndarray, "C 3"]) -> Int[np.ndarray, "Z 3"]:
+    """A choice that no new assignment of one layer's targets to what is left of the triplets makes better."""
+    value, idle, layer = gained(gain, chosen), 0, 0
+    while idle < 3:
+        other = reassigned(gain, chosen[:, OTHERS[layer]], layer)
+        if gained(gain, other) > value + 1e-9:
+            chosen, value, idle = other, gained(gain, other), 0
+        else:
+            idle += 1
+        layer = (layer + 1) % 3
+    return chosen
+
+
+def reassigned(
+    gain: Float[np.ndarray, "N1 M1 L1"], pairs: Int[np.ndarray, "P 2"], layer: int
+) -> Int[np.ndarray, "Z 3"]:
+    """The best choice of triplets that holds these pairs of the other two layers, or their targets alone."""
+    pairs = pairs[(pairs > 0).all(axis=1)]
+    rows = []
+    for side, other in enumerate(OTHERS[layer]):
+        single = np.ones(gain.shape[other], bool)
+        single[pairs[:, side]] = False
+        rest = np.zeros((int(single[1:].sum()), 2), np.int64)
+        rest[:, side] = np.flatnonzero(single[1:]) + 1
+        rows.append(rest)
+    group = np.insert(np.concatenate([pairs, *rows]), layer, 0, axis=1)
+    where = list(group.T)
+    where[layer] = np.arange(gain.shape[layer])[:, None]
+    worth = gain[tuple(where)]
+    without = np.maximum(worth[0], 0.0)
+    target, place = linear_sum_assignment(np.maximum(worth[1:] - without, 0.0), maximize=True)
+    better = worth[1 + target, place] > without[place]
+    group[place[better], layer] = target[better] + 1
+    return group[gain[tuple(group.T)] > 0]
+
+
+def _free_of(
+    taken: Int[np.ndarray, "Z 3"], nodes: Int[np.ndarray, "C 3"], shape: tuple[int, ...]
+) -> Bool[np.ndarray, "C"]:
+    """Which triplets share no target with those taken."""
+    free = np.ones(len(nodes), bool)
+    for layer, size in enumerate(shape):
+        held = np.zeros(size, bool)
+        held[taken[:, layer]] = True
+        held[0] = False
+        free &= ~held[nodes[:, layer]]
+    return free
+
+
+def _first_of_each_kind(nodes: Int[np.ndarray, "C 3"]) -> Bool[np.ndarray, "C"]:
+    """Which triplets are among the first of some target: of its whole ones, or of its pairs with another layer."""
+    wanted = np.zeros(len(nodes), bool)
+    there = nodes > 0
+    for layer, (other, _) in enumerate(OTHERS):
+        kind = np.where(there.all(axis=1), 0, np.where(there[:, other], 1, 2))
+        key = nodes[:, layer] * 3 + kind
+        sorted_ = np.argsort(key, kind="stable")
+        start = np.flatnonzero(np.diff(key[sorted_], prepend=-1))
+        rank = np.arange(len(nodes)) - np.repeat(start, np.diff(start, append=len(nodes)))
+        wanted[sorted_[(rank < PER_TARGET[kind[sorted_]]) & there[sorted_, layer]]] = True
+    return wanted
