@@ -103,6 +103,19 @@ def test_no_gradient_is_nan_where_vectors_are_zero_or_equal():
     assert a.grad.isfinite().all()
 
 
+def test_the_exported_graph_gives_the_same():
+    class Triplets(torch.nn.Module):
+        def forward(self, a, b, c, *known):
+            return affinity.triplets(a, b, c, *known)
+
+    rows = features(dtype=torch.float32)
+    known = masks(*rows)
+    known[1][0, 2] = False
+    graph = torch.export.export(Triplets(), (*rows, *known))
+    assert not any("cdist" in str(node.target) for node in graph.graph.nodes)  # which ONNX has not
+    torch.testing.assert_close(graph.module()(*rows, *known), affinity.triplets(*rows, *known))
+
+
 vectors = st.lists(st.lists(st.floats(0, 1e3), min_size=3, max_size=3), min_size=1, max_size=4)
 
 

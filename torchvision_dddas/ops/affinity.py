@@ -18,7 +18,9 @@ def overlap(
     min + max = a + b and max - min = |a - b|: so both follow from one distance, and no (B, N, M, D) is held.
     """
     total = a.sum(-1)[..., :, None] + b.sum(-1)[..., None, :]
-    apart = torch.cdist(a, b, p=1.0)
+    # ONNX has no L1 distance of all pairs: an exported graph does hold (B, N, M, D).
+    exported = torch.compiler.is_compiling()
+    apart = (a[..., :, None, :] - b[..., None, :, :]).abs().sum(-1) if exported else torch.cdist(a, b, p=1.0)
     return ((total - apart) / 2).clamp(min=0), (total + apart) / 2
 
 
