@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.sinks.beside import Beside, Writer
 from torchvision_dddas.sinks.whole import remove, temporary
 from torchvision_dddas.types import Scene
 
@@ -65,21 +66,11 @@ def caption(picture: np.ndarray, lines: Sequence[tuple[str, tuple[int, int, int]
         cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), 0, size, colour, 1, cv2.LINE_AA)
 
 
-class Writer(Protocol):
-    """What writes pictures into a video file."""
-
-    def write(self, picture: np.ndarray) -> None:
-        """Add a picture, (H, W, 3) uint8 BGR with even H and W."""
-
-    def close(self) -> None:
-        """Finish the file."""
-
-
 class Overlay(Generic[Item]):
     """overlay.mp4: H.264, which browsers play, where PyAV is installed (extra `video`); else OpenCV's mp4v."""
 
     def __init__(self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray]) -> None:
-        """draw: the picture of a scene or followed frame, (H, W, 3) uint8 BGR."""
+        """draw: makes the picture of a scene or followed frame, a new one each time, (H, W, 3) uint8 BGR."""
         self._path = folder / "overlay.mp4"
         self._part = temporary(self._path)
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
@@ -91,9 +82,10 @@ class Overlay(Generic[Item]):
         picture = self._draw(item)
         height, width = picture.shape[:2]
         # Colour is stored for blocks of 2×2 pixels: repeat the last row and column of odd sizes.
-        picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        if height % 2 or width % 2:
+            picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         if self._writer is None:
-            self._writer = open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0]))
+            self._writer = Beside(open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0])))
         self._writer.write(picture)
 
     def close(self, complete: bool) -> None:
@@ -135,8 +127,9 @@ class _H264:
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.thread_count = 2  # memory that does not depend on the machine's cores
-        # No look-ahead: it would hold tens of frames in memory.
-        self._stream.options = {"preset": "veryfast", "tune": "zerolatency", "crf": "22"}
+        # No look-ahead: it would hold tens of frames in memory. The preset: 3.1 ms of processor time a frame at 768x576
+        # instead of `veryfast`'s 7.5, for a file 1.5 times the size.
+        self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "22"}
 
     def write(self, picture: np.ndarray) -> None:
         # OpenCV's conversion is as quick as FFmpeg's and needs no second copy of the picture in colour.
