@@ -42,8 +42,7 @@ def test_every_picture_is_in_the_film_in_order_once_it_is_closed():
 def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
     beside = Beside(Film(bad=(0,)))
     with pytest.raises(OSError, match="full"):
-        for _ in range(100):
-            beside.write(level(0))
+        list(map(beside.write, [level(0)] * 100))
     film = Film(bad=(1,))
     beside = Beside(film, waiting=5)
     for value in (0, 1):
