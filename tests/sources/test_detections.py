@@ -85,6 +85,8 @@ BAD = [
     ("1,-1,2,3,4,5,high", "score is 'high'"),
     ("1,-1,2,3,-4,5", "width is '-4'; wanted more than 0 pixels"),
     ("1,-1,2,3,4,0", "height is '0'; wanted more than 0 pixels"),
+    ("1,-1,2,-1e12,4,5", "y is '-1e12'; wanted pixels, 1e+09 at most"),
+    ("1,-1,2,3,1e300,5", "width is '1e300'; wanted pixels"),
     ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
     ("-3,-1,2,3,4,5", "frame is '-3'"),
     ("1.5,-1,2,3,4,5", "frame is '1.5'"),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def track(
     clip: Annotated[
         str | None,
-        typer.Argument(metavar="[INPUT]", help="A video file, a folder or glob of images, camera:0 or rtsp://..."),
+        typer.Argument(metavar="INPUT", help="A video file, a folder or glob of images, camera:0 or rtsp://..."),
     ] = None,
     detections: Annotated[
         Path | None,

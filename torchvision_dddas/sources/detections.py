@@ -18,6 +18,9 @@ COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
 LAST_FRAME = 10_000_000
 """A higher frame number is taken for a mistake, such as a time stamp: every frame up to the last is gone through."""
 
+FARTHEST_PX = 1e9
+"""A place or size beyond is no pixel's."""
+
 
 @dataclass(frozen=True)
 class DetectionTable:
@@ -69,7 +72,7 @@ def read_detections(path: str | Path) -> DetectionTable:
     The id and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
     without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
-    below 1 or above LAST_FRAME, a width or height that is not positive.
+    below 1 or above LAST_FRAME, a width or height that is not positive, a place or size beyond FARTHEST_PX.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -135,6 +138,8 @@ def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
             raise InputError(f"{name}, line {line}: frame is '{cell}'; wanted a whole number from 1 to {LAST_FRAME}")
         if column in ("width", "height") and value <= 0:
             raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted more than 0 pixels")
+        if column not in ("frame", "score") and abs(value) > FARTHEST_PX:
+            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted pixels, {FARTHEST_PX:g} at most")
     return [*(value for value in values if value is not None), float(line)]
 
 
