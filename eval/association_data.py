@@ -97,16 +97,17 @@ class Windows:
     dispersions: np.ndarray
 
 
-def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float]) -> Windows:
+def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float], every: int = 1) -> Windows:
     """The windows of `count` frames, one ending at each frame that has its older ones, with any target in it.
 
-    cuts: the dissimilarities at which clusters of locations and of histograms end.
+    cuts: the dissimilarities at which clusters of locations and of histograms end. every: take one
+    window in so many.
     """
     last = max(int(truth.frame.max()), max(truth.seen, default=1))
     rows = {number: truth.rows(number) for number in range(1, last + 1)}
     ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
-    frames = np.array([f for f in ends if truth.seen.issuperset(f) and any(len(rows[t]) for t in f)], int)
-    frames = frames.reshape(-1, count)
+    whole = [f for f in ends if truth.seen.issuperset(f) and any(len(rows[t]) for t in f)]
+    frames = np.array(whole[::every], int).reshape(-1, count)
     centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
     most = max(len(r) for r in rows.values())
     valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]

@@ -75,6 +75,7 @@ def main() -> None:
     parser.add_argument("--study", default=",".join(STUDIES))
     parser.add_argument("--only", default="", help="sequences whose name contains this")
     parser.add_argument("--interval", type=int, default=5)
+    parser.add_argument("--every", type=int, default=1, help="take one in so many of the windows of three frames")
     parser.add_argument("--out", type=Path, help="a folder for plots and figures.json")
     options = parser.parse_args()
     if unknown := set(options.study.split(",")) - set(STUDIES):
@@ -86,10 +87,10 @@ def main() -> None:
     found: Figures = {}
     for study in options.study.split(","):
         print(f"\n## {study}\n", flush=True)
-        run: Callable[[Path, int], Figures] = globals()[f"by_{study}"]
+        run: Callable[[Path, int, int], Figures] = globals()[f"by_{study}"]
         found[study] = {}
         for place in places:
-            found[study][place.name] = run(place, options.interval)
+            found[study][place.name] = run(place, options.interval, options.every)
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "figures.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
@@ -119,10 +120,10 @@ def weights(windows: data.Windows, knobs: PaperKnobs) -> np.ndarray:
     return np.array(found)
 
 
-def _windows(place: Path, count: int, interval: int, pictures: str = "video") -> data.Windows:
+def _windows(place: Path, count: int, interval: int, pictures: str = "video", every: int = 1) -> data.Windows:
     knobs = PaperKnobs()
     truth = data.read(place, pictures)
-    return data.windows(truth, count, interval, (knobs.location_cut, knobs.appearance_cut))
+    return data.windows(truth, count, interval, (knobs.location_cut, knobs.appearance_cut), every)
 
 
 def _words(values: np.ndarray) -> str:
@@ -136,7 +137,7 @@ def _knobs(**values: object) -> PaperKnobs:
 # -- the studies: a sequence -> figures, printed as they come --------------------------------------------------------
 
 
-def by_reference(place: Path, interval: int) -> Figures:
+def by_reference(place: Path, interval: int, _: int) -> Figures:
     """AR_2 of the video, and of single pictures where there are some, beside the reference."""
     known = REFERENCE.get(place.name, {}) if interval == 5 else {}
     gated: list[tuple[str, float | None]] = [("one_dummy", w) for w in (0.0, 0.5, 0.7, 0.8, 1.0, None)]
@@ -163,23 +164,23 @@ def by_reference(place: Path, interval: int) -> Figures:
     return found
 
 
-def by_weight(place: Path, interval: int) -> Figures:
+def by_weight(place: Path, interval: int, every: int) -> Figures:
     """AR_K against the weight, gated and not, and by the rule."""
     print(f"\n{place.name}\n")
-    print("| K | gate | " + " | ".join(f"w = {w:g}" for w in WEIGHTS) + " | by the dispersions |")
-    print("| --- | --- " + "| ---: " * (len(WEIGHTS) + 1) + "|")
+    print("| K | windows | gate | " + " | ".join(f"w = {w:g}" for w in WEIGHTS) + " | by the dispersions |")
+    print("| --- | ---: | --- " + "| ---: " * (len(WEIGHTS) + 1) + "|")
     found: Figures = {}
     for count in (2, 3):
-        windows = _windows(place, count, interval)
+        windows = _windows(place, count, interval, every=every if count == 3 else 1)
         for gate in ("one_dummy", "off"):
             knobs = _knobs(window=count, gate=gate)
             values = [ratios(windows, knobs, weight) for weight in [*WEIGHTS, None]]
-            print(f"| {count} | {gate} | " + " | ".join(map(_words, values)) + " |", flush=True)
+            print(f"| {count} | {len(windows.frames)} | {gate} | " + " | ".join(map(_words, values)) + " |", flush=True)
             found[f"{count} {gate}"] = {"mean": [v.mean() for v in values], "sd": [v.std(ddof=1) for v in values]}
     return found
 
 
-def by_threshold(place: Path, interval: int) -> Figures:
+def by_threshold(place: Path, interval: int, _: int) -> Figures:
     """Mean AR_2 against threshold (rows) × weight (columns)."""
     windows = _windows(place, 2, interval)
     print(f"\n{place.name}, K = 2, mean AR in %\n")
@@ -192,7 +193,7 @@ def by_threshold(place: Path, interval: int) -> Figures:
     return {"mean": table}
 
 
-def by_dispersion(place: Path, interval: int) -> Figures:
+def by_dispersion(place: Path, interval: int, _: int) -> Figures:
     """The dispersions of a window and the weight over time, with AR_2 by that weight and by fixed ones."""
     windows, knobs = _windows(place, 2, interval), _knobs(window=2)
     chosen = weights(windows, knobs)
@@ -224,7 +225,7 @@ def by_dispersion(place: Path, interval: int) -> Figures:
     }
 
 
-def by_cuts(place: Path, interval: int) -> Figures:
+def by_cuts(place: Path, interval: int, _: int) -> Figures:
     """AR_2 by the rule for cuts of the clusters of locations and of histograms, beside the best fixed weight."""
     windows, truth = _windows(place, 2, interval), data.read(place, "video")
     found: Figures = {}
@@ -248,15 +249,12 @@ def by_cuts(place: Path, interval: int) -> Figures:
     return found
 
 
-def by_readings(place: Path, interval: int) -> Figures:
+def by_readings(place: Path, interval: int, every: int) -> Figures:
     """Mean AR_3 in each reading of the gate and of an entry with a dummy."""
-    windows = _windows(place, 3, interval)
+    windows = _windows(place, 3, interval, every=every)
     by_formula = _by_formula(place, windows)
-    print(
-        f"\n{place.name}, K = 3\n\n| gate | dummy | w = 0 | w = 0.5 | w = 0.7 | w = 1 |\n| --- | --- "
-        + "| ---: " * 4
-        + "|"
-    )
+    print(f"\n{place.name}, K = 3, {len(windows.frames)} windows\n")
+    print("| gate | dummy | w = 0 | w = 0.5 | w = 0.7 | w = 1 |\n| --- | --- | ---: | ---: | ---: | ---: |")
     found: Figures = {}
     for gate in ("one_dummy", "every_dummy", "off"):
         for dummy, table in (("zero", windows), ("formula", by_formula)):
