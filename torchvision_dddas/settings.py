@@ -295,7 +295,7 @@ class PaperKnobs(Group):
         12, "targets", 0, 1000, meaning="three frames with no more targets in any are solved exactly, others ..."
     )
     gap: float = knob(
-        0.005, "-", 0, 1, meaning="... by relaxation, to within this share of the bound, or exactly if it cannot be met"
+        0.005, "-", 0, 1, meaning="... by relaxation, to within this share of the bound where that can be had in time"
     )
 
 
