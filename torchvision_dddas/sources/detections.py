@@ -1,6 +1,5 @@
 """Detections from a table: MOTChallenge text of any tool, or the CSV that `dddas detect` writes."""
 
-import csv
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -119,7 +118,7 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
     places = [names.index(column) for column in COLUMNS]
     score = names.index("score") if "score" in names else len(names)
     for number, text in content:
-        cells = next(csv.reader([text]))
+        cells = text.split(",")
         if len(cells) != len(names):
             raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
         yield _row([cells[place].strip() for place in places], [*cells, ""][score].strip(), number, name)
