@@ -107,7 +107,7 @@ def _tried(
         found = None
         if len(columns) <= TRIED_COLUMNS:
             held = [nodes[start[column] : start[column + 1]] for column in columns]
-            found = _least_loss(held, [gains[column] for column in columns], prices)
+            found = least_loss(held, [gains[column] for column in columns], prices, TRIED_STEPS)
         if found is None:
             left_open[columns] = True
         else:
@@ -115,9 +115,12 @@ def _tried(
     return chosen, left_open
 
 
-def _least_loss(held: list[list[int]], gain: list[float], price: list[float]) -> list[int] | None:
-    """The best choice in one group, as places in its list; None if it takes too many steps.
+def least_loss(
+    held: list[list[int]], gain: list[float], price: list[float], steps: int, limit: float = float("inf")
+) -> list[int] | None:
+    """The best choice among some columns that loses less than `limit`, as places in their list; none if there is none.
 
+    held: the nodes of each column; price: of every node by its number. None if it takes more than so many steps.
     The prices of all nodes are more than any choice can gain. A node that stays alone loses its price, a column that is
     taken what its nodes' prices exceed its gain by: depth first, node by node, what loses least is the best choice.
     """
@@ -131,8 +134,7 @@ def _least_loss(held: list[list[int]], gain: list[float], price: list[float]) ->
     for node, mask in bit.items():
         options[mask].append((price[node], mask, -1))
         options[mask].sort()
-    full, steps = (1 << len(bit)) - 1, 0
-    least, best = float("inf"), list[int]()
+    full, least, best = (1 << len(bit)) - 1, limit, list[int]()
     stack: list[tuple[float, int, tuple[int, ...]]] = [(0.0, 0, ())]
     while stack:
         lost, used, taken = stack.pop()
@@ -141,8 +143,8 @@ def _least_loss(held: list[list[int]], gain: list[float], price: list[float]) ->
         if used == full:
             least, best = lost, list(taken)
             continue
-        steps += 1
-        if steps > TRIED_STEPS:
+        steps -= 1
+        if steps < 0:
             return None
         first = ~used & (used + 1)
         for loss, mask, column in reversed(options[first]):

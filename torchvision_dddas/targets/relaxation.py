@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from torchvision_dddas.targets.columns import good_columns
+from torchvision_dddas.targets.columns import good_columns, least_loss
 from torchvision_dddas.targets.descent import Shortlist
 from torchvision_dddas.targets.dummies import checked_scores, gain_over_alone, with_the_rest_alone
 from torchvision_dddas.targets.prices import Prices, best_over, bound, cheap, low_prices, settle
@@ -21,8 +21,11 @@ from torchvision_dddas.targets.rounding import gained, improved, reassigned, rou
 
 # How often prices are lowered and a choice rounded from them before the exact solver is asked.
 TURNS = 3
+DRAWS = 20
 # Triplets a target that the subgradient steps look at, of those that lose least.
 SHORTLIST = 60
+# Steps of the search with those prices before the integer programme: it ends sooner on most windows of 10 targets.
+SEARCHED = 20_000
 # Bound and value closer than this, in units of the largest gain, are the same.
 SAME = 1e-9
 
@@ -44,7 +47,7 @@ class Solution:
 
 
 def triplets(
-    score: Float[np.ndarray, "N1 M1 L1"], gap: float = 0.005, steps: int = 20, most_exact: int | None = 3000
+    score: Float[np.ndarray, "N1 M1 L1"], gap: float = 0.005, steps: int = 20, most_exact: int | None = 4000
 ) -> Solution:
     """The triplets with the largest sum of scores, to within `gap` of it, every real target in exactly one.
 
@@ -68,9 +71,8 @@ def triplets(
         index = index[gain.ravel()[index] > 0]
         if most_exact is None or len(index) <= most_exact:
             nodes = np.stack(np.unravel_index(index, gain.shape), axis=1)
-            branches = None if most_exact is None else most_exact // 10
-            kept, certain = good_columns(nodes - 1, gain.ravel()[index], branches)
-            chosen = max(chosen, nodes[kept], key=lambda choice: gained(gain, choice))
+            better, certain = _best_of(nodes, gain, prices, gained(gain, chosen), most_exact)
+            chosen = max(chosen, better, key=lambda choice: gained(gain, choice))
             if certain:
                 return _solution(tensor, chosen, -np.inf, exact=True)
     return _solution(tensor, chosen, alone + scale * bound(prices), exact=False)
@@ -100,9 +102,36 @@ def _relaxed(
         lowest = min(lowest, here, key=bound)
         if _near_enough(gain, chosen, lowest, gap, alone):
             break
-        other = improved(gain, rounded(gain, shortlist.nodes, share, here, whole=turn == TURNS))
-        chosen = max(chosen, other, key=lambda choice: gained(gain, choice))
+        draws = DRAWS if turn > 1 else 1
+        for other in rounded(gain, shortlist.nodes, share, here, draws):
+            chosen = max(chosen, improved(gain, other), key=lambda choice: gained(gain, choice))
+            if _near_enough(gain, chosen, lowest, gap, alone):
+                break
     return chosen, lowest
+
+
+def _best_of(
+    nodes: Int[np.ndarray, "C 3"],
+    gain: Float[np.ndarray, "N1 M1 L1"],
+    prices: Prices,
+    value: float,
+    most_exact: int | None,
+) -> tuple[Int[np.ndarray, "Z 3"], bool]:
+    """The best choice of these triplets, if it gains more than `value`, and whether that is certain."""
+    worth = gain[tuple(nodes.T)]
+    price = np.concatenate(prices)
+    named = nodes + np.cumsum([0, *gain.shape[:2]])
+    # Targets that none of the triplets holds stay alone, and lose their prices in any case.
+    spare = float(price.sum() - price[np.unique(named[nodes > 0])].sum())
+    held = [
+        [name for name, node in zip(*row, strict=True) if node]
+        for row in zip(named.tolist(), nodes.tolist(), strict=True)
+    ]
+    found = least_loss(held, worth.tolist(), price.tolist(), SEARCHED, price.sum() - value - spare + SAME)
+    if found is not None:
+        return nodes[found], True
+    kept, certain = good_columns(nodes - 1, worth, None if most_exact is None else most_exact // 10)
+    return nodes[kept], certain
 
 
 def _near_enough(

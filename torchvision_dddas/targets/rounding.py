@@ -1,17 +1,19 @@
 """Whole triplets from prices: a choice that shares no target, and better ones nearby."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.targets.columns import fractions, good_columns
+from torchvision_dddas.targets.columns import fractions
 from torchvision_dddas.targets.prices import OTHERS, Prices
 
 # Triplets a target that are rounded from, of those that lose least: whole ones, and pairs with each other layer. Pairs
 # apart, since dummies that all score the same would crowd the whole ones out.
 PER_TARGET = np.array([4, 2, 2])
-# Branches of HiGHS in the search for the best choice among those: where all are alike it would not end.
-WHOLE_BRANCHES = 5
+# How far draws after the first shake what the linear programme says.
+SHAKE = 1.0
 
 
 def gained(gain: Float[np.ndarray, "N1 M1 L1"], chosen: Int[np.ndarray, "C 3"]) -> float:
@@ -24,14 +26,14 @@ def rounded(
     nodes: Int[np.ndarray, "C 3"],
     share: Float[np.ndarray, "C"],
     prices: Prices,
-    whole: bool,
-) -> Int[np.ndarray, "Z 3"]:
-    """A choice from some triplets `nodes`, each with its share of the answers of a descent.
+    draws: int,
+) -> Iterator[Int[np.ndarray, "Z 3"]]:
+    """Choices from some triplets `nodes`, each with its share of the answers of a descent.
 
     Those in every answer are taken. For the rest a linear programme says how much of each triplet to take, and the most
-    goes first. Or, if `whole`, the best choice of all is looked for, for a while.
+    goes first, in several draws.
     """
-    agreed = nodes[:0] if whole else nodes[share > 1 - 1e-9]
+    agreed = nodes[share > 1 - 1e-9]
     uses = np.bincount(agreed[:, 0], minlength=gain.shape[0])
     agreed = agreed[(agreed[:, 0] == 0) | (uses[agreed[:, 0]] == 1)]
     nodes = nodes[_free_of(agreed, nodes, gain.shape)]
@@ -40,18 +42,12 @@ def rounded(
     nodes = nodes[np.argsort(loss + 1e-9 * np.random.default_rng(0).random(len(loss)))]
     nodes = nodes[_first_of_each_kind(nodes)]
     worth = gain[tuple(nodes.T)]
-    if whole:
-        return np.concatenate([agreed, nodes[good_columns(nodes - 1, worth, WHOLE_BRANCHES)[0]]])
     parts = fractions(nodes - 1, worth)
-    used: tuple[set[int], set[int], set[int]] = ({0}, {0}, {0})
-    taken = []
-    for column in np.argsort(-parts, kind="stable").tolist():
-        held = nodes[column].tolist()
-        if parts[column] > 1e-6 and not any(n and n in layer for n, layer in zip(held, used, strict=True)):
-            taken.append(column)
-            for node, layer in zip(held, used, strict=True):
-                layer.add(node)
-    return np.concatenate([agreed, nodes[taken]])
+    random = np.random.default_rng(0)
+    for draw in range(draws):
+        # The first as the programme says, the others shaken: what it takes half of may go either way.
+        order = np.argsort(-(parts + SHAKE * random.random(len(parts)) if draw else parts), kind="stable")
+        yield np.concatenate([agreed, nodes[_first_that_fit(nodes, order[parts[order] > 1e-6])]])
 
 
 def improved(gain: Float[np.ndarray, "N1 M1 L1"], chosen: Int[np.ndarray, "C 3"]) -> Int[np.ndarray, "Z 3"]:
@@ -88,6 +84,18 @@ def reassigned(
     better = worth[1 + target, place] > without[place]
     group[place[better], layer] = target[better] + 1
     return group[gain[tuple(group.T)] > 0]
+
+
+def _first_that_fit(nodes: Int[np.ndarray, "C 3"], order: Int[np.ndarray, "D"]) -> list[int]:
+    """The triplets, in this order, that share no target with one before."""
+    used: tuple[set[int], set[int], set[int]] = (set(), set(), set())
+    taken = []
+    for column, held in zip(order.tolist(), nodes[order].tolist(), strict=True):
+        if not any(node and node in layer for node, layer in zip(held, used, strict=True)):
+            taken.append(column)
+            for node, layer in zip(held, used, strict=True):
+                layer.add(node)
+    return taken
 
 
 def _free_of(
