@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.targets import relaxation
 from torchvision_dddas.targets.assignment import pairs, triplets_exact
 from torchvision_dddas.targets.columns import best_columns
 from torchvision_dddas.targets.prices import best_over, bound, cheap, low_prices, settle, shared_prices
@@ -144,6 +145,26 @@ def test_a_gap_that_the_relaxation_cannot_close_is_closed_by_the_exact_solver():
     open_, closed = triplets(score, most_exact=0), triplets(score)
     assert open_.value == 1.0 and open_.bound == pytest.approx(1.5) and not open_.exact
     assert closed.value == closed.bound == 1.0 and closed.exact
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000))
+def test_searching_by_the_prices_and_branching_find_the_same_value(seed):
+    score = tensor_of(seed, (8, 8, 8)) ** 0.3
+    with pytest.MonkeyPatch.context() as patch:
+        searched = triplets(score, gap=0.0)
+        patch.setattr(relaxation, "SEARCHED", 0)
+        branched = triplets(score, gap=0.0)
+    assert searched.value == pytest.approx(branched.value)
+
+
+def test_an_exact_solver_that_gives_up_leaves_the_gap_certified(monkeypatch):
+    score = np.zeros((2, 2, 2))
+    score[1, 1, 0] = score[1, 0, 1] = score[0, 1, 1] = 1.0
+    monkeypatch.setattr(relaxation, "SEARCHED", 0)
+    monkeypatch.setattr(relaxation, "good_columns", lambda nodes, worth, branches: (np.zeros(0, np.int64), False))
+    solved = triplets(score)
+    assert solved.value == 1.0 and solved.bound == pytest.approx(1.5) and not solved.exact
 
 
 def test_the_order_of_the_targets_does_not_change_the_value():

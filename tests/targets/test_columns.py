@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.targets import columns as columns_module
-from torchvision_dddas.targets.columns import best_columns
+from torchvision_dddas.targets.columns import best_columns, least_loss
 
 
 def tried(columns, score):
@@ -80,6 +80,13 @@ def test_trying_stops_where_it_takes_too_long(monkeypatch):
     expected = score[best_columns(columns, score)].sum()
     monkeypatch.setattr(columns_module, "TRIED_STEPS", 1)
     assert score[best_columns(columns, score)].sum() == pytest.approx(expected)
+
+
+def test_a_search_says_when_nothing_loses_less_and_when_it_did_not_end():
+    held, gain, price = [[0, 1], [1, 2]], [1.0, 1.2], [0.5, 0.7, 0.5]
+    assert least_loss(held, gain, price, steps=100) == [1]
+    assert least_loss(held, gain, price, steps=100, limit=0.5) == []
+    assert least_loss(held, gain, price, steps=0) is None
 
 
 @settings(max_examples=30, deadline=None)
