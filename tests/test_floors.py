@@ -34,6 +34,7 @@ FLOORS: dict[str, set[str]] = {
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "targets.silhouette", "types", "settings", "errors"},
     "vision.onboard_registration": {"cv2", "numpy", "targets.projective", "types", "settings", "errors"},
     "vision.onboard_pixels": {"cv2", "numpy", "targets.projective", "types", "settings", "errors"},
+    "vision.appearance": {"cv2", "numpy"},
     "vision.camera": {"cv2", "numpy", "targets.projective", "types", "settings"},
     "windows": {"settings"},
     "pipeline": {"numpy", "targets", "types", "settings", "vision", "errors"},

@@ -206,6 +206,23 @@ def test_a_frame_that_cannot_be_decoded_keeps_its_rows_and_is_told(dddas, clip, 
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
 
 
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(("size", "grey"), [((1, 1), False), ((90, 3), True), ((101, 67), True), ((8, 8), False)])
+def test_clips_of_any_size_and_colour_can_be_tracked(dddas, table, tmp_path, size, grey, given):
+    folder, rng = tmp_path / "frames", np.random.default_rng(0)
+    folder.mkdir()
+    for k in range(6):
+        shape = size[::-1] if grey else (*size[::-1], 3)
+        image = rng.integers(0, 4095, shape, dtype=np.uint16) if grey else rng.integers(0, 255, shape, dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+    words = ("--detections", table()) if given else ()
+    result = dddas("track", folder, *words, "--out", tmp_path / "out", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+    assert record(tmp_path / "out")["frames"]["written"] == 6
+    assert (tmp_path / "out/tracks.csv").read_text().count("\n") >= 1 + 5 * given
+    assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 6
+
+
 def test_a_clip_cut_short_ends_with_a_note_and_keeps_the_rows_after_it(dddas, table, tmp_path):
     """A Matroska file does not count its frames: what it announces is no reason to refuse a table."""
     path = tmp_path / "clip.mkv"
