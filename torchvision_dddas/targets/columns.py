@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from torchvision_dddas.errors import InputError
@@ -180,9 +180,10 @@ def _incidence(columns: Int[np.ndarray, "C 3"]) -> csc_array:
 def _groups(incidence: csc_array) -> Int[np.ndarray, "C"]:
     """The number of the group of each column; columns that share a node share their group."""
     height, width = incidence.shape
-    row = np.repeat(np.arange(width) + height, np.diff(incidence.indptr))
-    graph = csc_array((np.ones(len(row)), (row, incidence.indices)), shape=(height + width, height + width))
-    return connected_components(graph, directed=False)[1][height:]
+    # One graph of columns and nodes; the nodes' own rows are empty.
+    start = np.concatenate([incidence.indptr, np.full(height, incidence.nnz)])
+    graph = csr_array((incidence.data, incidence.indices + width, start), shape=(width + height, width + height))
+    return connected_components(graph, directed=False)[1][:width]
 
 
 def _checked(
