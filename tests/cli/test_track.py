@@ -269,7 +269,7 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, table, tmp_path):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
     )  # fmt: skip
     assert process.stdout is not None
-    assert process.stdout.readline() == "now\n"
+    assert process.stdout.readline() == "now\n", process.communicate(timeout=30)[1]
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=30)
     assert process.returncode == 130

@@ -26,7 +26,7 @@ class Counted:
 @pytest.fixture(scope="module")
 def ground():
     """A large picture of the simulator's ground."""
-    return cv2.resize(render(3, 1, (800, 600)).images[0], (1600, 1200), interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(render(3, 1, (640, 480)).images[0], (1600, 1200), interpolation=cv2.INTER_CUBIC)
 
 
 def seen(ground, ground_from_image, noise=0, size=(640, 480)):
