@@ -23,7 +23,7 @@ from torchvision_dddas.vision.histograms import rgb_histograms
 class Truth:
     """The true boxes of a sequence, a row a box, and the frames whose pictures there are.
 
-    box_px: (R, 4) as the file has them, pixels from 1. histogram: (R, 768) counts, zeros where there is no picture.
+    box_px: (R, 4) as the file has them, pixels from 1. histogram: (R, 768), zeros where there is no picture.
     """
 
     name: str
@@ -43,10 +43,13 @@ def sequences(folder: Path) -> list[Path]:
     return sorted(path.parent.parent for path in folder.glob("*/gt/gt.txt"))
 
 
-def read(place: Path, pictures: str) -> Truth:
-    """Read a sequence. pictures: video, images, or none."""
+def read(place: Path, pictures: str, histograms: str = "channel", ignored: bool = False) -> Truth:
+    """Read a sequence. pictures: video or images. histograms: count, or channel, which adds up to 1 in each.
+
+    ignored: with the rows that are marked to be left out.
+    """
     found = read_rows(place / "gt" / "gt.txt", "truth")
-    real = found.mark != 0
+    real = (found.mark != 0) | ignored
     frame, box_px = found.table.frame[real], found.table.box_px[real]
     histogram, seen = np.zeros((len(frame), 768)), set()
     for number, image in _pictures(place, pictures):
@@ -54,8 +57,9 @@ def read(place: Path, pictures: str) -> Truth:
         # MOTChallenge counts pixels from 1.
         histogram[rows] = rgb_histograms(image, box_px[rows] - (1, 1, 0, 0))
         seen.add(number)
-    every = frozenset(seen) if pictures != "none" else frozenset(range(1, int(frame.max()) + 1))
-    return Truth(place.name, frame, found.table.identity[real], box_px, histogram, every)
+    if histograms == "channel":
+        histogram = jaccard.per_channel(histogram)
+    return Truth(place.name, frame, found.table.identity[real], box_px, histogram, frozenset(seen))
 
 
 def has_pictures(place: Path, pictures: str) -> bool:
@@ -69,7 +73,7 @@ def _pictures(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
         while (read_one := video.read())[0]:
             number += 1
             yield number, read_one[1]
-    elif pictures == "images":
+    else:
         for path in _images(place):
             yield int(path.stem), cv2.imread(str(path))
 
@@ -108,7 +112,7 @@ def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float], 
     ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
     whole = [f for f in ends if truth.seen.issuperset(f) and any(len(rows[t]) for t in f)]
     frames = np.array(whole[::every], int).reshape(-1, count)
-    centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
+    centre, shares = jaccard.centres(truth.box_px), truth.histogram
     most = max(len(r) for r in rows.values())
     valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
     parts = []
@@ -130,7 +134,7 @@ def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float], 
 
 def dispersions(truth: Truth, frames: np.ndarray, cuts: tuple[float, float]) -> np.ndarray:
     """(W, K, 2) of the locations and of the histograms of each frame of the windows, at these cuts."""
-    centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
+    centre, shares = jaccard.centres(truth.box_px), truth.histogram
     rows = {number: truth.rows(number) for number in np.unique(frames).tolist()}
     found = {t: (dispersion(centre[rows[t]], cuts[0]), dispersion(shares[rows[t]], cuts[1])) for t in rows}
     return np.array([[found[t] for t in f] for f in frames.tolist()]).reshape(*frames.shape, 2)

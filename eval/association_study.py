@@ -8,7 +8,7 @@ weight      AR_K against the weight of location, K = 2 and 3 (appendix C, Fig. 4
 threshold   AR_2 against threshold × weight (Fig. 6)
 dispersion  the dispersions and the chosen weight over time (Fig. 4b and 5)
 cuts        AR_2 by the dispersions, with clusters that end earlier or later
-readings    AR_3 in every reading of the gate and of the dummy
+readings    AR_K in every reading of the gate, of the dummy and of the histograms
 
 Prints Markdown: mean / standard deviation over the windows, in percent. `--out` gets the plots (extra `report`) and
 figures.json.
@@ -120,9 +120,11 @@ def weights(windows: data.Windows, knobs: PaperKnobs) -> np.ndarray:
     return np.array(found)
 
 
-def _windows(place: Path, count: int, interval: int, pictures: str = "video", every: int = 1) -> data.Windows:
+def _windows(
+    place: Path, count: int, interval: int, pictures: str = "video", every: int = 1, **how: Any
+) -> data.Windows:
     knobs = PaperKnobs()
-    truth = data.read(place, pictures)
+    truth = data.read(place, pictures, **how)
     return data.windows(truth, count, interval, (knobs.location_cut, knobs.appearance_cut), every)
 
 
@@ -156,6 +158,8 @@ def by_reference(place: Path, interval: int, _: int) -> Figures:
 
     video = _windows(place, 2, interval)
     row("video", video, np.arange(len(video.frames)))
+    ignored = _windows(place, 2, interval, ignored=True)
+    row("video, ignored boxes too", ignored, np.arange(len(ignored.frames)))
     if data.has_pictures(place, "images"):
         single = _windows(place, 2, interval, "images")
         if len(single.frames):
@@ -250,24 +254,33 @@ def by_cuts(place: Path, interval: int, _: int) -> Figures:
 
 
 def by_readings(place: Path, interval: int, every: int) -> Figures:
-    """Mean AR_3 in each reading of the gate and of an entry with a dummy."""
-    windows = _windows(place, 3, interval, every=every)
-    by_formula = _by_formula(place, windows)
-    print(f"\n{place.name}, K = 3, {len(windows.frames)} windows\n")
-    print("| gate | dummy | w = 0 | w = 0.5 | w = 0.7 | w = 1 |\n| --- | --- | ---: | ---: | ---: | ---: |")
+    """AR_K in each reading of the gate, of an entry with a dummy and of the histograms."""
+    shares = _windows(place, 3, interval, every=every)
+    tables = {
+        "2, zero, channel": _windows(place, 2, interval),
+        "2, zero, count": _windows(place, 2, interval, histograms="count"),
+        "3, zero, channel": shares,
+        "3, zero, count": _windows(place, 3, interval, every=every, histograms="count"),
+        "3, formula, channel": _by_formula(place, shares),
+    }
+    gates = [("one_dummy", "features"), ("one_dummy", "affinity"), ("every_dummy", "features"), ("off", "features")]
+    print(f"\n{place.name}\n")
+    print("| K, dummy, histogram | windows | gate | gated | w = 0 | w = 0.5 | w = 0.7 | w = 1 |")
+    print("| --- | ---: | --- | --- " + "| ---: " * 4 + "|")
     found: Figures = {}
-    for gate in ("one_dummy", "every_dummy", "off"):
-        for dummy, table in (("zero", windows), ("formula", by_formula)):
-            words = [_words(ratios(table, _knobs(gate=gate), weight)) for weight in (0.0, 0.5, 0.7, 1.0)]
-            print(f"| {gate} | {dummy} | " + " | ".join(words) + " |", flush=True)
-            found[f"{gate} {dummy}"] = words
+    for name, table in tables.items():
+        for gate, gated in gates if "3" in name else [pair for pair in gates if pair[0] != "every_dummy"]:
+            knobs = _knobs(window=int(name[0]), gate=gate, gated=gated)
+            words = [_words(ratios(table, knobs, weight)) for weight in (0.0, 0.5, 0.7, 1.0)]
+            print(f"| {name} | {len(table.frames)} | {gate} | {gated} | " + " | ".join(words) + " |", flush=True)
+            found[f"{name}, {gate}, {gated}"] = words
     return found
 
 
 def _by_formula(place: Path, windows: data.Windows) -> data.Windows:
     """The same windows with eq. 4 and 5 on a dummy of zeros."""
     truth = data.read(place, "video")
-    centre, shares = jaccard.centres(truth.box_px), jaccard.per_channel(truth.histogram)
+    centre, shares = jaccard.centres(truth.box_px), truth.histogram
     location, appearance = (
         [jaccard.triplets(*(feature[truth.rows(t)] for t in f), dummy="formula") for f in windows.frames.tolist()]
         for feature in (centre, shares)
