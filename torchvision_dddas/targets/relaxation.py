@@ -6,7 +6,7 @@
    a choice is rounded from a linear programme over the targets on which the steps do not agree.
 4. If it stays too wide: only triplets that lose no more than the gap can be in a better choice. The exact solver gets
    those, if they are few enough: a search by the prices, then HiGHS. That takes seconds in some windows of 20 to 30
-   targets, where the linear programme is not integral. If they are too many, or it gives up, the gap is reported as it is.
+   targets, where the linear programme is not integral. If they are too many, or it gives up, the gap is told as it is.
 """
 
 from dataclasses import dataclass
