@@ -3,6 +3,7 @@
 Runs in the environment that `make peers` makes, and knows nothing of this package. JOBS: a list of
 {"tracker": name, "settings": {...}, "boxes": file, "interval": D, "length": frames, "out": file or null}; prints the
 list of seconds that each took, reading and writing left out. Every look is one update, also one without boxes.
+`least_score` among the settings is ours: boxes below it are not given.
 """
 
 import functools
@@ -25,14 +26,16 @@ def read(path: str) -> np.ndarray:
 
 
 def run(job: dict) -> float:
+    settings = dict(job["settings"])
     table = read(job["boxes"])
+    table = table[table[:, 6] >= settings.pop("least_score", -np.inf)]
     looks = range(1, job["length"] + 1, job["interval"])
     given = []
     for frame in looks:
         rows = table[table[:, 0] == frame]
         corners = np.c_[rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]]
         given.append(sv.Detections(xyxy=corners, confidence=rows[:, 6]) if len(rows) else sv.Detections.empty())
-    tracker = TRACKERS[job["tracker"]](**job["settings"])
+    tracker = TRACKERS[job["tracker"]](**settings)
     begun = time.perf_counter()
     found = [tracker.update(d) for d in given]
     seconds = time.perf_counter() - begun

@@ -24,11 +24,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import report
 
-from torchvision_dddas.metrics import mot_text, tracking
+from torchvision_dddas.metrics import clear, hota, identity, mot_text, tracking
 from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.clear import count as count_clear
-from torchvision_dddas.metrics.identity import count as count_identity
-from torchvision_dddas.metrics.identity import measures as identity_measures
 from torchvision_dddas.metrics.matching import TrackTable, pair
 from torchvision_dddas.metrics.tracking import TrackCounts
 
@@ -41,51 +38,49 @@ Settings = dict[str, Any]
 # Around each tracker's defaults and towards looser gates, shorter confirmation and longer memory.
 BOXES: dict[str, dict[str, list]] = {
     "SORT": {
-        "minimum_iou_threshold": [0.01, 0.05, 0.1, 0.3],
-        "lost_track_buffer": [3, 10, 30, 90],
-        "minimum_consecutive_frames": [1, 2, 3],
+        "minimum_iou_threshold": [0.01, 0.1, 0.3],
+        "lost_track_buffer": [3, 30],
+        "minimum_consecutive_frames": [1, 3],
     },
     "ByteTrack": {
-        "minimum_iou_threshold": [0.01, 0.05, 0.1, 0.3],
-        "lost_track_buffer": [3, 10, 30, 90],
+        "minimum_iou_threshold": [0.01, 0.1, 0.3],
+        "lost_track_buffer": [3, 30],
         "minimum_consecutive_frames": [1, 2],
     },
     "OC-SORT": {
         "minimum_iou_threshold": [0.01, 0.1, 0.3],
-        "lost_track_buffer": [10, 30, 90],
         "minimum_consecutive_frames": [1, 3],
         "direction_consistency_weight": [0.0, 0.2],
     },
     "norfair": {
         "distance_threshold": [0.7, 0.9, 0.99],
-        "hit_counter_max": [3, 8, 15, 45],
+        "hit_counter_max": [3, 15],
         "initialization_delay": [0, 1],
     },
 }
 DETECTIONS: dict[str, dict[str, list]] = {
     "SORT": {
-        "track_activation_threshold": [0.25, 0.6, 0.8, 0.9],
+        "least_score": [0.0, 0.5, 0.7],
+        "track_activation_threshold": [0.25, 0.9],
         "minimum_iou_threshold": [0.1, 0.3],
-        "lost_track_buffer": [10, 30, 60],
         "minimum_consecutive_frames": [2, 3],
     },
     "ByteTrack": {
-        "track_activation_threshold": [0.7, 0.8, 0.9],
-        "high_conf_det_threshold": [0.5, 0.6, 0.8],
+        "least_score": [0.0, 0.5, 0.7],
+        "track_activation_threshold": [0.7, 0.9],
+        "high_conf_det_threshold": [0.6, 0.8],
         "minimum_iou_threshold": [0.1, 0.2],
-        "lost_track_buffer": [10, 30, 60],
     },
     "OC-SORT": {
         "high_conf_det_threshold": [0.5, 0.6, 0.7, 0.8],
         "minimum_iou_threshold": [0.1, 0.3],
-        "lost_track_buffer": [10, 30, 60],
-        "direction_consistency_weight": [0.0, 0.2],
+        "lost_track_buffer": [30, 60],
     },
     "norfair": {
+        "least_score": [0.0, 0.7],
         "distance_threshold": [0.5, 0.7, 0.9],
-        "hit_counter_max": [8, 15, 30],
-        "initialization_delay": [1, 3, 7],
-        "least_score": [0.0, 0.6, 0.8],
+        "hit_counter_max": [8, 15],
+        "initialization_delay": [1, 3],
     },
 }
 
@@ -144,16 +139,20 @@ def read(data: Path) -> list[Sequence]:
 
 
 def run_peer(
-    peer: str, settings: Settings, files: list[tuple[Path, int]], interval: int, folder: Path
-) -> list[TrackTable]:
-    """Tracks that a peer makes of each file of boxes, (file, frames of its clip)."""
+    peer: str, tried: list[Settings], files: list[tuple[Path, int]], interval: int, folder: Path
+) -> list[list[TrackTable]]:
+    """Tracks that a peer makes under each of its settings of each file of boxes, (file, frames of its clip)."""
     jobs = [
         {"tracker": peer, "settings": settings, "boxes": str(file), "interval": interval, "length": length}
-        | {"out": str(folder / f"{i}.txt")}
+        | {"out": str(folder / f"{k}-{i}.txt")}
+        for k, settings in enumerate(tried)
         for i, (file, length) in enumerate(files)
     ]
     seconds_of(peer, jobs, folder)
-    return [mot_text.read_rows(folder / f"{i}.txt", "tracks").table for i in range(len(files))]
+    return [
+        [mot_text.read_rows(folder / f"{k}-{i}.txt", "tracks").table for i in range(len(files))]
+        for k in range(len(tried))
+    ]
 
 
 def seconds_of(peer: str, jobs: list[dict], folder: Path) -> list[float]:
@@ -189,10 +188,11 @@ def on_boxes(sequences: list[Sequence], peers: list[str]) -> dict:
             folder = Path(place)
             files = [(stripped(s, interval, folder), s.length) for s in chosen]
             for peer in peers:
-                tried = []
-                for settings in [{}, *grid(BOXES[peer])]:
-                    tracks = run_peer(peer, settings, files, interval, folder)
-                    tried.append({"settings": settings, "clips": by_clip(chosen, tracks, interval)})
+                choices = [{}, *grid(BOXES[peer])]
+                tried = [
+                    {"settings": settings, "clips": by_clip(chosen, tracks, interval)}
+                    for settings, tracks in zip(choices, run_peer(peer, choices, files, interval, folder), strict=True)
+                ]
                 rows[f"{peer}, defaults"] = tried[0]
                 rows[f"{peer}, tuned"] = max(tried, key=mean_idf1)
                 say(interval, peer, rows)
@@ -224,8 +224,8 @@ def by_clip(sequences: list[Sequence], tracks: list[TrackTable], interval: int) 
     for sequence, found in zip(sequences, tracks, strict=True):
         assert sequence.truth.tracks is not None
         clip = pair(sequence.truth.tracks.every(interval), found)
-        idf1 = identity_measures(count_identity(clip, SAME))["idf1"]
-        scores[sequence.name] = [count_clear(clip, SAME).switches, 100 * idf1]
+        idf1 = identity.measures(identity.count(clip, SAME))["idf1"]
+        scores[sequence.name] = [clear.count(clip, SAME).switches, 100 * idf1]
     return scores
 
 
@@ -250,9 +250,10 @@ def on_detections(sequences: list[Sequence], peers: list[str]) -> dict:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         for peer in peers:
+            choices = [{}, *grid(DETECTIONS[peer])]
             tried = [
-                {"settings": settings, **pooled(chosen, run_peer(peer, settings, files, 1, folder))}
-                for settings in ({}, *grid(DETECTIONS[peer]))
+                {"settings": settings, **pooled(chosen, tracks)}
+                for settings, tracks in zip(choices, run_peer(peer, choices, files, 1, folder), strict=True)
             ]
             rows[f"{peer}, defaults"], rows[f"{peer}, tuned"] = tried[0], max(tried, key=lambda row: row["hota"])
             for name in (f"{peer}, defaults", f"{peer}, tuned"):
@@ -265,7 +266,8 @@ def pooled(sequences: list[Sequence], tracks: list[TrackTable]) -> dict:
     clips, total = {}, TrackCounts()
     for sequence, found in zip(sequences, tracks, strict=True):
         assert sequence.truth.tracks is not None
-        counts = tracking.count(sequence.truth.tracks, found)
+        clip = pair(sequence.truth.tracks, found)
+        counts = TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip))
         clips[sequence.name] = figures_of(counts)
         total = total.plus(counts)
     return {**figures_of(total), "clips": clips}
