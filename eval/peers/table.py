@@ -60,25 +60,25 @@ BOXES: dict[str, dict[str, list]] = {
 }
 DETECTIONS: dict[str, dict[str, list]] = {
     "SORT": {
-        "least_score": [0.0, 0.5, 0.7],
+        "least_score": [0.0, 0.7, 0.8, 0.9],
         "track_activation_threshold": [0.25, 0.9],
-        "minimum_iou_threshold": [0.1, 0.3],
+        "minimum_iou_threshold": [0.2, 0.3],
         "minimum_consecutive_frames": [2, 3],
     },
     "ByteTrack": {
-        "least_score": [0.0, 0.5, 0.7],
+        "least_score": [0.0, 0.7, 0.8],
         "track_activation_threshold": [0.7, 0.9],
         "high_conf_det_threshold": [0.6, 0.8],
         "minimum_iou_threshold": [0.1, 0.2],
     },
     "OC-SORT": {
-        "high_conf_det_threshold": [0.5, 0.6, 0.7, 0.8],
+        "high_conf_det_threshold": [0.6, 0.7, 0.8, 0.9],
         "minimum_iou_threshold": [0.1, 0.3],
         "lost_track_buffer": [30, 60],
     },
     "norfair": {
-        "least_score": [0.0, 0.7],
-        "distance_threshold": [0.5, 0.7, 0.9],
+        "least_score": [0.0, 0.7, 0.8, 0.9],
+        "distance_threshold": [0.7, 0.9],
         "hit_counter_max": [8, 15],
         "initialization_delay": [1, 3],
     },
