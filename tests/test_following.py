@@ -191,7 +191,6 @@ def test_odd_tables_lose_no_row_and_give_no_identity_twice_in_a_frame(name, mode
             assert (f.tracks.identity > 0).all()
 
 
-@pytest.mark.xfail(reason="the tracker takes a box without pixels for one that looks like nothing before")
 def test_boxes_wholly_outside_the_picture_are_tracked_like_the_others():
     table = table_of(ODD["boxes outside the picture"])
     followed = list(follow_clip(Clip(20), table, load_vision("onboard", SETTINGS), SETTINGS, 1))

@@ -87,7 +87,7 @@ def follow_clip(
 
 def follow_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[Followed]:
     """A table alone: no registration, no appearance. From its first to its last row, frames without rows are empty."""
-    follower = Follower(settings, interval, None, not table.probable)
+    follower = Follower(settings, interval, table.extent, not table.probable)
     first = table.first + -(table.first - 1) % interval
     for number in range(first, table.last + 1, interval) if len(table) else ():
         yield from follower.take(_of(table, number))
@@ -115,7 +115,7 @@ def _unread(table: DetectionTable, number: int) -> Followed:
 class Follower:
     """The tracker, and the frames it was fed that it has not settled yet."""
 
-    def __init__(self, settings: Settings, interval: int, size: tuple[int, int] | None, certain: bool = False) -> None:
+    def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None, certain: bool = False) -> None:
         """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all."""
         self.tracker = _tracker(settings, interval, size)
         self.likeness = _likeness(settings)
@@ -177,7 +177,7 @@ class _Associates(Protocol):
     def end(self) -> list[Tracks]: ...
 
 
-def _tracker(settings: Settings, interval: int, size: tuple[int, int] | None) -> _Associates:
+def _tracker(settings: Settings, interval: int, size: tuple[float, float] | None) -> _Associates:
     if settings.track.mode == "paper":
         from torchvision_dddas.targets.paper import PaperTracker
 

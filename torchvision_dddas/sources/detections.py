@@ -53,6 +53,14 @@ class DetectionTable:
         """Whether the scores can be probabilities: all in [0, 1]. Otherwise every row is as good as certain."""
         return bool(((self.score >= 0) & (self.score <= 1)).all())
 
+    @property
+    def extent(self) -> tuple[float, float] | None:
+        """(width, height) that holds all boxes, the best guess at the picture's size; None without rows."""
+        if not len(self):
+            return None
+        width, height = (self.box_px[:, :2] + self.box_px[:, 2:]).max(axis=0)
+        return float(width), float(height)
+
     def rows(self, frame: int) -> slice:
         """Where the rows of a frame are."""
         return slice(*np.searchsorted(self.frame, [frame, frame + 1]))

@@ -1,79 +1,95 @@
-"""Where a target goes: position and velocity of many targets at once, filtered with constant velocity.
+"""Where a target goes: position, velocity, size and growth of many targets at once, filtered at constant velocity.
 
-A state is a (N, COLUMNS) float64 array, one row a target, in pixels and frames. Its covariance is that of each of the
+The velocity is constant in the world, not in the picture: what comes nearer by a perspective camera grows, and moves
+faster the larger it is. With a growth of γ a frame, after g frames a height h is h / (1 − γ g) and the displacement is
+v g / (1 − γ g), exactly for a straight walk at constant speed towards a pinhole camera, or past a camera that drives.
+
+A state is a (N, COLUMNS) float64 array, one row a target, in pixels and frames. Its variances are those of each of the
 two axes, which are alike and independent, in squares of the target's height: near targets move as far in their own
-heights as distant ones.
+heights as distant ones. Those of the size are of the logarithm of the height.
 """
 
 import numpy as np
 
-X, Y, VX, VY, WIDTH, HEIGHT, PP, PV, VV, SEEN, GROWTH, SS, SG, GG = range(14)
+X, Y, VX, VY, WIDTH, HEIGHT, GROWTH, SEEN = range(8)
+PP, PV, VV = 8, 9, 10  # position, velocity: variances and covariance
+SS, SG, GG = 11, 12, 13  # logarithm of the height, growth
 COLUMNS = 14
-_LOOSE = 0.1  # sd of the logarithm of a height
-_GROW0 = 0.03
-_GROWQ = 0.01
-_NEAR = 0.5
-_POW = 2
+
+USUAL_SPEED = 0.07
+"""Heights a frame at which the noise below is meant; it scales with the speed."""
+_SIZE_SCATTER = 0.1  # sd of a detection's logarithm of the height
+_GROWTH = 0.03  # sd of the growth of a new target, per frame
+_GROWTH_CHANGE = 0.01  # sd of its change in one frame
+_WIDTH_GAIN = 0.5
+_FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: nothing is predicted to come nearer than half its distance
 
 
 def started(box_px: np.ndarray, frame: int, scatter: float, speed: float) -> np.ndarray:
-    """States of targets seen for the first time, at rest. box_px: (N, 4). scatter, speed: sd in heights, heights/frame."""
+    """States of targets seen for the first time, at rest.
+
+    box_px: (N, 4) x, y, width, height. scatter, speed: sd of the centre in heights, and of the velocity per frame.
+    """
     state = np.zeros((len(box_px), COLUMNS))
-    state[:, X] = box_px[:, 0] + box_px[:, 2] / 2
-    state[:, Y] = box_px[:, 1] + box_px[:, 3] / 2
+    state[:, X : Y + 1] = box_px[:, :2] + box_px[:, 2:] / 2
     state[:, WIDTH : HEIGHT + 1] = box_px[:, 2:]
-    state[:, PP], state[:, VV], state[:, SEEN] = scatter**2, speed**2, frame
-    state[:, SS], state[:, GG] = _LOOSE**2, (_GROW0*speed/.07)**2
+    state[:, SEEN] = frame
+    state[:, PP], state[:, VV] = scatter**2, speed**2
+    state[:, SS], state[:, GG] = _SIZE_SCATTER**2, (_GROWTH * speed / USUAL_SPEED) ** 2
     return state
 
 
 def predicted(state: np.ndarray, frame: int, agility: float) -> np.ndarray:
     """The states at a later frame. agility: sd of the change of velocity in one frame, heights/frame."""
-    gap, power = frame - state[:, SEEN], agility**2
+    gap = frame - state[:, SEEN]
     later = state.copy()
-    stretch = 1 / (1 - np.clip(gap * state[:, GROWTH], -1, _NEAR))
-    later[:, X] += gap * state[:, VX] * stretch
-    later[:, Y] += gap * state[:, VY] * stretch
-    later[:, VX : VY + 1] *= (stretch**_POW)[:, None]
+    stretch = 1 / (1 - np.clip(gap * state[:, GROWTH], _FARTHEST, _NEAREST))
+    later[:, X : Y + 1] += (gap * stretch)[:, None] * state[:, VX : VY + 1]
+    later[:, VX : VY + 1] *= (stretch**2)[:, None]
+    later[:, WIDTH : HEIGHT + 1] *= stretch[:, None]
     later[:, GROWTH] *= stretch
-    later[:, PP] += gap * (2 * state[:, PV] + gap * (state[:, VV] + power * gap / 3))
-    later[:, PV] += gap * (state[:, VV] + power * gap / 2)
-    later[:, VV] += power * gap
-    later[:, WIDTH] *= stretch
-    later[:, HEIGHT] *= stretch
-    power = (_GROWQ*agility/.009)**2
-    later[:, SS] += gap * (2 * state[:, SG] + gap * (state[:, GG] + power * gap / 3))
-    later[:, SG] += gap * (state[:, GG] + power * gap / 2)
-    later[:, GG] += power * gap
+    _spread(later, PP, PV, VV, gap, agility**2)
+    _spread(later, SS, SG, GG, gap, (_GROWTH_CHANGE / 0.009 * agility) ** 2)
     return later
 
 
-def updated(later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float, size_gain: float) -> np.ndarray:
+def _spread(later: np.ndarray, place: int, both: int, rate: int, gap: np.ndarray, power: float) -> None:
+    """Let the variances of a value and its rate grow over a gap (N,), the rate being a random walk of this power."""
+    later[:, place] += gap * (2 * later[:, both] + gap * (later[:, rate] + power / 3 * gap))
+    later[:, both] += gap * (later[:, rate] + power / 2 * gap)
+    later[:, rate] += power * gap
+
+
+def updated(later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float) -> np.ndarray:
     """Predicted states corrected by their boxes (N, 4).
 
     The velocity's gain is held to two over the gap: one surprise after a long absence tells little of the speed now.
     """
     gap = np.maximum(frame - later[:, SEEN], 1)
-    gain = later[:, PP] / (later[:, PP] + scatter**2)
-    turn = np.minimum(later[:, PV] / (later[:, PP] + scatter**2), 2 / gap)
-    miss = box_px[:, :2] + box_px[:, 2:] / 2 - later[:, :2]
     new = later.copy()
-    new[:, :2] += gain[:, None] * miss
+    gain, turn = _gains(new, PP, PV, VV, scatter**2, 2 / gap)
+    miss = box_px[:, :2] + box_px[:, 2:] / 2 - later[:, : Y + 1]
+    new[:, : Y + 1] += gain[:, None] * miss
     new[:, VX : VY + 1] += turn[:, None] * miss
-    sgain = later[:, SS] / (later[:, SS] + _LOOSE**2)
-    sturn = later[:, SG] / (later[:, SS] + _LOOSE**2)
-    off = np.log(box_px[:, 3] / later[:, HEIGHT])
-    new[:, HEIGHT] *= np.exp(sgain * off)
-    new[:, WIDTH] += size_gain * (box_px[:, 2] - later[:, WIDTH])
-    new[:, GROWTH] += sturn * off
-    new[:, GG] -= sturn * later[:, SG]
-    new[:, SG] *= 1 - sgain
-    new[:, SS] *= 1 - sgain
-    new[:, VV] -= turn * later[:, PV]
-    new[:, PV] *= 1 - gain
-    new[:, PP] *= 1 - gain
+    gain, turn = _gains(new, SS, SG, GG, _SIZE_SCATTER**2, np.inf)
+    grown = np.log(box_px[:, 3] / later[:, HEIGHT])
+    new[:, HEIGHT] *= np.exp(gain * grown)
+    new[:, GROWTH] += turn * grown
+    new[:, WIDTH] += _WIDTH_GAIN * (box_px[:, 2] - later[:, WIDTH])
     new[:, SEEN] = frame
     return new
+
+
+def _gains(
+    new: np.ndarray, place: int, both: int, rate: int, noise: float, most: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gains (N,) of a value and its rate; the variances shrink in place. most: bound of the second gain."""
+    certain = new[:, place] + noise
+    gain, turn = new[:, place] / certain, np.minimum(new[:, both] / certain, most)
+    new[:, rate] -= turn * new[:, both]
+    new[:, both] *= 1 - gain
+    new[:, place] *= 1 - gain
+    return gain, turn
 
 
 def carried(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
@@ -81,14 +97,27 @@ def carried(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
 
     Velocities turn and stretch with the picture around each target, and sizes with its scale there.
     """
-    h = now_from_before
-    point = state[:, :2] @ h[:2, :2].T + h[:2, 2]
-    depth = (state[:, :2] @ h[2, :2] + h[2, 2])[:, None]
-    place = point / depth
-    # The derivative of the homography at each target.
-    turn = (h[None, :2, :2] - place[:, :, None] * h[2, :2]) / depth[:, :, None]
+    place, turn = _mapped(state[:, : Y + 1], now_from_before)
     new = state.copy()
-    new[:, :2] = place
+    new[:, : Y + 1] = place
     new[:, VX : VY + 1] = np.einsum("nij,nj->ni", turn, state[:, VX : VY + 1])
-    new[:, WIDTH : HEIGHT + 1] *= np.sqrt(np.abs(np.linalg.det(turn)))[:, None]
+    new[:, WIDTH : HEIGHT + 1] *= _scale(turn)
     return new
+
+
+def carried_boxes(box_px: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
+    """The same for boxes (N, 4): the centre moves, the sides stretch by the scale there and stay upright."""
+    centre, turn = _mapped(box_px[:, :2] + box_px[:, 2:] / 2, now_from_before)
+    size = box_px[:, 2:] * _scale(turn)
+    return np.concatenate([centre - size / 2, size], axis=1)
+
+
+def _mapped(point: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 2) under a homography, and its derivative there, (N, 2, 2)."""
+    depth = (point @ h[2, :2] + h[2, 2])[:, None]
+    place = (point @ h[:2, :2].T + h[:2, 2]) / depth
+    return place, (h[None, :2, :2] - place[:, :, None] * h[2, :2]) / depth[:, :, None]
+
+
+def _scale(turn: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.abs(turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]))[:, None]

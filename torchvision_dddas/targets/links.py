@@ -1,4 +1,8 @@
-"""How well a detection continues a track: the score of a link, a logarithm of odds, 0 where nothing speaks either way."""
+"""How well a detection continues a track: the score of a link, a logarithm of odds, 0 where nothing speaks either way.
+
+Scores of links add up, and a target without a link scores 0: no dummy has to be tuned, and none wins by its number
+(appendix C gives dummies an affinity of their own, and its optimum is then to link nothing).
+"""
 
 from dataclasses import dataclass
 
@@ -6,34 +10,44 @@ import numpy as np
 
 from torchvision_dddas.settings import TrackKnobs
 from torchvision_dddas.targets import kalman
-from torchvision_dddas.targets.kalman import HEIGHT, PP, SEEN, WIDTH, X, Y
+from torchvision_dddas.targets.kalman import HEIGHT, PP, SEEN, SS, USUAL_SPEED, WIDTH, X, Y
 
 _PRIOR = 4.0  # what a detection that continues a track is worth before anything is compared
 _TAIL = 4.0  # freedom of the distance's distribution: people turn and stop more than a normal law allows
-_UPRIGHT = 0.6  # people move less up and down in the picture than across it
-_SIZE_SCATTER = 0.1  # of the logarithm of a height
-_SIZE_CHANGE = 0.4  # heights change as far as targets come nearer
+_UPRIGHT = 0.6  # standing people move less up and down in the picture than across it
+_SIZE_SCATTER = 0.1  # sd of the logarithm of a height
 _WORST_SIZE = 8.0
-_GROWK = 1.0
+_MISSED, _MISSED_FRAMES = 0.5, 5.0  # the price of a gap, and how it grows
 _REST_DRIFT = 0.03  # heights per square root of a frame
 _REST_PRICE = 1.0
+_COME_BACK_AT_BORDER, _LEFT_AT_BORDER = 4.0, 2.0  # a target seen at the border after a gap is more likely another one
+_USUAL_BIRTHS = 0.002  # per detection and frame
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What is known of a look at the scene. speed: of the pace, heights/frame. births: new tracks inside the picture
-    per detection. size: (width, height) of the picture, None if unknown."""
+    """What is known of a look at the scene.
+
+    frame: its number. interval: frames between looks. speed: of the pace, heights/frame. births: targets that begin
+    inside the picture, per detection and frame. doubt: share of detections that are not certain. size: (width, height)
+    of the picture, None if unknown.
+    """
 
     frame: int
     interval: int
     speed: float
-    births: float
-    size: tuple[float, float] | None
+    births: float = 0.0
+    doubt: float = 0.0
+    size: tuple[float, float] | None = None
+
+    def agility(self, knobs: TrackKnobs) -> float:
+        """Sd of the change of velocity in a frame, heights/frame: who is fast turns fast."""
+        return knobs.agility * self.speed / USUAL_SPEED
 
 
 def near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.ndarray:
     """(N,) whether boxes (N, 4) are so close to the picture's border that a target may come or go there."""
-    if size is None or not len(box_px):
+    if size is None:
         return np.zeros(len(box_px), bool)
     x, y, width, height = box_px.T
     margin = 0.15 * height
@@ -47,50 +61,37 @@ def link_scores(
 
     state: (N, kalman.COLUMNS) as last seen. left_at_border: (N,) whether they were seen at the border then.
     """
-    later = kalman.predicted(state, sight.frame, knobs.agility * sight.speed / 0.07)
-    gap = sight.frame - state[:, SEEN]
-    missed = gap > sight.interval
-    centre_x, centre_y = box_px[:, 0] + box_px[:, 2] / 2, box_px[:, 1] + box_px[:, 3] / 2
-    score = _near(later, later[:, PP] + knobs.scatter**2, centre_x, centre_y)
-    score -= _size(later, box_px, np.sqrt(_SIZE_SCATTER**2 + later[:, kalman.SS] * _GROWK))
+    later = kalman.predicted(state, sight.frame, sight.agility(knobs))
+    centre, height = box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 3])
+    score = _closeness(later, later[:, PP] + knobs.scatter**2, centre) - _misfit(later, height, sight.doubt)
+    missed = sight.frame - state[:, SEEN] > sight.interval
     if missed.any():
-        long = np.maximum(gap[missed] - sight.interval, 0)
-        rest = _near(state[missed], knobs.scatter**2 + _REST_DRIFT**2 * gap[missed], centre_x, centre_y)
-        rest -= _size(state[missed], box_px, np.sqrt(_SIZE_SCATTER**2 + state[missed, kalman.SS]*_GROWK)) + _REST_PRICE
-        both = np.maximum(score[missed], rest)
-        both -= (0.5 + 0.5 * np.log1p(long / 5))[:, None]
-        both -= 4.0 * near_border(box_px, sight.size)[None] + 2.0 * left_at_border[missed, None]
-        both -= 2 * max(np.log(max(sight.births, 1e-9) / 0.01), 0.0)
-        score[missed] = both
+        was, gap = state[missed], sight.frame - state[missed, SEEN]
+        # Who was lost may have stood still behind something: that tells where better than any velocity.
+        rest = _closeness(was, knobs.scatter**2 + _REST_DRIFT**2 * gap, centre) - _misfit(was, height, sight.doubt)
+        lost = np.maximum(score[missed], rest - _REST_PRICE)
+        lost -= (_MISSED + 0.5 * np.log1p((gap - sight.interval) / _MISSED_FRAMES))[:, None]
+        lost -= _COME_BACK_AT_BORDER * near_border(box_px, sight.size) + _LEFT_AT_BORDER * left_at_border[missed, None]
+        # Where targets keep appearing out of nowhere, this is one more rather than one come back.
+        lost -= 2 * np.log(max(sight.births / _USUAL_BIRTHS, 1.0))
+        score[missed] = lost
     return score
 
 
-def _near(place: np.ndarray, variance: np.ndarray, centre_x: np.ndarray, centre_y: np.ndarray) -> np.ndarray:
-    """(N, M) logarithm of the density of centres around places with a variance (N,) in squared heights."""
-    across = centre_x - place[:, X : X + 1]
-    along = (centre_y - place[:, Y : Y + 1]) / _UPRIGHT
-    distance = (across**2 + along**2) / (place[:, HEIGHT] ** 2 * variance)[:, None]
-    return _PRIOR - (1 + _TAIL / 2) * np.log1p(distance / _TAIL) - np.log(2 * np.pi * variance * _UPRIGHT)[:, None]
+def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+    """(N, M) logarithm of the density of centres around places, and the prior. variance: (N,) in squared heights."""
+    upright = np.where(place[:, HEIGHT] > place[:, WIDTH], _UPRIGHT, 1.0)
+    unit = (place[:, HEIGHT] ** 2 * variance)[:, None]
+    across = centre_px[:, 0] - place[:, X : X + 1]
+    along = (centre_px[:, 1] - place[:, Y : Y + 1]) / upright[:, None]
+    away = (across * across + along * along) / unit
+    peak = _PRIOR - np.log(2 * np.pi * variance * upright)
+    return peak[:, None] - (1 + _TAIL / 2) * np.log1p(away / _TAIL)
 
 
-def _size(state: np.ndarray, box_px: np.ndarray, scatter: np.ndarray) -> np.ndarray:
-    """(N, M) price of a height other than expected. scatter: (N,) sd of its logarithm."""
-    change = np.log(box_px[:, 3]) - np.log(state[:, HEIGHT : HEIGHT + 1])
-    return np.minimum(0.5 * (change / scatter[:, None]) ** 2, _WORST_SIZE) + np.log(scatter / _SIZE_SCATTER)[:, None]
-
-
-def likeness_scores(likeness: np.ndarray, visible: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
-    """(N, M) what the appearance adds. likeness: (N, M) Bhattacharyya coefficients. visible: (M,) shares of the boxes."""
-    return knobs.appearance_weight * (likeness - knobs.appearance_offset) * np.sqrt(visible)[None]
-
-
-def visible_share(box_px: np.ndarray) -> np.ndarray:
-    """(N,) share of each box that no box nearer to the camera covers; nearer is what stands lower in the picture."""
-    if not len(box_px):
-        return np.zeros(0)
-    low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
-    side = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
-    overlap = np.prod(np.maximum(side, 0), axis=2)
-    nearer = high[None, :, 1] > high[:, None, 1]
-    covered = (overlap * nearer).sum(axis=1) / np.prod(box_px[:, 2:], axis=1)
-    return np.clip(1 - covered, 0.0, 1.0)
+def _misfit(state: np.ndarray, height: np.ndarray, doubt: float) -> np.ndarray:
+    """(N, M) price of a height other than expected. height: (M,) its logarithm."""
+    usual = _SIZE_SCATTER * (1 + 0.5 * doubt)
+    variance = usual**2 + state[:, SS]
+    change = height - np.log(state[:, HEIGHT : HEIGHT + 1])
+    return np.minimum(0.5 * change**2 / variance[:, None], _WORST_SIZE) + 0.5 * np.log(variance / usual**2)[:, None]

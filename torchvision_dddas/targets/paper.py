@@ -124,7 +124,7 @@ def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
 class PaperTracker:
     """The state of a run by the source's association; the same interface as `tracks.Tracker`, and never any delay."""
 
-    def __init__(self, settings: Settings, interval_frames: int, size: tuple[int, int] | None = None) -> None:
+    def __init__(self, settings: Settings, interval_frames: int, size: tuple[float, float] | None = None) -> None:
         """interval_frames, size: not needed here; what is fed is what is associated, in pixels of the picture."""
         self.knobs = settings.paper
         self.window: deque[Look] = deque(maxlen=self.knobs.window)  # newest first
