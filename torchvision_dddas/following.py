@@ -115,7 +115,9 @@ def _unread(table: DetectionTable, number: int) -> Followed:
 class Follower:
     """The tracker, and the frames it was fed that it has not settled yet."""
 
-    def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None, certain: bool = False) -> None:
+    def __init__(
+        self, settings: Settings, interval: int, size: tuple[float, float] | None, certain: bool = False
+    ) -> None:
         """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all."""
         self.tracker = _tracker(settings, interval, size)
         self.likeness = _likeness(settings)
