@@ -19,6 +19,7 @@ from torchvision_dddas.errors import InputError
 # call alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
 TRIED_COLUMNS, TRIED_STEPS = 200, 1000
 PRICE_ROUNDS = 6
+HAND_COLUMNS = 12
 
 
 def best_columns(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Int[np.ndarray, "Z"]:
@@ -43,13 +44,17 @@ def good_columns(
         return np.zeros(0, np.int64), True
     kept = columns[order]
     gain = score[order] / score[order].max()
-    incidence = _incidence(kept)
-    group = _groups(incidence)
-    chosen, left_open = _tried(incidence, gain, group)
+    chosen, left_open = _by_hand(kept, gain)
     certain = True
     if left_open.any():
-        parts = (incidence[:, left_open], gain[left_open], group[left_open])
-        chosen[left_open], certain = _programmed(*parts, most_branches)
+        hard, worth = kept[left_open], gain[left_open]
+        incidence = _incidence(hard)
+        group = _groups(incidence)
+        tried, still = _tried(incidence, worth, group)
+        if still.any():
+            parts = (incidence[:, still], worth[still], group[still])
+            tried[still], certain = _programmed(*parts, most_branches)
+        chosen[left_open] = tried
     return np.sort(order[chosen]), certain
 
 
@@ -89,6 +94,59 @@ def _solve(
     return (np.zeros(len(gain)) if solved.x is None else solved.x), bool(solved.success)
 
 
+def _by_hand(
+    columns: Int[np.ndarray, "C 3"], gain: Float[np.ndarray, "C"]
+) -> tuple[Bool[np.ndarray, "C"], Bool[np.ndarray, "C"]]:
+    """The columns chosen in the smallest groups, and those of larger groups, which are left open.
+
+    Most targets are nearly alone with themselves. For a handful of columns each call of NumPy costs more than this.
+    """
+    chosen, left_open = np.zeros(len(gain), bool), np.zeros(len(gain), bool)
+    gains = gain.tolist()
+    held = [[3 * node + layer for layer, node in enumerate(column) if node >= 0] for column in columns.tolist()]
+    for members in _joined(held):
+        if len(members) > HAND_COLUMNS:
+            left_open[members] = True
+            continue
+        price: dict[int, float] = {}
+        for column in members:
+            share = gains[column] / len(held[column])
+            for node in held[column]:
+                if price.get(node, 0.0) < share:
+                    price[node] = share
+        # Of one node a layer any two columns meet, unless one is a node alone: the best takes all.
+        if len({node % 3 for node in price}) == len(price) and min(len(held[column]) for column in members) > 1:
+            chosen[max(members, key=gains.__getitem__)] = True
+            continue
+        found = least_loss([held[c] for c in members], [gains[c] for c in members], price, TRIED_STEPS)
+        if found is None:
+            left_open[members] = True
+        else:
+            chosen[[members[place] for place in found]] = True
+    return chosen, left_open
+
+
+def _joined(held: list[list[int]]) -> list[list[int]]:
+    """The groups of columns that share nodes, by their places; held: the nodes of each column."""
+    above: dict[int, int] = {}
+
+    def top(node: int) -> int:
+        while (higher := above.setdefault(node, node)) != node:
+            above[node] = above[higher]
+            node = higher
+        return node
+
+    for nodes in held:
+        first = top(nodes[0])
+        for node in nodes[1:]:
+            above[top(node)] = first
+            first = top(first)
+    groups: dict[int, list[int]] = {}
+    for column, nodes in enumerate(held):
+        groups.setdefault(top(nodes[0]), []).append(column)
+    return list(groups.values())
+
+
 def _tried(
     incidence: csc_array, gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"]
 ) -> tuple[Bool[np.ndarray, "C"], Bool[np.ndarray, "C"]]:
@@ -116,7 +174,7 @@ def _tried(
 
 
 def least_loss(
-    held: list[list[int]], gain: list[float], price: list[float], steps: int, limit: float = float("inf")
+    held: list[list[int]], gain: list[float], price: list[float] | dict[int, float], steps: int, limit: float = float("inf")
 ) -> list[int] | None:
     """The best choice among some columns that loses less than `limit`, as places in their list; none if there is none.
 

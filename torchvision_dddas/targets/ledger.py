@@ -39,6 +39,7 @@ class Ledger:
         self.pages: deque[_Page] = deque()
         self.looks = 0
         self.steps: deque[np.ndarray | None] = deque(maxlen=4 * _REMEMBERED)  # to each of the latest looks
+        self.moving = False  # whether the camera ever did
         self.past: dict[int, deque[_Sighting]] = {}
         self.sure: set[int] = set()
         self.counts: dict[int, int] = {}
@@ -55,6 +56,7 @@ class Ledger:
     ) -> None:
         """Add a look: numbers of tracks (N,), their boxes, scores and rows among the frame's detections."""
         self.steps.append(now_from_before)
+        self.moving |= now_from_before is not None
         page = _Page(frame, self.looks)
         self.pages.append(page)
         self.looks += 1
@@ -113,11 +115,15 @@ class Ledger:
         near = [s for s in self.past.get(number, ()) if s.look > self.looks - len(self.steps)]
         if len(near) < 2:
             return seen.box_px
-        boxes = np.array([seen_from(s.box_px, self._step(s.look, seen.look)) for s in near])
+        boxes = np.array([s.box_px for s in near])
+        if self.moving:
+            boxes = np.array([seen_from(s.box_px, self._step(s.look, seen.look)) for s in near])
         return smoothed(boxes, np.array([s.look for s in near], float), seen.look)
 
     def _step(self, there: int, here: int) -> np.ndarray | None:
         """How pixels moved from one look to another; None if the camera stood still between them."""
+        if not self.moving:
+            return None
         low, high = sorted((there, here))
         oldest = self.looks - len(self.steps)
         steps = [s for look in range(low + 1, high + 1) if (s := self.steps[look - oldest]) is not None]

@@ -15,28 +15,28 @@ def plausible(links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def best_links(
-    links: np.ndarray, tracks: np.ndarray, now: np.ndarray, onward: np.ndarray, born: np.ndarray, bridging: np.ndarray
+    value: np.ndarray, tracks: np.ndarray, now: np.ndarray, onward: np.ndarray, born: np.ndarray, bridging: np.ndarray
 ) -> np.ndarray:
-    """The pairs (track, detection), (K, 2), of the disjoint triplets with the largest sum of scores.
+    """(P,) which links belong to the disjoint triplets with the largest sum of scores.
 
-    links: (N, M) from tracks to this look. tracks, now: (P,) those `plausible`. Scores to the L detections of the next
-    look: onward (P, L) of the tracks after these links, born (M, L) of tracks that would begin here, bridging (N, L) of
-    tracks not seen in this look, the (i, k) links that the source's eq. 4 and 5 leave out. Only the first layer is
-    kept: the next look decides its own with its own follower.
+    value, tracks, now: (P,) the plausible links' scores, tracks and detections of this look. Scores to the L detections
+    of the next look: onward (P, L) of the tracks after these links, born (M, L) of tracks that would begin here,
+    bridging (N, L) of tracks not seen in this look, the (i, k) links that the source's eq. 4 and 5 leave out. Only the
+    first layer is kept: the next look decides its own with its own follower.
     """
-    value = links[tracks, now]
     p, k = np.nonzero(onward > 0)
     j, m = np.nonzero(born > 0)
     i, n = np.nonzero(bridging > 0)
-    columns = np.full((len(value) + len(p) + len(j) + len(i), 3), -1)
-    score = np.empty(len(columns))
-    at = np.cumsum([0, len(value), len(p), len(j), len(i)])
-    columns[: at[1], 0], columns[: at[1], 1], score[: at[1]] = tracks, now, value
-    columns[at[1] : at[2]] = np.stack([tracks[p], now[p], k], axis=1)
-    score[at[1] : at[2]] = value[p] + _AHEAD * onward[p, k]
-    columns[at[2] : at[3], 1], columns[at[2] : at[3], 2], score[at[2] : at[3]] = j, m, _AHEAD * born[j, m]
-    columns[at[3] :, 0], columns[at[3] :, 2], score[at[3] :] = i, n, _AHEAD * bridging[i, n]
-    worth = score > 0
-    columns, score = columns[worth], score[worth]
-    chosen = columns[best_columns(columns, score)]
-    return chosen[(chosen[:, 0] >= 0) & (chosen[:, 1] >= 0), :2]
+    ends = np.cumsum([len(value), len(p), len(j), len(i)]).tolist()
+    columns, score = np.full((ends[3], 3), -1), np.empty(ends[3])
+    pair, triplet, late, bridge = (slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
+    columns[pair, 0], columns[pair, 1], score[pair] = tracks, now, value
+    columns[triplet, 0], columns[triplet, 1], columns[triplet, 2] = tracks[p], now[p], k
+    score[triplet] = value[p] + _AHEAD * onward[p, k]
+    columns[late, 1], columns[late, 2], score[late] = j, m, _AHEAD * born[j, m]
+    columns[bridge, 0], columns[bridge, 2], score[bridge] = i, n, _AHEAD * bridging[i, n]
+    best = best_columns(columns, score)
+    chosen = np.zeros(len(value), bool)
+    chosen[best[best < ends[0]]] = True
+    chosen[p[best[(best >= ends[0]) & (best < ends[1])] - ends[0]]] = True
+    return chosen

@@ -32,6 +32,6 @@ class Pace:
         mutual = np.flatnonzero(back[nearest] == np.arange(len(before_px)))
         self.steps.extend(distance[mutual, nearest[mutual]] / (before_px[mutual, 3] * frames))
         if (known := len(self.steps)) >= _LEAST_STEPS:
-            usual = max(1.25 * float(np.percentile(self.steps, 75)), _LEAST_SPEED)
+            usual = max(1.25 * sorted(self.steps)[(3 * known) // 4], _LEAST_SPEED)
             weighted = _PRIOR_STEPS * np.log(self.start) + known * np.log(usual)
             self.speed = float(np.exp(weighted / (_PRIOR_STEPS + known)))

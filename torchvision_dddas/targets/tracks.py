@@ -101,8 +101,14 @@ class Tracker:
         self.seen += len(look.score)
         self.doubtful += int((look.score < 1).sum())
         links = self._scores(self.roster, look, look.box_px)
-        matched = pairs(links) if ahead is None or not len(ahead.row) else self._with_next(links, look, ahead)
-        self._commit(look, matched)
+        tracks, now = plausible(links)
+        followed = self._followed(look, tracks, now)
+        if ahead is not None and len(ahead.row):
+            chosen = self._with_next(links, tracks, now, followed, look, ahead)
+        else:
+            best = pairs(links)
+            chosen = np.isin(tracks * len(look.row) + now, best[:, 0] * len(look.row) + best[:, 1])
+        self._commit(look, tracks[chosen], now[chosen], followed.only(chosen))
         self.before = look
 
     def _sight(self, frame: int) -> Sight:
@@ -118,13 +124,14 @@ class Tracker:
             scores += likeness_scores(roster.signature, look.signature, look.visible, self.knobs)
         return scores
 
-    def _with_next(self, links: np.ndarray, look: _Look, ahead: _Look) -> np.ndarray:
-        """The pairs (track, detection) that are best in view of the next look."""
-        tracks, now = plausible(links)
-        follow, born = self._followed(look, tracks, now), self._begun(look, np.arange(len(look.row)))
-        onward = self._scores(follow.plus(born).plus(self.roster), ahead, ahead.boxes_before())
-        parts = np.split(onward, [len(follow), len(follow) + len(born)])
-        return best_links(links, tracks, now, *parts)
+    def _with_next(
+        self, links: np.ndarray, tracks: np.ndarray, now: np.ndarray, followed: Roster, look: _Look, ahead: _Look
+    ) -> np.ndarray:
+        """(P,) which of the plausible links (tracks, now) are best in view of the next look."""
+        born = self._begun(look, np.arange(len(look.row)))
+        onward = self._scores(followed.plus(born).plus(self.roster), ahead, ahead.boxes_before())
+        parts = np.split(onward, [len(followed), len(followed) + len(born)])
+        return best_links(links[tracks, now], tracks, now, *parts)
 
     def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray) -> Roster:
         """The tracks (K,) after a detection (K,) each."""
@@ -152,12 +159,12 @@ class Tracker:
             np.ones(len(now), np.int64),
         )
 
-    def _commit(self, look: _Look, matched: np.ndarray) -> None:
-        tracks, now = matched[:, 0], matched[:, 1]
+    def _commit(self, look: _Look, tracks: np.ndarray, now: np.ndarray, followed: Roster) -> None:
+        """Write down that these tracks (K,), now `followed`, have these detections (K,), and begin new ones."""
         unmatched = np.ones(len(look.row), bool)
         unmatched[now] = False
         new = np.flatnonzero(unmatched & (look.score >= self.knobs.birth_score))
-        begun, followed = self._begun(look, new), self._followed(look, tracks, now)
+        begun = self._begun(look, new)
         self.begun += len(begun)
         if self.before is not None:
             self.births += int((~begun.at_border).sum())
