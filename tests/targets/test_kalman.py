@@ -130,7 +130,7 @@ def test_a_box_where_it_was_expected_moves_nothing():
 
 def test_a_certain_place_moves_less_than_an_uncertain_one():
     later = kalman.predicted(known(0), 5, AGILITY)
-    box = kalman_boxes(later) + [7.0, 0, 0, 0]
+    box = kalman_boxes(later) + np.array([7, 0, 0, 0])
     moved = [kalman.updated(later, box, 5, scatter)[:, X] - later[:, X] for scatter in (1e-3, 0.06, 1.0)]
     assert (moved[0] > moved[1]).all() and (moved[1] > moved[2]).all() and (moved[2] > 0).all()
     np.testing.assert_allclose(moved[0], 7, rtol=0.01)
@@ -145,7 +145,7 @@ def test_one_surprise_after_a_long_absence_hardly_changes_the_velocity():
     for gap in (1, 40):
         later = kalman.predicted(state, gap, AGILITY)
         later[:, PV] = 0.9 * np.sqrt(later[:, PP] * later[:, VV])
-        box = kalman_boxes(later) + [10.0, 0, 0, 0]
+        box = kalman_boxes(later) + np.array([10, 0, 0, 0])
         turns.append(kalman.updated(later, box, gap, 1e-3)[:, VX] - later[:, VX])
         assert (turns[-1] <= 10 * 2 / gap + 1e-9).all()
     assert (turns[1] < turns[0]).all()

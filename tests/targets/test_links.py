@@ -65,7 +65,7 @@ def test_standing_people_move_less_up_and_down_than_across_and_lying_boxes_do_no
     across, along = scored(moved((30, 0), (0, 30)))
     assert across > along
     lying = np.array([500.0, 300, 80, 32])
-    across, along = scored(lying + [[30.0, 0, 0, 0], [0, 30.0, 0, 0]], track(lying))
+    across, along = scored(lying + np.array([[30, 0, 0, 0], [0, 30, 0, 0]]), track(lying))
     assert across == pytest.approx(along)
 
 
@@ -106,13 +106,13 @@ def test_the_longer_a_target_was_missed_the_less_its_return_is_worth():
 
 def test_who_was_lost_may_have_stood_still_though_it_was_walking():
     """Only after a gap: a target seen in the last look is where its velocity says."""
-    at_rest, onward = moved((0, 0), (160, 0))
+    at_rest, onward, back, half = moved((0, 0), (160, 0), (-120, 0), (40, 0))
     walking = {gap: track(seen=11 - gap, velocity=(8, 0)) for gap in (5, 20)}
     lost, still = scored([at_rest], walking[20])[0], scored([at_rest], track(seen=-9))[0]
     assert lost > 0
     assert still >= lost
-    assert scored([at_rest + [-120.0, 0, 0, 0], onward], walking[20])[0] < 0
-    assert scored([at_rest], walking[5])[0] < 0.5 * scored([at_rest + [40.0, 0, 0, 0]], walking[5])[0]
+    assert scored([back, onward], walking[20])[0] < 0
+    assert scored([at_rest], walking[5])[0] < 0.5 * scored([half], walking[5])[0]
 
 
 def test_the_border_counts_only_for_those_that_were_missed():

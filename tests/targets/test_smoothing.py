@@ -57,7 +57,7 @@ def test_noisy_boxes_come_nearer_to_the_truth_within_a_walk_and_at_its_end():
 
 def test_what_is_far_in_time_counts_for_little():
     looks = np.append(LOOKS, 25.0)
-    box = np.concatenate([walk(LOOKS), walk([25]) + [500.0, 0, 0, 0]])
+    box = np.concatenate([walk(LOOKS), walk([25]) + np.array([500, 0, 0, 0])])
     near = smoothed(walk(LOOKS), LOOKS, 2)
     np.testing.assert_allclose(smoothed(box, looks, 2), near, atol=1e-6)
 

@@ -19,7 +19,7 @@ from torchvision_dddas.errors import InputError
 # call alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
 TRIED_COLUMNS, TRIED_STEPS = 200, 1000
 PRICE_ROUNDS = 6
-HAND_COLUMNS = 12
+HAND_COLUMNS = 30
 
 
 def best_columns(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Int[np.ndarray, "Z"]:

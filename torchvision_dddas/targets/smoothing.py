@@ -1,5 +1,7 @@
 """Where a target was, once its next few boxes are known too."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from torchvision_dddas.targets.kalman import carried_boxes
@@ -13,15 +15,21 @@ def smoothed(box_px: np.ndarray, looks: np.ndarray, at: float) -> np.ndarray:
     looks: (N,) times of the boxes, counted in looks. Weights are Gaussian, so the fit is local; a faint pull to no
     slope decides where the times say nothing of it.
     """
-    since = looks - at
-    weight = np.exp(-0.5 * (since / _WIDTHS) ** 2)
-    total = weight.sum(axis=1, keepdims=True)
-    once = (weight @ since)[:, None]
-    twice = (weight @ (since * since))[:, None] + 1e-3 * _WIDTHS**2
-    place, size = (twice - once * since) * weight / (total * twice - once**2)
+    place, size = _weights(tuple((looks - at).tolist()))
     centre = place @ (box_px[:, :2] + box_px[:, 2:] / 2)
     side = np.exp(size @ np.log(box_px[:, 2:]))
     return np.concatenate([centre - side / 2, side])
+
+
+@lru_cache(maxsize=1024)
+def _weights(since: tuple[float, ...]) -> np.ndarray:
+    """(2, N) what each box counts for the place and for the size; few patterns of times come up again and again."""
+    time = np.array(since)
+    weight = np.exp(-0.5 * (time / _WIDTHS) ** 2)
+    total = weight.sum(axis=1, keepdims=True)
+    once = (weight @ time)[:, None]
+    twice = (weight @ time**2)[:, None] + 1e-3 * _WIDTHS**2
+    return (twice - once * time) * weight / (total * twice - once**2)
 
 
 def between(before_px: np.ndarray, after_px: np.ndarray, part: float) -> np.ndarray:
