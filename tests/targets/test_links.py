@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.targets import kalman
@@ -28,7 +29,7 @@ def track(box: np.ndarray = BOX, seen: int = 6, velocity: tuple[float, float] = 
     return state
 
 
-def scored(boxes: np.ndarray, state: np.ndarray | None = None, sight: Sight = SIGHT, left: bool = False) -> list[float]:
+def scored(boxes: ArrayLike, state: np.ndarray | None = None, sight: Sight = SIGHT, left: bool = False) -> list[float]:
     """The scores of one track's links."""
     state = track() if state is None else state
     return link_scores(state, np.full(len(state), left), np.asarray(boxes), sight, KNOBS)[0].tolist()

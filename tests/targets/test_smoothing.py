@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from torchvision_dddas.targets.kalman import carried_boxes
 from torchvision_dddas.targets.smoothing import between, seen_from, smoothed
@@ -11,7 +12,7 @@ from torchvision_dddas.targets.smoothing import between, seen_from, smoothed
 LOOKS = np.arange(10, dtype=float)
 
 
-def walk(looks: np.ndarray, growth: float = 0.0) -> np.ndarray:
+def walk(looks: ArrayLike, growth: float = 0.0) -> np.ndarray:
     """(N, 4) boxes on a straight line whose sides grow by a factor a look."""
     looks = np.asarray(looks, float)
     height = 80 * np.exp(growth * looks)
@@ -43,7 +44,7 @@ def test_one_box_or_several_at_one_time_are_their_mean():
 
 def test_noisy_boxes_come_nearer_to_the_truth_within_a_walk_and_at_its_end():
     random = np.random.default_rng(4)
-    better = {4: [], 9: []}
+    better: dict[int, list[np.ndarray]] = {4: [], 9: []}
     for _ in range(200):
         noisy = walk(LOOKS)
         noisy += random.normal(0, 4, noisy.shape)
