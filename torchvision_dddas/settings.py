@@ -245,7 +245,7 @@ class TrackKnobs(Group):
         "always", "-", meaning="compare pictures of targets: always, where locations leave a doubt, or never"
     )
     min_score: float = knob(0.7, "-", 0, 1, meaning="detections of a lower score are no part of any track")
-    birth_score: float = knob(0.9, "-", 0, 1, meaning="a detection of at least this score may begin a track")
+    birth_score: float = knob(0.95, "-", 0, 1, meaning="a detection of at least this score may begin a track")
     hits: int = knob(3, "frames", 1, 60, meaning="detections that confirm a track; one of score 1 does so alone")
     smooth: bool = knob(True, "-", meaning="move boxes of a score below 1 to where their track was")
     memory_frames: int = knob(125, "frames", 1, 10_000, meaning="how long a track that is not seen is remembered")

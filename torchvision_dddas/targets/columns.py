@@ -174,7 +174,11 @@ def _tried(
 
 
 def least_loss(
-    held: list[list[int]], gain: list[float], price: list[float] | dict[int, float], steps: int, limit: float = float("inf")
+    held: list[list[int]],
+    gain: list[float],
+    price: list[float] | dict[int, float],
+    steps: int,
+    limit: float = float("inf"),
 ) -> list[int] | None:
     """The best choice among some columns that loses less than `limit`, as places in their list; none if there is none.
 

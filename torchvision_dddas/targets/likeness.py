@@ -4,6 +4,8 @@ import numpy as np
 
 from torchvision_dddas.settings import TrackKnobs
 
+_WORST = -1.0  # light, shadow and turning change a look at once: little of it speaks against a link for long
+
 
 def likeness_scores(
     signature: np.ndarray, other: np.ndarray, other_visible: np.ndarray, knobs: TrackKnobs
@@ -14,7 +16,8 @@ def likeness_scores(
     """
     likeness = np.sqrt(signature) @ np.sqrt(other).T
     known = np.any(signature, axis=1).reshape(-1, 1) & np.any(other, axis=1)
-    return np.where(known, knobs.appearance_weight * (likeness - knobs.appearance_offset) * np.sqrt(other_visible), 0.0)
+    score = knobs.appearance_weight * (likeness - knobs.appearance_offset)
+    return np.where(known, np.maximum(score, _WORST) * np.sqrt(other_visible), 0.0)
 
 
 def blended(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from torchvision_dddas.types import Detections, Tracks
 
 _LEAVING = 15  # frames for which a target is taken to go on as it went
 _ENOUGH = 30  # detections before the rate of births means anything
+_NO_BIRTHS = 10  # detections without a birth, times the interval, that the rate starts from
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,11 @@ class Tracker:
     def _sight(self, frame: int) -> Sight:
         doubt = self.doubtful / max(self.seen, 1)
         # Who misses targets loses tracks and begins new ones for them: such births are no sign of new targets.
-        births = self.births / (self.seen * self.interval * (1 + 2 * doubt)) if self.seen > _ENOUGH else 0.0
+        births = (
+            self.births / ((self.seen + _NO_BIRTHS * self.interval) * self.interval * (1 + 2 * doubt))
+            if self.seen > _ENOUGH
+            else 0.0
+        )
         return Sight(frame, self.interval, self.pace.speed, births, doubt, self.size)
 
     def _scores(self, roster: Roster, look: _Look, box_px: np.ndarray) -> np.ndarray:
