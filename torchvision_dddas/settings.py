@@ -242,7 +242,7 @@ class TrackKnobs(Group):
     )
     look_ahead: bool = knob(True, "-", meaning="decide with the next frame in view (K = 3); false decides at once")
     appearance: Literal["always", "ambiguous", "never"] = knob(
-        "always", "-", meaning="compare pictures of targets: always, where locations leave a doubt, or never"
+        "ambiguous", "-", meaning="compare pictures of targets: always, where locations leave a doubt, or never"
     )
     min_score: float = knob(0.7, "-", 0, 1, meaning="detections of a lower score are no part of any track")
     birth_score: float = knob(0.95, "-", 0, 1, meaning="a detection of at least this score may begin a track")

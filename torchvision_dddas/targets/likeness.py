@@ -4,6 +4,7 @@ import numpy as np
 
 from torchvision_dddas.settings import TrackKnobs
 
+_HOPELESS, _CLOSE = -8.0, 7.0  # links that no look can save, and apart by more than looks can turn
 _WORST = -1.0  # light, shadow and turning change a look at once: little of it speaks against a link for long
 
 
@@ -18,6 +19,23 @@ def likeness_scores(
     known = np.any(signature, axis=1).reshape(-1, 1) & np.any(other, axis=1)
     score = knobs.appearance_weight * (likeness - knobs.appearance_offset)
     return np.where(known, np.maximum(score, _WORST) * np.sqrt(other_visible), 0.0)
+
+
+def in_doubt(links: np.ndarray, signature: np.ndarray) -> bool:
+    """Whether locations leave a doubt that looks may settle, from scores (N, M) without them and histograms (N, D).
+
+    So they do where a track or a detection has two links that looks could exchange, and where a track that might go on
+    here has not been looked at yet.
+    """
+    if not links.size:
+        return False
+    likely = links > _HOPELESS
+    rivals = likely & (links > links.max(axis=1, keepdims=True) - _CLOSE)
+    rivals_of_detections = likely & (links > links.max(axis=0, keepdims=True) - _CLOSE)
+    if (rivals.sum(axis=1) > 1).any() or (rivals_of_detections.sum(axis=0) > 1).any():
+        return True
+    unknown = ~np.any(signature, axis=1) if signature.shape[1] else np.ones(len(links), bool)
+    return bool(likely[unknown].any())
 
 
 def blended(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:

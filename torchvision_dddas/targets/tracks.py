@@ -10,7 +10,7 @@ from torchvision_dddas.targets import kalman
 from torchvision_dddas.targets.assignment import pairs
 from torchvision_dddas.targets.kalman import SEEN, VX, VY, X, Y, carried_boxes
 from torchvision_dddas.targets.ledger import FILLED, Ledger
-from torchvision_dddas.targets.likeness import blended, likeness_scores, visible_share
+from torchvision_dddas.targets.likeness import blended, in_doubt, likeness_scores, visible_share
 from torchvision_dddas.targets.links import Sight, link_scores, near_border
 from torchvision_dddas.targets.lookahead import best_links, plausible
 from torchvision_dddas.targets.pace import Pace
@@ -22,11 +22,11 @@ _ENOUGH = 30  # detections before the rate of births means anything
 _NO_BIRTHS = 10  # detections without a birth, times the interval, that the rate starts from
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Look:
     """A frame and those of its detections that count. row: of the frame's detections. step: now from the look before.
 
-    visible: share of each box. signature: (M, D) histograms, (M, 0) where unknown.
+    visible: share of each box. appearance: gives the (M, D) histograms. signature: these, (M, 0) until asked for.
     """
 
     frame: int
@@ -35,7 +35,14 @@ class _Look:
     row: np.ndarray
     step: np.ndarray | None
     visible: np.ndarray
+    appearance: Callable[[], np.ndarray] | None
     signature: np.ndarray
+
+    def examine(self) -> None:
+        """Look at the picture, once."""
+        if self.appearance is not None and len(self.row):
+            self.signature = self.appearance()[self.row]
+        self.appearance = None
 
     def boxes_before(self) -> np.ndarray:
         """The boxes in the coordinates of the look before."""
@@ -70,13 +77,18 @@ class Tracker:
         """Take the detections of a frame, whose number is above the last one's.
 
         now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
-        appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called only where they are needed.
+        appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, and maybe with
+        the next frame.
         """
         row = np.flatnonzero(detections.score >= self.knobs.min_score)
         box = detections.box_px[row]
-        wanted = appearance is not None and len(row) > 0 and self.knobs.appearance != "never"
-        signature = appearance()[row] if wanted and appearance is not None else np.zeros((len(row), 0), np.float32)
-        look = _Look(frame, box, detections.score[row], row, now_from_before, visible_share(box), signature)
+        look = _Look(
+            *(frame, box, detections.score[row], row, now_from_before, visible_share(box)),
+            appearance=None if self.knobs.appearance == "never" else appearance,
+            signature=np.zeros((len(row), 0), np.float32),
+        )
+        if self.knobs.appearance == "always":
+            look.examine()
         if not self.knobs.look_ahead:
             self._decide(look, None)
         else:
@@ -102,6 +114,11 @@ class Tracker:
         self.seen += len(look.score)
         self.doubtful += int((look.score < 1).sum())
         links = self._scores(self.roster, look, look.box_px)
+        if look.appearance is not None and in_doubt(links, self.roster.signature):
+            look.examine()
+            if ahead is not None:
+                ahead.examine()
+            links = self._scores(self.roster, look, look.box_px)
         tracks, now = plausible(links)
         followed = self._followed(look, tracks, now)
         if ahead is not None and len(ahead.row):
