@@ -7,7 +7,7 @@ from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.likeness import blended, likeness_scores, visible_share
+from torchvision_dddas.targets.likeness import blended, in_doubt, likeness_scores, visible_share
 
 KNOBS = Settings().track
 UNKNOWN = np.zeros(12)
@@ -61,6 +61,35 @@ def test_each_pair_is_scored_by_itself(seed, count, others):
         for j in range(others):
             alone = likeness_scores(one[i : i + 1], other[j : j + 1], visible[j : j + 1], KNOBS)
             assert score[i, j] == pytest.approx(alone[0, 0])
+
+
+CLEAR, RIVALS = [[9.0, -90], [-90, 9.0]], [[9.0, 8.5], [-90, 9.0]]
+
+
+def test_there_is_a_doubt_where_a_track_or_a_detection_has_two_likely_links():
+    known = looks(2)
+    assert not in_doubt(np.array(CLEAR), known)
+    assert in_doubt(np.array(RIVALS), known)
+    assert in_doubt(np.array(RIVALS).T, known)
+
+
+def test_two_links_that_are_both_hopeless_or_far_apart_are_no_doubt():
+    known = looks(1)
+    assert not in_doubt(np.array([[-90.0, -90.0]]), known)
+    assert not in_doubt(np.array([[9.0, -7.0]]), known)
+
+
+def test_there_is_a_doubt_until_a_track_that_may_go_on_has_been_looked_at():
+    known = looks(2)
+    assert in_doubt(np.array(CLEAR), known[:, :0])
+    known[1] = 0
+    assert in_doubt(np.array(CLEAR), known)
+    assert not in_doubt(np.array([[9.0, -90], [-90, -90]]), known)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
+def test_nobody_or_nothing_leaves_no_doubt(shape):
+    assert not in_doubt(np.zeros(shape), looks(shape[0]))
 
 
 def test_a_first_look_is_taken_whole_and_an_unknown_one_changes_nothing():

@@ -78,6 +78,15 @@ def test_a_track_waits_for_the_next_look_where_a_bridge_is_worth_more():
     assert chosen([[1.0]], onward={(0, 0): [-5.0, 1.0]}, ahead=2) == [(0, 0)]
 
 
+def test_a_birth_and_a_bridge_each_count():
+    """A link of little worth is left only if both others together are worth more."""
+    links, onward = [[3.0]], {(0, 0): [-5.0, -5.0]}
+    bridge, birth = [[3.0, -5.0]], [[-5.0, 3.0]]
+    assert chosen(links, onward=onward, bridging=bridge, ahead=2) == [(0, 0)]
+    assert chosen(links, onward=onward, born=birth, ahead=2) == [(0, 0)]
+    assert chosen(links, onward=onward, born=birth, bridging=bridge, ahead=2) == []
+
+
 def test_a_bridge_alone_and_a_birth_alone_are_no_pairs():
     assert chosen(np.zeros((1, 0)), bridging=[[4.0]], ahead=1) == []
     assert chosen(np.zeros((0, 1)), born=[[4.0]], ahead=1) == []

@@ -60,12 +60,14 @@ def test_the_order_of_the_boxes_does_not_matter():
     assert other.speed == pytest.approx(pace.speed)
 
 
-def test_a_target_without_a_partner_is_no_step():
-    """One that came, far from all others, is nobody's nearest and nearest to somebody else's neighbour."""
+@pytest.mark.parametrize("left", [True, False])
+def test_targets_without_a_partner_are_no_steps(left):
+    """Those that left are nobody's nearest, those that came are nearest to none: their distances are no speeds."""
     pace, other = Pace(0.07), Pace(0.07)
     before, now = walkers(0, 0.1), walkers(5, 0.1)
+    strangers = walkers(0, 0.1) - np.array([5000, 0, 0, 0])
     pace.add(before, now, 5)
-    other.add(before, np.concatenate([now, now[:1] - [5000.0, 0, 0, 0]]), 5)
+    other.add(np.concatenate([strangers, before]) if left else before, now if left else np.r_[now, strangers], 5)
     assert other.speed == pytest.approx(pace.speed)
 
 

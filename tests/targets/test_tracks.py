@@ -9,13 +9,16 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.settings import Settings, TrackKnobs, with_knobs
+from torchvision_dddas.targets import tracks
 from torchvision_dddas.targets.kalman import carried_boxes
+from torchvision_dddas.targets.links import Sight, link_scores
 from torchvision_dddas.targets.tracks import Tracker
 from torchvision_dddas.types import Detections, Tracks
 
 SIZE = (1200.0, 800.0)
 HEIGHT = 80.0
+DOUBTFUL = (1 + Settings().track.birth_score) / 2  # may begin a track, but is not certain
 
 
 def boxes(*centres: Sequence[float]) -> np.ndarray:
@@ -106,7 +109,7 @@ def test_each_frame_comes_out_once_in_order_no_later_than_promised(hits, look_ah
 def test_what_has_come_out_is_the_same_whatever_comes_later(seed, stop):
     """So a run online and a batch run agree: nothing is taken back, and nothing depends on what is to come."""
     frames, _ = shuffled(walks(5, 16, 5, seed), seed)
-    rest = [seen(*np.random.default_rng(seed).uniform(100, 700, (4, 2)), score=0.95) for _ in range(16 - stop)]
+    rest = [seen(*np.random.default_rng(seed).uniform(100, 700, (4, 2)), score=DOUBTFUL) for _ in range(16 - stop)]
     one, other = tracker(), tracker()
     for n, (first, second) in enumerate(zip(frames, frames[:stop] + rest, strict=True)):
         out, again = one.feed(1 + 5 * n, first), other.feed(1 + 5 * n, second)
@@ -141,7 +144,7 @@ def test_people_whose_ways_cross_keep_their_identities_at_a_low_frame_rate(seed,
     assert all(len(page) == 6 for page in found)
 
 
-@pytest.mark.parametrize("score", [1.0, 0.95])
+@pytest.mark.parametrize("score", [1.0, DOUBTFUL])
 def test_the_order_of_the_rows_only_renames_the_tracks(score):
     centres = walks(7, 20, 5, 3)
     plain = names(tracked([seen(*c, score=score) for c in centres]))
@@ -166,7 +169,7 @@ def test_a_third_look_tells_two_people_apart_whom_two_looks_confuse(look_ahead):
 def test_identities_begin_at_one_leave_none_out_and_are_per_run():
     for _ in range(2):
         frames = [seen((200, 300))] * 4 + [seen((200, 300), (600, 500, 90), (900, 300))] * 4
-        found = tracked([seen((900, 700), score=0.95), *frames])
+        found = tracked([seen((900, 700), score=DOUBTFUL), *frames])
         assert [sorted(page.identity.tolist()) for page in found] == [[], *[[1]] * 4, *[[1, 2, 3]] * 4]
 
 
@@ -187,7 +190,7 @@ def test_a_poor_detection_is_never_used():
     assert names(tracked(gone)) == [{0: 1}] * 3 + [{}] * 6
 
 
-@pytest.mark.parametrize(("score", "looks", "shown"), [(0.95, 2, 0), (0.95, 3, 3), (1.0, 1, 1)])
+@pytest.mark.parametrize(("score", "looks", "shown"), [(DOUBTFUL, 2, 0), (DOUBTFUL, 3, 3), (1.0, 1, 1)])
 def test_three_detections_confirm_a_track_and_a_certain_one_alone(score, looks, shown):
     frames = [seen()] * 2 + [seen((300, 300), score=score)] * looks + [seen()] * 5
     assert sum(map(len, names(tracked(frames)))) == shown
@@ -195,7 +198,7 @@ def test_three_detections_confirm_a_track_and_a_certain_one_alone(score, looks, 
 
 def test_detections_far_apart_in_time_confirm_nothing():
     """Three false alarms at one place, each after a longer gap than is bridged for who is not confirmed."""
-    frames = ([seen((300, 300), score=0.95)] + [seen()] * 4) * 3
+    frames = ([seen((300, 300), score=DOUBTFUL)] + [seen()] * 4) * 3
     assert not any(names(tracked(frames)))
 
 
@@ -237,6 +240,24 @@ def test_who_walked_out_of_the_picture_is_forgotten_sooner():
     """What appears at the border afterwards is somebody else; without a picture's size nobody can tell."""
     frames = [seen((1060 + 25.0 * n, 300)) for n in range(6)] + [seen()] * 4 + [seen((1150, 300))] * 3
     assert names(tracked(frames))[-1] == {0: 2}
+
+
+def test_who_left_the_picture_is_remembered_for_less_long_than_who_was_lost_inside():
+    """One walks out at the side; one walks there too, but is lost so early that it may as well have turned."""
+    for start, size, remembered in ((1060, SIZE, 0), (500, SIZE, 1), (1060, None, 1)):
+        run = tracker(size=size)
+        for n in range(26):
+            run.feed(1 + 5 * n, seen((start + 25.0 * n, 300)) if n < 6 else seen())
+        assert len(run.roster) == remembered
+
+
+def test_who_was_never_confirmed_is_soon_dropped():
+    run = tracker()
+    for n in range(24):
+        alarm = [(80 + 45 * n, 100)] * (n % 3 == 0)
+        run.feed(1 + 5 * n, seen((600, 600), *alarm, score=[1.0, DOUBTFUL][: 1 + len(alarm)]))
+        assert len(run.roster) <= 3
+        assert len(run.ledger.counts) <= 3
 
 
 def test_one_target_for_ever_keeps_its_identity_and_the_tracker_its_size():
@@ -299,6 +320,26 @@ def test_a_moving_camera_known_by_its_homographies_gives_the_identities_of_one_t
     assert switches(tracked(moved, size=None), people) > 5
 
 
+def test_the_third_look_is_compared_from_where_the_camera_was():
+    """What only three looks tell apart, with a camera that pans and zooms between them."""
+    frames = [seen((80 * n, 300), (120 - 80 * n, 308)) for n in range(4)]
+    for seed in range(5):
+        steps, now_from_first = filmed(4, seed, roughness=1.0)
+        moved = [Detections(carried_boxes(f.box_px, h), f.score) for f, h in zip(frames, now_from_first, strict=True)]
+        assert names(tracked(moved, size=None, steps=steps)) == [{0: 1, 1: 2}] * 4
+
+
+def test_a_camera_that_moves_does_not_pass_for_people_that_run():
+    frames, _ = shuffled(walks(6, 20, 5, 1, speed=3.0))
+    steps, now_from_first = filmed(20, 1, roughness=1.0)
+    standing, moving = tracker(size=None), tracker(size=None)
+    for n, (frame, step, h) in enumerate(zip(frames, steps, now_from_first, strict=True)):
+        standing.feed(1 + 5 * n, frame)
+        moving.feed(1 + 5 * n, Detections(carried_boxes(frame.box_px, h), frame.score), step)
+    assert standing.pace.speed != standing.pace.start
+    assert moving.pace.speed == pytest.approx(standing.pace.speed, rel=1e-6)
+
+
 @pytest.mark.parametrize("factor", [1.25, 0.8])
 def test_a_zoom_alone_is_taken_out_scale_included(factor):
     """Five looks of zooming make people three times as large, or as small; they also walk and are missed once."""
@@ -322,7 +363,8 @@ def test_a_zoom_alone_is_taken_out_scale_included(factor):
 def test_certain_boxes_come_out_exactly_as_given_also_between_doubtful_ones():
     random, centres = np.random.default_rng(0), walks(3, 20, 5, 1)
     frames = [
-        seen(*(c + random.normal(0, 4, c.shape)), score=[1.0, 0.95, 1.0 - n % 2 / 20]) for n, c in enumerate(centres)
+        seen(*(c + random.normal(0, 4, c.shape)), score=[1.0, DOUBTFUL, DOUBTFUL if n % 2 else 1.0])
+        for n, c in enumerate(centres)
     ]
     found = tracked(frames, size=None)
     assert all(len(page) == 3 for page in found)
@@ -340,7 +382,7 @@ def test_doubtful_boxes_come_out_nearer_to_the_truth(moving):
     random, centres = np.random.default_rng(6), walks(5, 40, 1, 4)
     steps, now_from_first = filmed(40, 3, 0.2) if moving else ([None] * 40, [np.eye(3)] * 40)
     truth = [carried_boxes(boxes(*c), h) for c, h in zip(centres, now_from_first, strict=True)]
-    noisy = [Detections(t + random.normal(0, 0.04 * t[:, 3:], t.shape), np.full(len(t), 0.95)) for t in truth]
+    noisy = [Detections(t + random.normal(0, 0.04 * t[:, 3:], t.shape), np.full(len(t), DOUBTFUL)) for t in truth]
     for smooth, better in ((True, True), (False, False)):
         found = tracked(noisy, 1, None, steps=steps, smooth=smooth)
         assert sum(map(len, found)) > 190
@@ -379,6 +421,26 @@ def test_colours_tell_apart_whom_places_confuse(order, look_ahead):
     assert found == [{0: 1, 1: 2}] * 4 + [{0: 1 + order[0], 1: 1 + order[1]}] * 4
 
 
+def test_pictures_are_looked_at_where_places_leave_a_doubt_and_once_at_most():
+    """Two who walk alone until they meet: what the doubts ask for is asked once, and is enough."""
+    asked = [0] * 16
+
+    def looked(n: int) -> Callable[[], np.ndarray]:
+        def look() -> np.ndarray:
+            asked[n] += 1
+            return coloured(3, 7)()
+
+        return look
+
+    frames = [seen((200 + 25 * min(n, 8), 300), (1000 - 72 * min(n, 8), 300)) for n in range(16)]
+    doubts = names(tracked(frames, pictures=[looked(n) for n in range(16)], appearance="ambiguous"))
+    assert max(asked) == 1
+    assert sum(asked[4:6]) == 0 < sum(asked[8:])
+    asked[:] = [0] * 16
+    assert names(tracked(frames, pictures=[looked(n) for n in range(16)], appearance="always")) == doubts
+    assert asked == [1] * 16
+
+
 def test_unknown_colours_say_nothing():
     frames = [seen((300, 300), (340, 300))] * 8
     for colours in ([coloured(-1, -1)] * 8, [coloured(1, 2)] * 4 + [coloured(-1, -1)] * 4):
@@ -400,6 +462,57 @@ def test_colours_belong_to_rows_also_where_some_rows_are_not_used(order):
     frames += [seen((600, 300), (320, 292), (320, 308), score=score)] * 4
     colours = [coloured(3, 3, 7)] * 4 + [coloured(7, *(np.array([3, 7])[[*order]]))] * 4
     assert names(tracked(frames, pictures=colours))[-1] == {1: 1 + order[0], 2: 1 + order[1]}
+
+
+def test_the_first_looks_of_a_target_are_averaged_and_hidden_ones_do_not_count():
+    def speckled(*bins: int) -> Callable[[], np.ndarray]:
+        return lambda: np.array([0.95 * np.eye(12)[0] + 0.05 * np.eye(12)[b] for b in bins], np.float32)
+
+    run = tracker(look_ahead=False, appearance="always")
+    for n, speckle in enumerate((2, 5, 8)):
+        run.feed(1 + 5 * n, seen((300, 300)), None, speckled(speckle))
+    np.testing.assert_allclose(run.roster.signature[0, [2, 5, 8]], 0.05 / 3, rtol=1e-5)
+    before = run.roster.signature[0]
+    for n in range(3, 6):
+        run.feed(1 + 5 * n, seen((300, 300), (300, 330, 140)), None, speckled(11, 4))
+    np.testing.assert_allclose(run.roster.signature[run.roster.number == 0][0], before, atol=1e-6)
+
+
+def spied(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, Sight]]:
+    """What is told to `link_scores` from now on: who was last seen at the border, and the sight."""
+    told = []
+
+    def spy(state: np.ndarray, left: np.ndarray, box_px: np.ndarray, sight: Sight, knobs: TrackKnobs) -> np.ndarray:
+        told.append((left, sight))
+        return link_scores(state, left, box_px, sight, knobs)
+
+    monkeypatch.setattr(tracks, "link_scores", spy)
+    return told
+
+
+@pytest.mark.parametrize("doubtful", [0.0, 0.5, 1.0])
+def test_the_share_of_doubtful_detections_is_known_to_the_scores(monkeypatch, doubtful):
+    told = spied(monkeypatch)
+    tracked([seen((300, 300), (600, 300), score=[DOUBTFUL if doubtful else 1, DOUBTFUL if doubtful > 0.5 else 1])] * 6)
+    assert told[-1][1].doubt == doubtful
+    assert (told[-1][1].interval, told[-1][1].size, told[-1][1].frame) == (5, SIZE, 26)
+
+
+@pytest.mark.parametrize(("x", "size", "births"), [(600, SIZE, True), (20, SIZE, False), (20, None, True)])
+def test_only_targets_that_begin_inside_the_picture_after_the_first_look_count_as_births(monkeypatch, x, size, births):
+    """For those that a look shows at its border it is no wonder, nor for those that were there from the start."""
+    told = spied(monkeypatch)
+    frames = [seen((300, 600), (600, 600)), *[seen((300, 600), (600, 600), (x, 40 + 90 * n)) for n in range(5)]]
+    tracked(frames * 8, size=size)
+    assert (told[-1][1].births > 0) == births
+
+
+def test_who_was_last_seen_at_the_border_is_known_to_the_scores(monkeypatch):
+    told = spied(monkeypatch)
+    for walk in (np.linspace(500, 20, 13), np.linspace(20, 500, 13), [20.0]):
+        told.clear()
+        tracked([*[seen((x, 300)) for x in walk], seen((900, 300))], look_ahead=False)
+        assert told[-1][0].tolist() == [walk[-1] == 20]
 
 
 def test_frames_at_uneven_distances_are_linked_by_their_numbers():
