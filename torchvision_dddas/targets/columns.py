@@ -128,23 +128,23 @@ def _by_hand(
 
 def _joined(held: list[list[int]]) -> list[list[int]]:
     """The groups of columns that share nodes, by their places; held: the nodes of each column."""
-    above: dict[int, int] = {}
-
-    def top(node: int) -> int:
-        while (higher := above.setdefault(node, node)) != node:
-            above[node] = above[higher]
-            node = higher
-        return node
-
-    for nodes in held:
-        first = top(nodes[0])
-        for node in nodes[1:]:
-            above[top(node)] = first
-            first = top(first)
-    groups: dict[int, list[int]] = {}
+    home: dict[int, tuple[list[int], list[int]]] = {}  # of each node: its group's columns and nodes
     for column, nodes in enumerate(held):
-        groups.setdefault(top(nodes[0]), []).append(column)
-    return list(groups.values())
+        mine = home.get(nodes[0])
+        if mine is None:
+            mine = home[nodes[0]] = ([], [nodes[0]])
+        for node in nodes[1:]:
+            other = home.get(node)
+            if other is None:
+                home[node] = mine
+                mine[1].append(node)
+            elif other is not mine:
+                mine[0].extend(other[0])
+                mine[1].extend(other[1])
+                for moved in other[1]:
+                    home[moved] = mine
+        mine[0].append(column)
+    return list({id(group): sorted(group[0]) for group in home.values()}.values())
 
 
 def _tried(

@@ -26,7 +26,7 @@ _NO_BIRTHS = 10  # detections without a birth, times the interval, that the rate
 class _Look:
     """A frame and those of its detections that count. row: of the frame's detections. step: now from the look before.
 
-    visible: share of each box. appearance: gives the (M, D) histograms. signature: these, (M, 0) until asked for.
+    appearance: gives the (M, D) histograms. signature: these, (M, 0) until asked for, and visible: share of each box.
     """
 
     frame: int
@@ -34,14 +34,14 @@ class _Look:
     score: np.ndarray
     row: np.ndarray
     step: np.ndarray | None
-    visible: np.ndarray
     appearance: Callable[[], np.ndarray] | None
     signature: np.ndarray
+    visible: np.ndarray
 
     def examine(self) -> None:
         """Look at the picture, once."""
         if self.appearance is not None and len(self.row):
-            self.signature = self.appearance()[self.row]
+            self.signature, self.visible = self.appearance()[self.row], visible_share(self.box_px)
         self.appearance = None
 
     def boxes_before(self) -> np.ndarray:
@@ -82,11 +82,9 @@ class Tracker:
         """
         row = np.flatnonzero(detections.score >= self.knobs.min_score)
         box = detections.box_px[row]
-        look = _Look(
-            *(frame, box, detections.score[row], row, now_from_before, visible_share(box)),
-            appearance=None if self.knobs.appearance == "never" else appearance,
-            signature=np.zeros((len(row), 0), np.float32),
-        )
+        asked = None if self.knobs.appearance == "never" else appearance
+        unknown = np.zeros((len(row), 0), np.float32), np.ones(len(row))
+        look = _Look(frame, box, detections.score[row], row, now_from_before, asked, *unknown)
         if self.knobs.appearance == "always":
             look.examine()
         if not self.knobs.look_ahead:
