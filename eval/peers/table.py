@@ -3,10 +3,11 @@
 DATA holds MOTChallenge 2015 sequences: NAME/gt/gt.txt, NAME/det/det.txt, an optional NAME/*.mp4. Two studies:
 true boxes at an interval (identities stripped, rows shuffled within a frame; switches and IDF1, matched at an IoU of
 0.9, which only the box itself reaches), and detections at interval 1 (HOTA, MOTA, IDF1, switches, all sequences
-pooled). Each peer runs at its defaults and with thresholds tuned for that very study over GRIDS, on the sequences
-that the figures are of: the peers get every advantage; ours runs as it is. Prints Markdown; --write puts it between
-a file's `peers` marks, --json keeps everything. Few switches say little beside a low IDF1: a tracker that confirms
-late or loses its targets leaves boxes without identity, and those cannot switch.
+pooled). Each peer runs at its defaults and with thresholds tuned for that very study over BOXES or DETECTIONS below, on
+the sequences that the figures are of: the peers get every advantage; ours runs as it is. Prints Markdown, clip by clip;
+--details puts it between a file's `peers` marks, --write the sums and means alone, --json keeps everything. Few
+switches say little beside a low IDF1: a tracker that confirms late or loses its targets leaves boxes without identity,
+and those cannot switch.
 """
 
 import argparse
@@ -103,7 +104,8 @@ def main() -> None:
     parser.add_argument("--studies", default="boxes,detections,speed")
     parser.add_argument("--peers", default=",".join(BOXES), help="those to run; '' for ours alone")
     parser.add_argument("--json", type=Path, help="write all figures here, and keep those in it that are not run")
-    parser.add_argument("--write", type=Path, help="a text file with the peers marks, such as README.md")
+    parser.add_argument("--write", type=Path, help="a text file with the peers marks, such as README.md: a summary")
+    parser.add_argument("--details", type=Path, help="another, such as eval/README.md: every clip and every setting")
     options = parser.parse_args()
     sequences = read(options.data)
     if not sequences:
@@ -123,7 +125,9 @@ def main() -> None:
     text = markdown(figures)
     print(text)
     if options.write:
-        report.put(options.write, "peers", text)
+        report.put(options.write, "peers", summary(figures))
+    if options.details:
+        report.put(options.details, "peers", text)
 
 
 def read(data: Path) -> list[Sequence]:
@@ -322,7 +326,7 @@ def our_seconds(sequence: Sequence) -> float:
 def markdown(figures: dict) -> str:
     lines: list[str] = []
     for interval, rows in figures.get("boxes", {}).items():
-        clips = next(iter(rows.values()))["clips"]
+        clips = first(rows)
         lines += [f"True boxes at an interval of {interval}: switches / IDF1 in percent.", ""]
         lines += ["| tracker | sum / mean | " + " | ".join(clips) + " |", "| --- |" + " ---: |" * (len(clips) + 1)]
         for name, row in rows.items():
@@ -331,6 +335,41 @@ def markdown(figures: dict) -> str:
             mean = f"{total} / {mean_idf1(row):.1f}" if len(row["clips"]) == len(clips) else "–"
             lines.append(f"| {name} | {mean} | " + " | ".join(cells) + " |")
         lines.append("")
+    lines += others(figures)
+    if tuned := settings_of(figures):
+        lines += ["Tuned settings:", "", *tuned]
+    return "\n".join(lines)
+
+
+def summary(figures: dict) -> str:
+    """True boxes of all intervals in one table: all sequences as one, and each that has a clip."""
+    boxes = figures.get("boxes", {})
+    places = [(i, None) for i, rows in boxes.items() if len(first(rows)) > len(first(boxes["15"]))]
+    places += [(i, clip) for clip in first(boxes["15"]) for i in boxes if i != "1"] if boxes else []
+    heads = [f"{clip or f'{len(first(boxes[i]))} sequences'}, {i}" for i, clip in places]
+    lines = ["True boxes at an interval: switches / IDF1 in percent.", ""]
+    lines += ["| tracker | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
+    for name in boxes.get("1", {}):
+        cells = []
+        for interval, clip in places:
+            found = boxes[interval][name]["clips"]
+            if clip is None and len(found) < len(first(boxes[interval])):
+                cells.append("–")
+                continue
+            chosen = list(found.values()) if clip is None else [found[clip]]
+            cells.append(f"{sum(s for s, _ in chosen)} / {np.mean([idf1 for _, idf1 in chosen]):.1f}")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", *others(figures)])
+
+
+def first(rows: dict) -> dict:
+    """The clips of a study: those of its first row."""
+    return next(iter(rows.values()))["clips"]
+
+
+def others(figures: dict) -> list[str]:
+    """Detections and speed."""
+    lines: list[str] = []
     if rows := figures.get("detections", {}):
         lines += [f"Detections of {len(rows['ours']['clips'])} sequences at interval 1, pooled; in percent.", ""]
         lines += ["| tracker | HOTA | DetA | AssA | MOTA | IDF1 | switches |", "| --- |" + " ---: |" * 6]
@@ -341,9 +380,7 @@ def markdown(figures: dict) -> str:
     if figures.get("speed"):
         speeds = ", ".join(f"{name} {round(s, -1):.0f}" for name, s in figures["speed"].items())
         lines += [f"Frames a second on the detections of PETS09-S2L1, one process each, medians: {speeds}.", ""]
-    if tuned := settings_of(figures):
-        lines += ["Tuned settings:", "", *tuned]
-    return "\n".join(lines)
+    return lines
 
 
 def settings_of(figures: dict) -> list[str]:
