@@ -5,7 +5,7 @@ import numpy as np
 from torchvision_dddas.targets.columns import best_columns
 
 _LEAST = -2.0  # a link of a lower score is not made even if the next look speaks for it
-_AHEAD = 0.7  # weight of the next look: at 1, a sharp turn is taken for a change of persons
+_AHEAD = 0.8  # weight of the next look: at 1, a sharp turn is taken for a change of persons
 
 
 def plausible(links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
