@@ -34,6 +34,7 @@ PAPER = ["track.mode=paper"]
 TRACKERS: dict[str, tuple[bool, list[str]]] = {
     "default, with the clip": (True, []),
     "default, boxes alone": (False, []),
+    "default, with the clip, always looking": (True, ["track.appearance=always"]),
     "default, with the clip, deciding at once": (True, ["track.look_ahead=false"]),
     "paper, K = 2": (True, [*PAPER, "paper.window=2"]),
     "paper, K = 2, weight 0.7": (True, [*PAPER, "paper.window=2", "paper.rule=fixed"]),
