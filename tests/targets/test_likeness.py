@@ -33,6 +33,15 @@ def test_the_same_look_scores_best_and_a_mixture_of_two_between_them():
     assert score[0] == pytest.approx(KNOBS.appearance_weight * (1 - KNOBS.appearance_offset))
 
 
+def test_there_is_an_end_to_what_an_unlike_look_says_against_a_link():
+    """Light and turning change a look at once, so a larger weight makes the likes of it count more, not the unlikes."""
+    heavy = with_knobs(Settings(), {"track.appearance_weight": 100}).track
+    apart = np.eye(12)[:2]
+    score, more = (likeness_scores(apart, apart, np.ones(2), knobs) for knobs in (KNOBS, heavy))
+    assert more[0, 0] > score[0, 0]
+    assert more[0, 1] == score[0, 1] < 0
+
+
 def test_what_is_unknown_scores_nothing():
     known = looks(2)
     score = likeness_scores(np.stack([known[0], UNKNOWN]), np.stack([UNKNOWN, known[1]]), np.ones(2), KNOBS)
@@ -63,7 +72,7 @@ def test_each_pair_is_scored_by_itself(seed, count, others):
             assert score[i, j] == pytest.approx(alone[0, 0])
 
 
-CLEAR, RIVALS = [[9.0, -90], [-90, 9.0]], [[9.0, 8.5], [-90, 9.0]]
+CLEAR, RIVALS = [[9.0, -90], [-90, 9.0]], [[9.0, 8.5], [-90, -90]]
 
 
 def test_there_is_a_doubt_where_a_track_or_a_detection_has_two_likely_links():
