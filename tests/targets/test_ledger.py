@@ -199,7 +199,6 @@ def test_what_is_kept_does_not_grow_with_the_length_of_a_run():
     assert sizes[0] == sizes[1]
 
 
-@pytest.mark.xfail(strict=True, reason="only 12 boxes and 48 steps are kept, which no longer surround the box")
 @pytest.mark.parametrize(("hits", "moving"), [(30, False), (60, False), (60, True)])
 def test_many_hits_to_confirm_do_not_spoil_the_smoothing(hits, moving):
     ledger, found, truth = Ledger(hits, True), [], []

@@ -127,7 +127,9 @@ def test_the_border_counts_only_for_those_that_were_missed():
 
 def test_births_count_only_for_those_that_were_missed_and_only_where_there_are_many():
     for seen, matters in ((6, False), (1, True)):
-        score = [scored([BOX], track(seen=seen), replace(SIGHT, births=births))[0] for births in (0.0, 1e-4, 0.05, 0.5)]
+        score = [
+            scored([BOX], track(seen=seen), replace(SIGHT, births=births))[0] for births in (0.0, 1e-4, 0.005, 0.02)
+        ]
         assert score[0] == score[1]
         assert (score[1] > score[2] > score[3]) == matters
         assert (score[1] == score[3]) != matters

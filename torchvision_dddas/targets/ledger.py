@@ -10,13 +10,14 @@ from torchvision_dddas.types import Tracks
 
 FILLED = 2
 """Looks that a gap may last to be filled."""
-_REMEMBERED = 12  # boxes of a track that may still smooth another
+_BEFORE = 8  # boxes of a track before one that is settled that may still smooth it
 
 
 @dataclass
 class _Sighting:
     """A box of a track. look: counted from 0. row: of the frame's detections, -1 for a gap that was filled."""
 
+    frame: int
     look: int
     box_px: np.ndarray
     score: float
@@ -38,7 +39,9 @@ class Ledger:
         self.hits, self.smooth = hits, smooth
         self.pages: deque[_Page] = deque()
         self.looks = 0
-        self.steps: deque[np.ndarray | None] = deque(maxlen=4 * _REMEMBERED)  # to each of the latest looks
+        self.delay = hits - 1 + FILLED  # looks for which a page is held back
+        self.kept = self.delay + _BEFORE
+        self.steps: deque[np.ndarray | None] = deque(maxlen=2 * self.kept)  # to each of the latest looks
         self.moving = False  # whether the camera ever did
         self.past: dict[int, deque[_Sighting]] = {}
         self.sure: set[int] = set()
@@ -61,11 +64,11 @@ class Ledger:
         self.pages.append(page)
         self.looks += 1
         for number, box, certainty, at in zip(tracks.tolist(), box_px, score.tolist(), row.tolist(), strict=True):
-            sighting = _Sighting(page.look, box, certainty, at)
+            sighting = _Sighting(frame, page.look, box, certainty, at)
             self.counts[number] = self.counts.get(number, 0) + 1
             if self.counts[number] >= self.hits or certainty >= 1:
                 self.sure.add(number)
-            past = self.past.setdefault(number, deque(maxlen=_REMEMBERED))
+            past = self.past.setdefault(number, deque(maxlen=self.kept))
             if past and 1 < page.look - past[-1].look <= FILLED + 1:
                 self._fill(number, past[-1], sighting)
             past.append(sighting)
@@ -83,7 +86,7 @@ class Ledger:
     def settle(self, everything: bool = False) -> list[Tracks]:
         """The frames on which no later look has a say; all of them at the end."""
         done = []
-        while self.pages and (everything or len(self.pages) > self.hits - 1 + FILLED):
+        while self.pages and (everything or len(self.pages) > self.delay):
             page = self.pages.popleft()
             sure = [(number, seen) for number, seen in page.tracks.items() if number in self.sure]
             for number, _ in sure:
@@ -103,11 +106,11 @@ class Ledger:
     def _fill(self, number: int, before: _Sighting, after: _Sighting) -> None:
         for page in self.pages:
             if before.look < page.look < after.look:
-                part = (page.look - before.look) / (after.look - before.look)
+                part = (page.frame - before.frame) / (after.frame - before.frame)
                 start = seen_from(before.box_px, self._step(before.look, page.look))
                 end = seen_from(after.box_px, self._step(after.look, page.look))
                 score = before.score + part * (after.score - before.score)
-                page.tracks[number] = _Sighting(page.look, between(start, end, part), score, -1)
+                page.tracks[number] = _Sighting(page.frame, page.look, between(start, end, part), score, -1)
 
     def _box(self, number: int, seen: _Sighting) -> np.ndarray:
         if not self.smooth or seen.score >= 1:

@@ -22,6 +22,7 @@ _REST_DRIFT = 0.03  # heights per square root of a frame
 _REST_PRICE = 1.0
 _COME_BACK_AT_BORDER, _LEFT_AT_BORDER = 4.0, 2.0  # a target seen at the border after a gap is more likely another one
 _USUAL_BIRTHS = 0.002  # per detection and frame
+_MOST_BIRTHS = 6.0  # their price at most: who comes back at once and on the spot is no newcomer, whatever else appears
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def link_scores(
         lost -= (_MISSED + 0.5 * np.log1p((gap - sight.interval) / _MISSED_FRAMES))[:, None]
         lost -= _COME_BACK_AT_BORDER * near_border(box_px, sight.size) + _LEFT_AT_BORDER * left_at_border[missed, None]
         # Where targets keep appearing out of nowhere, this is one more rather than one come back.
-        lost -= 2 * np.log(max(sight.births / _USUAL_BIRTHS, 1.0))
+        lost -= min(2 * np.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
         score[missed] = lost
     return score
 

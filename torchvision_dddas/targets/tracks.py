@@ -112,10 +112,10 @@ class Tracker:
         self.seen += len(look.score)
         self.doubtful += int((look.score < 1).sum())
         links = self._scores(self.roster, look, look.box_px)
-        if look.appearance is not None and in_doubt(links, self.roster.signature):
-            look.examine()
-            if ahead is not None:
-                ahead.examine()
+        unexamined = [near for near in (look, ahead) if near is not None and near.appearance is not None]
+        if unexamined and in_doubt(links, self.roster.signature):
+            for near in unexamined:
+                near.examine()
             links = self._scores(self.roster, look, look.box_px)
         tracks, now = plausible(links)
         followed = self._followed(look, tracks, now)
