@@ -40,6 +40,12 @@ def test_all_histograms_of_a_box_sum_to_one_together_and_none_is_negative():
     assert (found >= 0).all()
 
 
+def test_each_strip_counts_the_same_and_each_channel_of_it():
+    np.testing.assert_allclose(strips(noise(), BOXES[:3]).reshape(3, 3, -1).sum(axis=2), 1 / 3, rtol=1e-5)
+    plain = strips(picture((BOX, RED, RED)), np.array([BOX], float))[0]
+    np.testing.assert_allclose(plain[plain > 0], np.full(9, 1 / 9), rtol=1e-5)
+
+
 def test_the_likeness_of_a_target_to_itself_is_one_and_to_another_colour_less():
     image = picture((BOX, RED, BLUE), ((200, 40, 40, 120), GREEN, BLUE), ((20, 40, 40, 120), RED, BLUE))
     same, other, again = strips(image, np.array([BOX, (200, 40, 40, 120), (20, 40, 40, 120)], float))
@@ -91,6 +97,25 @@ def test_a_target_cut_off_by_the_border_still_looks_like_itself():
     low = strips(image[:130], np.array([BOX], float))[0]
     assert likeness(whole, cut) > 0.98
     assert likeness(whole, low) > 0.98
+
+
+def test_what_the_upper_border_cut_off_is_missing_not_the_legs():
+    """Two strips of three are left: the legs are still compared with legs."""
+    image = picture((BOX, RED, BLUE))
+    whole = strips(image, np.array([BOX], float))[0]
+    headless = strips(image[70:], np.array([(100, -30, 40, 120)], float))[0]
+    assert likeness(whole, headless) > 0.99 * np.sqrt(2 / 3)
+    assert not headless[: SIGNATURE // 3].any()
+
+
+def test_the_middle_of_a_box_stays_the_middle_where_a_side_was_cut_off():
+    image = picture((BOX, GREEN, GREEN))
+    image[40:160, 110:130] = RED
+    whole, half = (
+        strips(image, np.array([BOX], float))[0],
+        strips(image[:, 120:], np.array([(-20, *BOX[1:])], float))[0],
+    )
+    assert likeness(whole, half) > 0.96
 
 
 def test_a_grey_picture_is_one_without_colour():
