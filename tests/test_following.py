@@ -308,3 +308,14 @@ def test_the_simulated_clip_s_own_detections_are_followed_end_to_end(film):
     counts = together(follow_scenes(scenes, settings, 1, (480, 360)), movers_of(film), 0.3)
     assert (counts.max(axis=1) > 5).sum() >= 4
     assert counts[linear_sum_assignment(-counts)].sum() > 0.6 * counts.sum()
+
+
+def test_doubtful_boxes_come_out_smoothed_and_certain_ones_to_the_digit():
+    random = np.random.default_rng(0)
+    rows = [(n, (100 + 5 * n + random.normal(0, 3), 200 + random.normal(0, 3), 40, 100)) for n in range(1, 31)]
+    for score, moved in ((0.97, True), (1.0, False)):
+        followed = list(follow_table(table_of(rows, score), SETTINGS, 1))
+        apart = np.concatenate([f.tracks.box_px - f.detections.box_px[f.tracks.row] for f in followed if len(f.tracks)])
+        assert len(apart) == 30
+        assert (np.abs(apart).max() > 0.5) == moved
+        assert np.concatenate([f.tracks.score for f in followed]).tolist() == [score] * 30

@@ -158,11 +158,11 @@ class Follower:
 
 
 def _as_given(tracks: Tracks, given: Detections) -> Tracks:
-    """The tracks with the boxes and scores that were given, to the digit, where they are detections."""
+    """The tracks with the scores that were given, where they are detections; their boxes may have been smoothed."""
     seen = tracks.row >= 0
-    box_px, score = np.array(tracks.box_px, float), np.array(tracks.score, float)
-    box_px[seen], score[seen] = given.box_px[tracks.row[seen]], given.score[tracks.row[seen]]
-    return replace(tracks, box_px=box_px, score=score)
+    score = np.array(tracks.score, float)
+    score[seen] = given.score[tracks.row[seen]]
+    return replace(tracks, score=score)
 
 
 class _Associates(Protocol):

@@ -1,4 +1,4 @@
-"""What the tracker has decided, held back until no later look can confirm a track in it, fill a gap or move a box."""
+"""What the tracker has decided, held back while the next looks may confirm a track in it, fill a gap or move a box."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -34,9 +34,12 @@ class _Page:
 class Ledger:
     """One page a look. `settle` gives out those whose time has come, the same ones however the looks came in."""
 
-    def __init__(self, hits: int, smooth: bool) -> None:
-        """hits: detections that confirm a track. smooth: move boxes of a score below 1 to where their track was."""
-        self.hits, self.smooth = hits, smooth
+    def __init__(self, hits: int, smooth: bool, interval: int = 1) -> None:
+        """hits: detections that confirm a track. smooth: move boxes of a score below 1 to where their track was.
+
+        interval: frames between looks.
+        """
+        self.hits, self.smooth, self.interval = hits, smooth, interval
         self.pages: deque[_Page] = deque()
         self.looks = 0
         self.delay = hits - 1 + FILLED  # looks for which a page is held back
@@ -121,7 +124,7 @@ class Ledger:
         boxes = np.array([s.box_px for s in near])
         if self.moving:
             boxes = np.array([seen_from(s.box_px, self._step(s.look, seen.look)) for s in near])
-        return smoothed(boxes, np.array([s.look for s in near], float), seen.look)
+        return smoothed(boxes, np.array([s.frame / self.interval for s in near]), seen.frame / self.interval)
 
     def _step(self, there: int, here: int) -> np.ndarray | None:
         """How pixels moved from one look to another; None if the camera stood still between them."""

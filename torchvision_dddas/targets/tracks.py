@@ -61,7 +61,7 @@ class Tracker:
         self.knobs, self.interval, self.size = settings.track, interval_frames, size
         self.pace = Pace(self.knobs.speed)
         self.roster = Roster()
-        self.ledger = Ledger(self.knobs.hits, self.knobs.smooth)
+        self.ledger = Ledger(self.knobs.hits, self.knobs.smooth, interval_frames)
         self.begun = 0
         self.before: _Look | None = None
         self.waiting: _Look | None = None
