@@ -33,7 +33,7 @@ def follow_scenes(
 
     Each counts as certain: its score grades its contrast, and it has been confirmed over several frames already.
     """
-    follower = Follower(settings, interval, size, certain=True)
+    follower = Follower(_for_own(settings), interval, size, certain=True)
     steps: list[np.ndarray | None] = []
     adjustments: tuple[Adjustment, ...] = ()
     seconds: Counter[str] = Counter()
@@ -60,6 +60,13 @@ def follow_scenes(
         )
         steps, adjustments, seconds = [], (), Counter()
     yield from follower.end()
+
+
+def _for_own(settings: Settings) -> Settings:
+    """With the scatter of blobs, which come in parts, with shadows and joined, in place of that of whole targets."""
+    knobs = settings.track
+    own = {"scatter": knobs.own_scatter, "size_scatter": knobs.own_size_scatter, "births": knobs.own_births}
+    return settings.model_copy(update={"track": knobs.model_copy(update=own)})
 
 
 def follow_clip(

@@ -253,6 +253,11 @@ class TrackKnobs(Group):
     speed: float = knob(0.07, "heights/frame", 1e-4, 10, meaning="typical speed at the start; adapts to the scene")
     agility: float = knob(0.009, "heights/frame", 1e-5, 1, meaning="change of velocity in one frame at that speed")
     scatter: float = knob(0.06, "heights", 1e-3, 1, meaning="scatter of a detection's centre")
+    size_scatter: float = knob(0.1, "-", 1e-3, 10, meaning="scatter of the logarithm of a detection's height")
+    births: float = knob(2.0, "-", 0, 10, meaning="price of a return after a gap where targets keep appearing")
+    own_scatter: float = knob(0.2, "heights", 1e-3, 1, meaning="scatter for the moving targets found in a clip")
+    own_size_scatter: float = knob(1.0, "-", 1e-3, 10, meaning="size_scatter for those, which part and join")
+    own_births: float = knob(0.0, "-", 0, 10, meaning="births for those: most are parts of known targets")
     appearance_weight: float = knob(10.0, "-", 0, 100, meaning="weight of the appearance's likeness")
     appearance_offset: float = knob(0.86, "-", 0, 1, meaning="likeness that speaks neither for a link nor against it")
 

@@ -18,24 +18,28 @@ COLUMNS = 14
 
 USUAL_SPEED = 0.07
 """Heights a frame at which the noise below is meant; it scales with the speed."""
-_SIZE_SCATTER = 0.1  # sd of a detection's logarithm of the height
+SIZE_SCATTER = 0.1
+"""Usual sd of a detection's logarithm of the height."""
 _GROWTH = 0.03  # sd of the growth of a new target, per frame
 _GROWTH_CHANGE = 0.01  # sd of its change in one frame
 _WIDTH_GAIN = 0.5
 _FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: nothing is predicted to come nearer than half its distance
 
 
-def started(box_px: np.ndarray, frame: int, scatter: float, speed: float) -> np.ndarray:
+def started(
+    box_px: np.ndarray, frame: int, scatter: float, speed: float, size_scatter: float = SIZE_SCATTER
+) -> np.ndarray:
     """States of targets seen for the first time, at rest.
 
     box_px: (N, 4) x, y, width, height. scatter, speed: sd of the centre in heights, and of the velocity per frame.
+    size_scatter: sd of the logarithm of the height.
     """
     state = np.zeros((len(box_px), COLUMNS))
     state[:, X : Y + 1] = box_px[:, :2] + box_px[:, 2:] / 2
     state[:, WIDTH : HEIGHT + 1] = box_px[:, 2:]
     state[:, SEEN] = frame
     state[:, PP], state[:, VV] = scatter**2, speed**2
-    state[:, SS], state[:, GG] = _SIZE_SCATTER**2, (_GROWTH * speed / USUAL_SPEED) ** 2
+    state[:, SS], state[:, GG] = size_scatter**2, (_GROWTH * speed / USUAL_SPEED) ** 2
     return state
 
 
@@ -60,7 +64,9 @@ def _spread(later: np.ndarray, place: int, both: int, rate: int, gap: np.ndarray
     later[:, rate] += power * gap
 
 
-def updated(later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float) -> np.ndarray:
+def updated(
+    later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float, size_scatter: float = SIZE_SCATTER
+) -> np.ndarray:
     """Predicted states corrected by their boxes (N, 4).
 
     The velocity's gain is held to two over the gap: one surprise after a long absence tells little of the speed now.
@@ -71,7 +77,7 @@ def updated(later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float) -
     miss = box_px[:, :2] + box_px[:, 2:] / 2 - later[:, : Y + 1]
     new[:, : Y + 1] += gain[:, None] * miss
     new[:, VX : VY + 1] += turn[:, None] * miss
-    gain, turn = _gains(new, SS, SG, GG, _SIZE_SCATTER**2, np.inf)
+    gain, turn = _gains(new, SS, SG, GG, size_scatter**2, np.inf)
     grown = np.log(box_px[:, 3] / later[:, HEIGHT])
     new[:, HEIGHT] *= np.exp(gain * grown)
     new[:, GROWTH] += turn * grown

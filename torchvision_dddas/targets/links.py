@@ -15,7 +15,6 @@ from torchvision_dddas.targets.kalman import HEIGHT, PP, SEEN, SS, USUAL_SPEED, 
 _PRIOR = 4.0  # what a detection that continues a track is worth before anything is compared
 _TAIL = 4.0  # freedom of the distance's distribution: people turn and stop more than a normal law allows
 _UPRIGHT = 0.6  # standing people move less up and down in the picture than across it
-_SIZE_SCATTER = 0.1  # sd of the logarithm of a height
 _WORST_SIZE = 8.0
 _MISSED, _MISSED_FRAMES = 0.5, 5.0  # the price of a gap, and how it grows
 _REST_DRIFT = 0.03  # heights per square root of a frame
@@ -64,17 +63,19 @@ def link_scores(
     """
     later = kalman.predicted(state, sight.frame, sight.agility(knobs))
     centre, height = box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 3])
-    score = _closeness(later, later[:, PP] + knobs.scatter**2, centre) - _misfit(later, height, sight.doubt)
+    score = _closeness(later, later[:, PP] + knobs.scatter**2, centre)
+    score -= _misfit(later, height, sight.doubt, knobs.size_scatter)
     missed = sight.frame - state[:, SEEN] > sight.interval
     if missed.any():
         was, gap = state[missed], sight.frame - state[missed, SEEN]
         # Who was lost may have stood still behind something: that tells where better than any velocity.
-        rest = _closeness(was, knobs.scatter**2 + _REST_DRIFT**2 * gap, centre) - _misfit(was, height, sight.doubt)
+        rest = _closeness(was, knobs.scatter**2 + _REST_DRIFT**2 * gap, centre)
+        rest -= _misfit(was, height, sight.doubt, knobs.size_scatter)
         lost = np.maximum(score[missed], rest - _REST_PRICE)
         lost -= (_MISSED + 0.5 * np.log1p((gap - sight.interval) / _MISSED_FRAMES))[:, None]
         lost -= _COME_BACK_AT_BORDER * near_border(box_px, sight.size) + _LEFT_AT_BORDER * left_at_border[missed, None]
         # Where targets keep appearing out of nowhere, this is one more rather than one come back.
-        lost -= min(2 * np.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
+        lost -= min(knobs.births * np.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
         score[missed] = lost
     return score
 
@@ -90,9 +91,9 @@ def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray) -
     return peak[:, None] - (1 + _TAIL / 2) * np.log1p(away / _TAIL)
 
 
-def _misfit(state: np.ndarray, height: np.ndarray, doubt: float) -> np.ndarray:
+def _misfit(state: np.ndarray, height: np.ndarray, doubt: float, scatter: float) -> np.ndarray:
     """(N, M) price of a height other than expected. height: (M,) its logarithm."""
-    usual = _SIZE_SCATTER * (1 + 0.5 * doubt)
+    usual = scatter * (1 + 0.5 * doubt)
     variance = usual**2 + state[:, SS]
     change = height - np.log(state[:, HEIGHT : HEIGHT + 1])
     return np.minimum(0.5 * change**2 / variance[:, None], _WORST_SIZE) + 0.5 * np.log(variance / usual**2)[:, None]

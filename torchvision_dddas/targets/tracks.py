@@ -161,7 +161,7 @@ class Tracker:
         width = max(old.signature.shape[1], look.signature.shape[1])
         signature, seen = widened(old.signature, width)[tracks], widened(look.signature, width)[now]
         return Roster(
-            kalman.updated(later, box, look.frame, self.knobs.scatter),
+            kalman.updated(later, box, look.frame, self.knobs.scatter, self.knobs.size_scatter),
             blended(signature, seen, look.visible[now], hits) if width else signature,
             near_border(box, self.size),
             old.number[tracks],
@@ -172,7 +172,7 @@ class Tracker:
         """Tracks that begin with a detection (K,) each."""
         box = look.box_px[now]
         return Roster(
-            kalman.started(box, look.frame, self.knobs.scatter, self.pace.speed),
+            kalman.started(box, look.frame, self.knobs.scatter, self.pace.speed, self.knobs.size_scatter),
             look.signature[now],
             near_border(box, self.size),
             self.begun + np.arange(len(now)),
