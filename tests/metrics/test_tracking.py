@@ -207,6 +207,16 @@ def test_windows_are_of_looks_an_interval_apart():
     assert tracking.count(truth, found, interval=2).links_3 == (1, 0.5)
 
 
+def test_windows_of_looks_far_apart_are_those_of_the_same_looks_close_by():
+    near = table({"a": 1}, {"a": 1}, {}, {}, {}, {}, {"a": 2}, {"a": 1}, {"a": 1})
+    far = near._replace(frame=np.where(near.frame > 3, near.frame + 2**50, near.frame))
+    for interval in (1, 2):
+        counts = [tracking.count(t, t, interval=interval) for t in (near, far)]
+        assert (counts[0].links_2, counts[0].links_3) == (counts[1].links_2, counts[1].links_3)
+    # Every window of three looks on frames 1 to 9 that holds a target.
+    assert tracking.count(near, near).links_3[0] == 5
+
+
 def test_an_identity_twice_in_a_frame_is_refused():
     twice = TrackTable(np.array([3, 3]), np.array([7, 7]), np.ones((2, 4)))
     with pytest.raises(InputError, match="the result has identity 7 twice in frame 3"):

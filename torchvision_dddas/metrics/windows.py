@@ -39,8 +39,11 @@ def count(clip: Paired, interval: int, size: int) -> Windows:
         hit = score[i, j] >= LEAST
         looks[frame] = true[i[hit]] + 1, found[j[hit]]
     nobody = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    whole = range(min(looks, default=1) + (size - 1) * interval, max(looks, default=0) + 1, interval)
+    # Frame numbers may be any, and far apart: only the windows that hold a look are gone through.
+    held = {frame + age * interval for frame in looks for age in range(size)}
     windows, total = 0, 0.0
-    for newest in range(min(looks, default=1) + (size - 1) * interval, max(looks, default=0) + 1, interval):
+    for newest in sorted(frame for frame in held if frame in whole):
         window = [looks.get(newest - age * interval, nobody) for age in range(size)]
         if not any(len(true) for true, _ in window):
             continue
