@@ -197,6 +197,25 @@ def test_tracks_that_someone_else_made_are_not_replaced(dddas, table, tmp_path):
     assert (tmp_path / "tracks.txt").read_text() == "truth"
 
 
+@pytest.mark.parametrize("name", ["tracks.txt", "tracks.csv", "run.json", "overlay.mp4"])
+def test_a_table_that_the_run_would_write_over_is_refused(dddas, table, tmp_path, name):
+    out = tmp_path / "out"
+    assert dddas("track", "--detections", table(), "--out", out, "--quiet").exit_code == 0
+    (out / name).write_text(walker(range(1, 6)))
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    said = bad(dddas("track", "--detections", tmp_path / "out/../out" / name, "--out", out))
+    assert f"{name} is a file that this run writes; choose another folder with --out" in said
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_the_record_of_a_run_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
+    text = walker(range(501, 560), x=0) + walker(range(502, 560), x=40)
+    dddas("track", "--detections", table(text), "--interval", 2, "--out", tmp_path / "out", "--quiet")
+    kept = record(tmp_path / "out")
+    assert (kept["first_frame"], kept["last_frame"], kept["frames"]["written"]) == (501, 559, 30)
+    assert kept["identities"] == len(set(tracks(tmp_path / "out")[:, 1])) == 2
+
+
 def test_a_frame_that_cannot_be_decoded_keeps_its_rows_and_is_told(dddas, clip, table, tmp_path):
     (clip / "00002.png").write_bytes(b"no picture")
     result = dddas("track", clip, "--detections", table(), "--out", tmp_path / "out")

@@ -97,6 +97,17 @@ def test_an_interrupted_run_is_scored_as_far_as_it_looked(tmp_path):
     assert "interrupted after frame 3" in report["notes"][0]
 
 
+def test_a_run_that_begins_late_is_scored_up_to_the_last_frame_that_it_names(tmp_path):
+    record = {"state": "complete", "frames": {"written": 60}, "outputs": ["tables"], "interval_frames": 1}
+    rows = "".join(f"{f},-1,0,0,10,20,1,-1,-1\n" for f in range(500, 560))
+    places = clip(tmp_path, rows, tracks__txt=rows.replace(",-1,0", ",1,0"), run__json=json.dumps(record))
+    with pytest.raises(InputError, match="share no frame"):
+        evaluate(*places)
+    clip(tmp_path, rows, run__json=json.dumps(record | {"first_frame": 500, "last_frame": 559}))
+    scored = evaluate(*places)["clips"]["out"]
+    assert (scored["frames"], scored["boxes"]["n_hit"]) == (60, 60)
+
+
 def test_no_tracks_at_all_are_zero_and_not_an_error(tmp_path):
     scored = evaluate(*clip(tmp_path, tracks__txt=""))["clips"]["out"]["tracks"]
     assert (scored["hota"], scored["idf1"], scored["n_fn"]) == (0, 0, 3)

@@ -89,6 +89,8 @@ def track_into(
     """
     from torchvision_dddas.sinks.track_output import TrackOutput
 
+    if detections is not None and detections.resolve() in [(folder / name).resolve() for name in TrackOutput.files]:
+        raise InputError(f"--detections {detections} is a file that this run writes; choose another folder with --out")
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.sources import open_source
         from torchvision_dddas.sources.agreement import agreed, looked_at
@@ -159,7 +161,7 @@ def looks(table: "DetectionTable | None", source: "Source | None", interval: int
 def summary(journal: "TrackJournal", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     made = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in save), "run.json"]
-    found = f"{journal.frames} frames, {journal.targets} detections, {len(journal.identities)} identities"
+    found = f"{journal.frames} frames, {journal.targets} detections, {journal.identities} identities"
     lines = [
         f"{found}, {journal.untracked} detections without one",
         *(f"note: {note}" for note in journal.notes),

@@ -16,7 +16,7 @@ DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
 
 @dataclass(frozen=True)
 class Result:
-    """A result. frames: how many the clip had, 0 where nothing says. state: of the run.
+    """A result. frames: the last one of the run, 0 where nothing says. state: of the run.
 
     place: the folder or file. detected: (N, 4) boxes of each frame with targets, None where only tracks were written.
     tracks: the boxes with identities, None where there are none.
@@ -74,8 +74,9 @@ def load(place: Path) -> Result:
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
         looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), record["outputs"]
-        # dddas track writes every interval-th frame, dddas detect each.
-        frames = max(looks - 1, 0) * int(record.get("interval_frames", 1)) + min(looks, 1)
+        # dddas track writes every interval-th frame, from wherever its table begins; dddas detect each.
+        counted = max(looks - 1, 0) * int(record.get("interval_frames", 1)) + min(looks, 1)
+        frames = int(record.get("last_frame", counted)) if looks else 0
     except (OSError, ValueError, KeyError, TypeError):
         # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
         numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]

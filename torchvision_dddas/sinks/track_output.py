@@ -16,23 +16,28 @@ SAVED = ("overlay",)
 
 
 class TrackJournal(Record):
-    """The record of a run that gives identities; notes say what the user should know of it."""
+    """The record of a run that gives identities; notes say what the user should know of it.
+
+    identities: how many were given; they are numbered from 1 without gaps. first: number of the first frame.
+    """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         super().__init__(folder, facts)
-        self.identities: set[int] = set()
-        self.bridges = self.untracked = 0
+        self.identities = self.bridges = self.untracked = self.first = 0
         self.notes: list[str] = []
 
     def write(self, followed: Followed) -> None:
         """Take note of a frame."""
         tracks, targets = followed.tracks, len(followed.detections)
         seen = int((tracks.row >= 0).sum())
-        self.identities.update(tracks.identity.tolist())
+        self.identities = int(tracks.identity.max(initial=self.identities))
+        self.first = self.first or followed.number
         self.bridges += len(tracks) - seen
         self.untracked += targets - seen
         self.counts = {
-            "identities": len(self.identities),
+            "first_frame": self.first,
+            "last_frame": followed.number,
+            "identities": self.identities,
             "tracked": self.targets + targets - self.untracked,
             "untracked": self.untracked,
             "bridges": self.bridges,
