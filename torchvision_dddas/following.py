@@ -44,8 +44,9 @@ def follow_scenes(
         number = scene.frame.number
         if not used(number, interval):
             continue
+        # A step that is not known counts as none: the others are nearer to the truth than a camera that stood still.
         known = [step for step in steps if step is not None]
-        now_from_before = chain(known) if len(known) == len(steps) else None
+        now_from_before = chain(known) if known else None
         yield from follower.take(
             Followed(
                 number,

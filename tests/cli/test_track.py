@@ -169,7 +169,7 @@ def test_neither_clip_nor_table_is_one_line(dddas):
 
 BAD_ROWS = [
     ("3,-1,5,5,x,9\n", "line 6: width is 'x'"),
-    ("3,-1,5,5,-2,9\n", "line 6: width is '-2'"),
+    ("3,-1,5,5,-2,9\n", "line 6: width is '-2'; wanted pixels, 0.001 at least"),
     ("3,-1,5,nan,2,9\n", "line 6: y is 'nan'"),
     ("0,-1,5,5,2,9\n", "line 6: frame is '0'"),
     ("3,-1,5\n", "line 6: 3 columns"),

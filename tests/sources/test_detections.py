@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.detections import LAST_FRAME, read_detections
+from torchvision_dddas.sources.detections import LAST_FRAME, DetectionTable, read_detections
 
 
 @pytest.fixture
@@ -77,14 +77,64 @@ def test_one_score_outside_0_to_1_means_that_none_is_a_probability(table, score,
     assert read.score.tolist() == [0.5, float(score)]
 
 
+@pytest.mark.parametrize(
+    ("good", "bad", "refused"), [(4358, 1, True), (199, 1, True), (198, 2, False), (99, 1, False), (0, 2, False)]
+)
+def test_a_few_scores_outside_0_to_1_are_mistakes_and_many_are_another_scale(table, good, bad, refused):
+    rows = ["2,-1,2,3,4,5,1.3\n"] * bad + ["1,-1,2,3,4,5,0.5\n"] * good
+    path = table("".join(rows[bad:] + rows[:bad]))
+    if not refused:
+        assert read_detections(path).certain
+        return
+    with pytest.raises(InputError) as error:
+        read_detections(path)
+    assert f"det.txt, line {good + 1}: score is 1.3; {bad} of {good + bad} scores lie outside" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "own"), [(("moving", "moving"), True), (("moving", "given"), False), (("detection",) * 2, False), ((), 0)]
+)
+def test_a_csv_whose_kinds_are_all_moving_is_our_own_and_certain(table, kinds, own):
+    rows = [f"{n},10,20,30,40, {kind} ,0.55" for n, kind in enumerate(kinds, 1)]
+    read = read_detections(table("\n".join(["frame,x_px,y_px,width_px,height_px,kind,score", *rows])))
+    assert (read.own, read.certain, read.probable) == (own, own, True)
+    assert not read_detections(table("1,-1,2,3,4,5,0.5,moving")).own
+
+
+def boxes(right, bottom, score, own=False):
+    n = len(right)
+    box_px = np.stack([np.asarray(right) - 10, np.asarray(bottom) - 20, np.full(n, 10), np.full(n, 20)], axis=1)
+    return DetectionTable("det.txt", np.ones(n, int), box_px.astype(float), np.full(n, score), np.arange(n) + 1, own)
+
+
+def test_three_stray_boxes_leave_the_extent_as_it_is_and_a_fourth_counts():
+    right, bottom = np.arange(601, 641), np.full(40, 480)
+    assert boxes(right, bottom, 0.9).extent == (637, 480)
+    strays = np.array([1e9, 5e6, 7e7])
+    assert boxes([*right, *strays], [*bottom, *strays], 0.9).extent == (640, 480)
+    assert boxes([*right, *strays, 800], [*bottom, *strays, 500], 0.9).extent == (800, 500)
+
+
+def test_the_extent_is_told_by_thirty_likely_boxes_at_least():
+    right, bottom = np.arange(1, 31), np.arange(1, 31)
+    assert boxes(right, bottom, 0.5).extent == (27, 27)
+    assert boxes(right[1:], bottom[1:], 0.5).extent is None
+    assert boxes(right, bottom, 0.4).extent is None
+    # Where scores are no probabilities, every row counts.
+    assert boxes(right, bottom, -0.4).extent == boxes(right, bottom, 0.4, own=True).extent == (27, 27)
+
+
 BAD = [
     ("1,-1,2,3,4,x", "height is 'x'; wanted a finite number"),
     ("1,-1,2,nan,4,5", "y is 'nan'"),
     ("1,-1,inf,3,4,5", "x is 'inf'"),
     ("1,-1,2,3,4,5,nan", "score is 'nan'"),
     ("1,-1,2,3,4,5,high", "score is 'high'"),
-    ("1,-1,2,3,-4,5", "width is '-4'; wanted more than 0 pixels"),
-    ("1,-1,2,3,4,0", "height is '0'; wanted more than 0 pixels"),
+    ("1,-1,2,3,-4,5", "width is '-4'; wanted pixels, 0.001 at least"),
+    ("1,-1,2,3,4,0", "height is '0'; wanted pixels, 0.001 at least"),
+    ("1,-1,2,3,0.000999,5", "width is '0.000999'; wanted pixels, 0.001 at least"),
+    ("1,-1,1_0,3,4,5", "x is '1_0'; wanted a finite number"),
+    ("1_0,-1,2,3,4,5", "frame is '1_0'; wanted a finite number"),
     ("1,-1,2,-1e12,4,5", "y is '-1e12'; wanted pixels, 1e+09 at most"),
     ("1,-1,2,3,1e300,5", "width is '1e300'; wanted pixels"),
     ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
@@ -115,6 +165,8 @@ def test_a_bad_row_is_one_line_that_names_file_and_line(table, row, says):
     ("text", "says"),
     [
         ("frame,x,y\n1,2,3", "line 1: its columns are frame, x, y; x_px, y_px, width_px, height_px missing"),
+        ("frame,x_px,y_px,width_px,height_px,x_px\n1,2,3,4,5,6", "line 1: column x_px is named twice"),
+        ("frame,x_px,y_px,width_px,height_px,note,note\n1,2,3,4,5,6,7", "line 1: column note is named twice"),
         ("hello world", "line 1: its columns are hello world"),
         ("frame,x_px,y_px,width_px,height_px\n1,2,3,4", "line 2: 4 columns; the first line names 5"),
         ("frame,x_px,y_px,width_px,height_px\n1,2,3,4,wide", "line 2: height is 'wide'"),

@@ -95,3 +95,9 @@ def test_a_bridge_alone_and_a_birth_alone_are_no_pairs():
 def test_nobody_and_nothing():
     assert chosen(np.zeros((0, 0))) == []
     assert chosen(np.zeros((0, 0)), ahead=2) == []
+
+
+def test_boxes_in_stacks_keep_to_those_of_their_own_place_in_the_order():
+    """Equal scores all over: any whole matching is as good, and it must be found without trying them all."""
+    for count in (2, 9, 20):
+        assert len(chosen(np.full((count, count), 5.0), born=np.full((count, count), 4.0), ahead=count)) == count

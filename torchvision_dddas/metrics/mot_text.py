@@ -75,7 +75,7 @@ def _row(cells: list[str], where: str) -> list[float]:
     values = []
     for cell, column in zip(cells, _COLUMNS, strict=False):
         try:
-            value = float(cell)
+            value = float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
         except ValueError:
             value = math.nan
         if not math.isfinite(value):

@@ -43,7 +43,9 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
             f"rows lie on every {grid}th frame only, and the frames between count as misses: --interval {grid} says "
             "that nobody looked there"
         )
-    if not table.probable:
+    if table.own:
+        notes.append("all rows are moving targets of dddas detect: every row counts as certain")
+    elif not table.probable:
         low, high = table.score.min(), table.score.max()
         notes.append(f"scores from {low:g} to {high:g} are no probabilities: every row counts as certain")
     if source is not None and (outside := int(_outside(table, source.size).sum())):

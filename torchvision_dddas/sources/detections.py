@@ -15,10 +15,19 @@ COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
 """The named columns that a CSV must have; `score` may be there as well, any other is ignored."""
 
 LAST_FRAME = 10_000_000
-"""A higher frame number is taken for a mistake, such as a time stamp: every frame up to the last is gone through."""
+"""A higher frame number is taken for a mistake, such as a time stamp."""
 
 FARTHEST_PX = 1e9
 """A place or size beyond is no pixel's."""
+
+LEAST_PX = 1e-3
+"""A smaller width or height is no target's."""
+
+FEW_SHARE = 0.01
+"""Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
+
+STRAYS, ENOUGH_ROWS = 3, 30
+"""How many rows that lie anywhere leave the extent as it is, and from how many rows it is told at all."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +35,7 @@ class DetectionTable:
     """Boxes by frame, sorted by frame; rows of one frame keep the file's order.
 
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
-    line: (N,) int64, where the row stands in the file, from 1.
+    line: (N,) int64, where the row stands in the file, from 1. own: whether `dddas detect` says that all were moving.
     """
 
     path: str
@@ -34,6 +43,7 @@ class DetectionTable:
     box_px: np.ndarray
     score: np.ndarray
     line: np.ndarray
+    own: bool = False
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -50,15 +60,28 @@ class DetectionTable:
 
     @cached_property
     def probable(self) -> bool:
-        """Whether the scores can be probabilities: all in [0, 1]. Otherwise every row is as good as certain."""
+        """Whether the scores can be probabilities: all in [0, 1]."""
         return bool(((self.score >= 0) & (self.score <= 1)).all())
 
     @property
+    def certain(self) -> bool:
+        """Whether every row is as good as certain: scores are on another scale, or grade the contrast of own targets.
+
+        An own target was confirmed over several frames before it was written, however faint it is.
+        """
+        return self.own or not self.probable
+
+    @cached_property
     def extent(self) -> tuple[float, float] | None:
-        """(width, height) that holds all boxes, the best guess at the picture's size; None without rows."""
-        if not len(self):
+        """(width, height) that holds nearly all boxes, the best guess at the picture's size; None with too few rows.
+
+        The farthest right and bottom edge but STRAYS: one stray row would move the border, and with it what counts as
+        leaving the picture, for all. Rows that are likelier false than true (score below 0.5) have no say.
+        """
+        likely = self.box_px if self.certain else self.box_px[self.score >= 0.5]
+        if len(likely) < ENOUGH_ROWS:
             return None
-        width, height = (self.box_px[:, :2] + self.box_px[:, 2:]).max(axis=0)
+        width, height = np.sort(likely[:, :2] + likely[:, 2:], axis=0)[-1 - STRAYS]
         return float(width), float(height)
 
     def rows(self, frame: int) -> slice:
@@ -79,7 +102,8 @@ def read_detections(path: str | Path) -> DetectionTable:
     The id and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
     without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
-    below 1 or above LAST_FRAME, a width or height that is not positive, a place or size beyond FARTHEST_PX.
+    below 1 or above LAST_FRAME, a width or height below LEAST_PX, a place or size beyond FARTHEST_PX, a column named
+    twice, a few scores outside [0, 1] (see FEW_SHARE).
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -88,15 +112,18 @@ def read_detections(path: str | Path) -> DetectionTable:
     except UnicodeDecodeError as error:
         raise InputError(f"detections {path} is no text: {error}") from None
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    own = False
     if content and _named(content[0][1]):
         number, header = content.pop(0)
-        rows = _by_name(content, header, f"detections {path}", number)
+        rows = list(_by_name(content, header, f"detections {path}", number))
+        own = _all_moving(content, header)
     else:
-        rows = _by_place(content, f"detections {path}")
-    table = np.array(list(rows), np.float64).reshape(-1, 7)
+        rows = list(_by_place(content, f"detections {path}"))
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    _refuse_few_outside(table[:, 5], table[:, 6], f"detections {path}")
     table = table[np.argsort(table[:, 0], kind="stable")]
     return DetectionTable(
-        str(path), table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5], table[:, 6].astype(np.int64)
+        str(path), table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5], table[:, 6].astype(np.int64), own
     )
 
 
@@ -123,6 +150,8 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
             f"{name}, line {line}: its columns are {', '.join(names)}; {', '.join(missing)} missing. Wanted numbers as "
             f"frame,id,x,y,w,h[,score], or a first line that names {', '.join(COLUMNS)}"
         )
+    if twice := [column for column in names if column and names.count(column) > 1]:
+        raise InputError(f"{name}, line {line}: column {twice[0]} is named twice; wanted each name once")
     places = [names.index(column) for column in COLUMNS]
     score = names.index("score") if "score" in names else len(names)
     for number, text in content:
@@ -130,6 +159,26 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
         if len(cells) != len(names):
             raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
         yield _row([cells[place].strip() for place in places], [*cells, ""][score].strip(), number, name)
+
+
+def _all_moving(content: Sequence[tuple[int, str]], header: str) -> bool:
+    """Whether the column `kind` says so of each row, as `dddas detect` does."""
+    names = [cell.strip() for cell in header.split(",")]
+    if not content or "kind" not in names:
+        return False
+    place = names.index("kind")
+    return all(line.split(",")[place].strip() == "moving" for _, line in content)
+
+
+def _refuse_few_outside(score: np.ndarray, line: np.ndarray, name: str) -> None:
+    """One score of 1.3 among thousands of probabilities must not make all of these certain."""
+    outside = (score < 0) | (score > 1)
+    if 0 < outside.sum() < FEW_SHARE * len(score):
+        first = outside.argmax()
+        raise InputError(
+            f"{name}, line {line[first]:.0f}: score is {score[first]:g}; {outside.sum()} of {len(score)} scores lie "
+            "outside [0, 1]. Wanted probabilities in [0, 1], or scores on another scale throughout"
+        )
 
 
 def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
@@ -143,8 +192,8 @@ def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
             raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted a finite number")
         if column == "frame" and not (value == int(value) and 1 <= value <= LAST_FRAME):
             raise InputError(f"{name}, line {line}: frame is '{cell}'; wanted a whole number from 1 to {LAST_FRAME}")
-        if column in ("width", "height") and value <= 0:
-            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted more than 0 pixels")
+        if column in ("width", "height") and value < LEAST_PX:
+            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted pixels, {LEAST_PX:g} at least")
         if column not in ("frame", "score") and abs(value) > FARTHEST_PX:
             raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted pixels, {FARTHEST_PX:g} at most")
     return [*(value for value in values if value is not None), float(line)]
@@ -152,6 +201,6 @@ def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
 
 def _number(text: str) -> float | None:
     try:
-        return float(text)
+        return float(text) if "_" not in text else None  # 1_0 is a number to Python alone
     except ValueError:
         return None

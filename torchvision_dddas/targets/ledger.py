@@ -50,6 +50,8 @@ class Ledger:
         self.sure: set[int] = set()
         self.counts: dict[int, int] = {}
         self.identities: dict[int, int] = {}
+        self.named = 0
+        self.gone: deque[tuple[int, int]] = deque()  # (look, track) of those forgotten
 
     def write(
         self,
@@ -78,9 +80,10 @@ class Ledger:
             page.tracks[number] = sighting
 
     def forget(self, numbers: np.ndarray) -> None:
-        """Tracks that will not be seen again."""
+        """Tracks that will not be seen again; what is known of them is kept as long as a page may name them."""
         for number in numbers.tolist():
             self.counts.pop(number, None)
+            self.gone.append((self.looks, number))
 
     def confirmed(self, numbers: np.ndarray) -> np.ndarray:
         """(N,) which tracks are more than a false alarm."""
@@ -93,7 +96,9 @@ class Ledger:
             page = self.pages.popleft()
             sure = [(number, seen) for number, seen in page.tracks.items() if number in self.sure]
             for number, _ in sure:
-                self.identities.setdefault(number, len(self.identities) + 1)
+                if number not in self.identities:
+                    self.named += 1
+                    self.identities[number] = self.named
             done.append(
                 Tracks(
                     page.frame,
@@ -142,6 +147,10 @@ class Ledger:
 
     def _tidy(self) -> None:
         """Drop what no page still held back can ask for."""
+        while self.gone and self.gone[0][0] < self.looks - len(self.pages):
+            _, number = self.gone.popleft()
+            self.identities.pop(number, None)
+            self.sure.discard(number)
         oldest = self.looks - len(self.steps)
         for number in [n for n, past in self.past.items() if past[-1].look <= oldest]:
             del self.past[number]

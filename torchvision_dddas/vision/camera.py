@@ -37,6 +37,7 @@ class Camera:
         self.vision = vision
         self.anchor: _Look | None = None
         self.last: _Look | None = None
+        self.lost: _Look | None = None  # the latest look whose motion is not known, shown since `last`
         self.age = 0  # looks since the anchor
 
     def step(self, image: np.ndarray) -> tuple[np.ndarray | None, str]:
@@ -44,21 +45,32 @@ class Camera:
 
         None where the camera stood still, and where the motion is unknown, then with a cause in words.
         """
-        look, anchor, last = _Look(image, self.vision), self.anchor, self.last
-        self.last, self.age = look, self.age + 1
-        if anchor is None or last is None:
-            self.anchor, self.age = look, 0
+        look = _Look(image, self.vision)
+        self.age += 1
+        if self.anchor is None or self.last is None:
+            self.anchor = self.last = look
+            self.age = 0
             return None, ""
-        still = _still(anchor, look)
-        if not still or self.age >= _OLDEST:
-            self.anchor, self.age = look, 0
-        if still:
+        if _still(self.anchor, look):
+            if self.age >= _OLDEST:
+                self.anchor, self.age = look, 0
+            self.last, self.lost = look, None
             return None, ""
-        for earlier in (anchor, last)[: 1 + (last is not anchor)]:
-            (found,) = self.vision.register([(earlier.view, look.view)])
+        # After a look that goes with nothing, a flash say, the motion since the one before it counts: the tracker has
+        # been told of none in between.
+        earlier = [self.anchor, *(e for e in (self.last, self.lost) if e is not None and e is not self.anchor)]
+        for other in earlier:
+            (found,) = self.vision.register([(other.view, look.view)])
             if found.reliable:
+                self.anchor = self.last = look
+                self.lost, self.age = None, 0
                 now_from_before = look.full_from_small @ found.later_from_earlier @ np.linalg.inv(look.full_from_small)
                 return now_from_before / now_from_before[2, 2], ""
+        if self.age >= _OLDEST:
+            self.anchor = self.last = look
+            self.lost, self.age = None, 0
+        else:
+            self.lost = look
         return None, found.cause
 
 
