@@ -4,12 +4,13 @@ DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Th
 followed by the default tracker along the clip, by the same without the clip, and by `--config paper` with windows of
 two and three frames. An interval of D has D phases: looks at 1, 1 + D, ..., at 2, 2 + D, ... Each is followed for
 itself, and AR_2 and AR_3 (appendix C, eq. 11) are means over the windows of all of them; identity switches and IDF1
-(in percent, matched at an IoU of 0.9) are given as the mean over the phases and the worst. Prints Markdown.
+(in percent, matched at an IoU of 0.9) are given as the mean over the phases and the worst. Looked at: the percentage of
+pictures whose targets were compared. Prints Markdown.
 """
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -55,8 +56,8 @@ def main() -> None:
     if not filmed:
         sys.exit(f"{options.data} holds no sequences with gt/gt.txt and a video; nothing was measured")
     lines = [
-        f"| interval {options.interval} | tracker | windows of 3 | AR_2 | AR_3 | switches | IDF1 |",
-        "| --- | --- " + "| ---: " * 5 + "|",
+        f"| interval {options.interval} | tracker | windows of 3 | AR_2 | AR_3 | switches | IDF1 | looked at |",
+        "| --- | --- " + "| ---: " * 6 + "|",
     ]
     for place, clip in filmed:
         for name, (pictures, overrides) in TRACKERS.items():
@@ -74,18 +75,19 @@ def measured(place: Path, clip: Path | None, interval: int, settings: Settings) 
     truth = truths.load(place / "gt/gt.txt").tracks
     assert truth is not None
     links, switches, idf1 = [Windows(), Windows()], [], []
-    for phase, found in enumerate(followed(truth, clip, interval, settings)):
+    tracks, looked = followed(truth, clip, interval, settings)
+    for phase, found in enumerate(tracks):
         both = pair(truth.at((truth.frame - 1) % interval == phase), found)
         links = [known.plus(windows.count(both, interval, size)) for known, size in zip(links, (2, 3), strict=True)]
         switches.append(clear.count(both, SAME).switches)
         idf1.append(100 * identity.measures(identity.count(both, SAME))["idf1"])
     ratios = " | ".join(f"{100 * known.mean:.2f}" for known in links)
     spread = f"{np.mean(switches):.1f} ({max(switches)}) | {np.mean(idf1):.1f} ({min(idf1):.1f})"
-    return f"{links[1].windows} | {ratios} | {spread}"
+    return f"{links[1].windows} | {ratios} | {spread} | {100 * looked:.0f}"
 
 
-def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Settings) -> list[TrackTable]:
-    """The tracks of each phase. All are fed in one run through the clip."""
+def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Settings) -> tuple[list[TrackTable], float]:
+    """The tracks of each phase, all fed in one run through the clip, and the share of frames that were looked at."""
     # Rows in another order in each frame, so that order tells nothing.
     order = np.random.default_rng(7).permutation(len(truth.frame))
     truth = truth.at(order[np.argsort(truth.frame[order], kind="stable")])
@@ -94,6 +96,18 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
     vision = load_vision("onboard", settings) if source else None
     followers = [Follower(settings, interval, size) for _ in range(interval)]
     cameras = [Camera(vision) for _ in range(interval)] if vision else []
+    looked = 0
+
+    def counted(look: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable:
+        def likeness(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+            nonlocal looked
+            looked += 1
+            return look(image, box_px)
+
+        return likeness
+
+    for follower in followers:
+        follower.likeness = counted(follower.likeness)
     settled: list[list[Tracks]] = [[] for _ in range(interval)]
     for frame in source or range(1, last + 1):
         number = frame if isinstance(frame, int) else frame.number
@@ -106,7 +120,7 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
         settled[phase] += [f.tracks for f in followers[phase].take(given)]
     for phase, follower in enumerate(followers):
         settled[phase] += [f.tracks for f in follower.end()]
-    return [table(tracks) for tracks in settled]
+    return [table(tracks) for tracks in settled], looked / last
 
 
 def boxes(truth: TrackTable, frame: int) -> Detections:
