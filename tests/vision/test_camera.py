@@ -90,6 +90,17 @@ def test_the_motion_is_that_of_the_picture_s_own_pixels_whatever_its_size(ground
     assert corner_error(now_from_before, np.array([[1, 0, -7], [0, 1, 4], [0, 0, 1.0]]), size) < 0.4
 
 
+def test_a_picture_that_shows_nothing_costs_no_motion(ground):
+    """The pan goes on behind it: what the next picture is told makes up for the step that was not known."""
+    camera, moved = Camera(Counted()), np.eye(3)
+    for k in range(8):
+        image = seen(ground, shift(12.0 * k), k)
+        now_from_before, cause = camera.step(np.zeros_like(image) if k == 4 else image)
+        assert bool(cause) == (k == 4)
+        moved = moved if now_from_before is None else now_from_before @ moved
+    assert corner_error(moved, np.array([[1, 0, -84.0], [0, 1, 0], [0, 0, 1]]), (640, 480)) < 1.0
+
+
 def test_a_cut_is_unknown_with_a_cause_and_the_next_step_is_known_again(ground):
     camera = Camera(Counted())
     camera.step(seen(ground, shift(0)))
