@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.agreement import looked_at
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.sources.source import Source
 from torchvision_dddas.targets.projective import chain
@@ -77,7 +78,7 @@ def follow_clip(
 
     The camera's motion is taken from one picture to the next one that can be read.
     """
-    follower, camera, number = Follower(settings, interval, source.size, not table.probable), Camera(vision), 1
+    follower, camera, number = _follower(table, settings, interval, source.size), Camera(vision), 1
     start = time.perf_counter()
     for frame in source.every(interval):
         read = time.perf_counter()
@@ -94,12 +95,35 @@ def follow_clip(
 
 
 def follow_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[Followed]:
-    """A table alone: no registration, no appearance. From its first to its last row, frames without rows are empty."""
-    follower = Follower(settings, interval, table.extent, not table.probable)
-    first = table.first + -(table.first - 1) % interval
-    for number in range(first, table.last + 1, interval) if len(table) else ():
+    """A table alone: no registration, no appearance. From its first to its last row, frames without rows are empty.
+
+    A stretch of these is left out from where all tracks are forgotten and settled to the frame before the next row.
+    """
+    follower = _follower(table, settings, interval, table.extent)
+    forgotten = settings.track.memory_frames + (settings.track.hits + 3) * interval
+    for number in _frames(table, interval, forgotten):
         yield from follower.take(_of(table, number))
     yield from follower.end()
+
+
+def _frames(table: DetectionTable, interval: int, forgotten: int) -> Iterator[int]:
+    """Each `interval`-th frame from the first to the last row, but for most of a stretch without rows.
+
+    Of that come those of its first `forgotten` frames and its last one: one stray row must not cost a million looks.
+    """
+    if not len(table):
+        return
+    start, last = table.first + -(table.first - 1) % interval, table.last - (table.last - 1) % interval
+    for row in np.union1d(table.frame[looked_at(table, interval)], [last]).tolist():
+        quiet = range(start, min(row, start + forgotten), interval)
+        yield from quiet
+        yield from range(max(start + len(quiet) * interval, row - interval), row + 1, interval)
+        start = row + interval
+
+
+def _follower(table: DetectionTable, settings: Settings, interval: int, size: tuple[float, float] | None) -> "Follower":
+    """A table that `dddas detect` wrote is followed as the clip's own detections are."""
+    return Follower(_for_own(settings) if table.own else settings, interval, size, table.certain)
 
 
 def _of(

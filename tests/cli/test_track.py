@@ -104,6 +104,16 @@ def test_what_detect_wrote_can_be_tracked_as_text_and_as_csv(dddas, engine, clip
     assert (tmp_path / "detections.txt/tracks.txt").read_text() == (tmp_path / "detections.csv/tracks.txt").read_text()
 
 
+def test_the_csv_of_detect_gives_identities_however_faint_its_targets_are(dddas, clip, table, tmp_path):
+    names = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
+    text = names + "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
+    for words in ((), (clip,)):
+        result = dddas("track", *words, "--detections", table(text), "--out", tmp_path / "out", "--save", "none")
+        assert "5 detections, 1 identities, 0 detections without one" in result.stdout
+        assert "note: all rows are moving targets of dddas detect" in result.stdout
+        assert tracks(tmp_path / "out")[:, 6].tolist() == [0.41] * 5
+
+
 def test_a_clip_in_which_nothing_moves_has_empty_tables(dddas, engine, clip, tmp_path):
     engine(found=False)
     dddas("detect", clip, "--out", tmp_path / "found", "--quiet")

@@ -160,6 +160,7 @@ def test_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_counts(tmp
         ("1,7,0,0,10,20,1\n\n2,nan,0,0,10,20,1\n", r"tracks\.txt, line 3: id is 'nan'; wanted a finite number"),
         ("1,7,0,inf,10,20,1\n", r"line 1: y is 'inf'; wanted a finite number"),
         ("1,7,0,,10,20,1\n", r"line 1: y is ''; wanted a finite number"),
+        ("1,7,0,1_0,10,20,1\n", r"line 1: y is '1_0'; wanted a finite number"),
         ("0,7,0,0,10,20,1\n", r"line 1: frame is '0'; frames count from 1"),
         ("1.5,7,0,0,10,20,1\n", r"line 1: frame is '1\.5'; wanted a whole number"),
         ("1,7,0,0,-10,20,1\n", r"line 1: the box is -10×20 pixels; wanted more than 0"),

@@ -1,5 +1,6 @@
 """A table, its clip and its interval."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -55,9 +56,12 @@ def test_rows_on_every_fifth_frame_only_call_for_the_interval():
     assert agreed(rows([1, 6]), 1) == []  # two frames are too few to tell
 
 
-def test_scores_that_are_no_probabilities_and_an_empty_table_are_told():
+def test_scores_that_are_no_probabilities_own_rows_and_an_empty_table_are_told():
     (note,) = agreed(rows([1, 2, 3], score=43.3), 1)
     assert "from 43.3 to 43.3 are no probabilities" in note
+    assert agreed(replace(rows([1, 2, 3], score=0.5), own=True), 1) == [
+        "all rows are moving targets of dddas detect: every row counts as certain"
+    ]
     assert agreed(rows([]), 1, clip(5)) == ["detections det.txt holds no rows"]
 
 
