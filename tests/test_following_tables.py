@@ -47,7 +47,9 @@ def found(tracks):
 def test_a_long_stretch_without_rows_is_left_out_and_changes_no_track(interval, mode, score, memory, hits):
     knobs = {"memory_frames": memory, "hits": hits, "mode": mode, "look_ahead": "true" if hits > 1 else "false"}
     settings = load(overrides=[f"track.{name}={value}" for name, value in knobs.items()])
-    table = table_of([*range(1, 60), *range(200, 260), *range(262, 280), *range(400, 440)], score=score)
+    table = table_of(
+        [*range(1, 60), *range(200, 260), *range(262, 280), *range(400, 440), *range(450, 460)], score=score
+    )
     tracker = (PaperTracker if mode == "paper" else Tracker)(settings, interval, table.extent)
     numbers = range(1, table.last + 1, interval)
     whole = [t for n in numbers for t in tracker.feed(n, table.at(n))] + tracker.end()
@@ -57,6 +59,7 @@ def test_a_long_stretch_without_rows_is_left_out_and_changes_no_track(interval, 
     rows = sorted({n for n in table.frame.tolist() if (n - 1) % interval == 0})
     assert set(rows) <= set(fed) <= set(numbers) and fed == sorted(set(fed))
     assert {n - interval for n in rows[1:]} <= set(fed)
+    assert {n for n in numbers if 0 < n - max((r for r in rows if r <= n), default=n) <= memory} <= set(fed)
     # Two stretches, of 140 and 120 frames, of which little more than the memory is looked at.
     assert len(numbers) - len(fed) >= (260 - 2 * (memory + (hits + 5) * interval)) // interval > 20
 
