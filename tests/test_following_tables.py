@@ -1,12 +1,14 @@
 """Tables that were written by `dddas detect`, and tables with long stretches without rows."""
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from torchvision_dddas.following import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.settings import load
+from torchvision_dddas.sources import Source
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets.paper import PaperTracker
 from torchvision_dddas.targets.tracks import Tracker
@@ -125,7 +127,7 @@ def test_the_table_of_a_clip_s_own_detections_is_followed_as_these_are_with_and_
         scenes.append(Scene(frame, np.zeros((240, 320), np.uint16), detections, 3))
     wanted = found(f.tracks for f in follow_scenes(scenes, SETTINGS, 1, SIZE))
     vision = load_vision("onboard", SETTINGS)
-    assert found(f.tracks for f in follow_clip(Blank(), table, vision, SETTINGS, 1)) == wanted
+    assert found(f.tracks for f in follow_clip(cast(Source, Blank()), table, vision, SETTINGS, 1)) == wanted
     alone = list(follow_table(table, SETTINGS, 1))
     assert all(sorted(f.tracks.identity.tolist()) == [1, 2] for f in alone)
     assert all(f.tracks.score.tolist() == [0.55, 0.55] for f in alone)

@@ -154,26 +154,27 @@ class Follower:
         self.tracker = _tracker(settings, interval, size)
         self.likeness = _likeness(settings)
         self.certain = certain
+        self.spent = 0.0  # seconds on pictures, this frame's and, where a doubt asks for it later, the one before
         self.waiting: deque[Followed] = deque()
 
     def take(self, followed: Followed) -> Iterator[Followed]:
         """Feed a frame, whose tracks are not known yet; yields the frames that are settled by it."""
-        detections, frame, spent = followed.detections, followed.frame, 0.0
+        detections, frame, before = followed.detections, followed.frame, self.spent
         if self.certain:
             detections = replace(detections, score=np.ones(len(detections)))
 
         def appearance() -> np.ndarray:
-            nonlocal spent
             assert frame is not None
             start = time.perf_counter()
             found = self.likeness(frame.image, detections.box_px)
-            spent += time.perf_counter() - start
+            self.spent += time.perf_counter() - start
             return found
 
         start = time.perf_counter()
         settled = self.tracker.feed(
             followed.number, detections, followed.now_from_before, appearance if frame is not None else None
         )
+        spent = self.spent - before
         took = {"appearance": spent, "track": time.perf_counter() - start - spent}
         self.waiting.append(replace(followed, seconds=followed.seconds | took))
         yield from self._settle(settled)

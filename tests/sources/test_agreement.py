@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.agreement import agreed, looked_at
+from torchvision_dddas.sources.agreement import agreed, beginning, looked_at
 from torchvision_dddas.sources.detections import DetectionTable
 
 
@@ -71,3 +71,11 @@ def test_boxes_wholly_outside_the_picture_are_counted_and_those_at_its_edge_are_
     assert note.startswith("3 boxes lie wholly outside")
     x, y, w, h = box
     assert agreed(rows([1, 2, 3], (x - np.sign(x) * 0.5, y - np.sign(y) * 0.5, w, h)), 1, clip(3)) == []
+
+
+def test_scores_too_low_for_any_track_are_noted_and_others_are_not():
+    (note,) = beginning(rows([1, 2], score=0.8), 0.95)
+    assert "det.txt reaches track.birth_score = 0.95" in note
+    assert beginning(rows([1, 2], score=0.95), 0.95) == []
+    assert beginning(replace(rows([1, 2], score=0.8), own=True), 0.95) == []
+    assert beginning(rows([]), 0.95) == []

@@ -93,13 +93,15 @@ def track_into(
         raise InputError(f"--detections {detections} is a file that this run writes; choose another folder with --out")
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.agreement import agreed, looked_at
+        from torchvision_dddas.sources.agreement import agreed, beginning, looked_at
         from torchvision_dddas.sources.detections import read_detections
         from torchvision_dddas.vision import load
 
         table = read_detections(detections) if detections is not None else None
         source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
         notes = agreed(table, interval, source) if table is not None else []
+        if table is not None and settings.track.mode == "default":
+            notes += beginning(table, settings.track.birth_score)
         vision = load(backend, settings) if source is not None else None
         facts = {
             "input": clip,

@@ -53,6 +53,18 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
     return notes
 
 
+def beginning(table: DetectionTable, birth_score: float) -> list[str]:
+    """A note where no row's score is enough for a track to begin."""
+    if not len(table) or table.certain or float(table.score.max()) >= birth_score:
+        return []
+    return [
+        (
+            f"no score of {table.path} reaches track.birth_score = {birth_score:g}, so no track begins: lower it with "
+            "--set, or give the detections.csv if dddas detect wrote them"
+        )
+    ]
+
+
 def _grid(table: DetectionTable) -> int:
     """The widest interval whose frames hold all rows; 1 where two frames are too few to tell."""
     frames = np.unique(table.frame)
