@@ -1,7 +1,7 @@
 """From detections to identities, one look at a time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -118,13 +118,16 @@ class Tracker:
                 near.examine()
             links = self._scores(self.roster, look, look.box_px)
         tracks, now = plausible(links)
-        followed = self._followed(look, tracks, now)
+        born = self._born(look)
+        followed = self._followed(look, tracks, now, born.at_border)
         if ahead is not None and len(ahead.row):
-            chosen = self._with_next(links, tracks, now, followed, look, ahead)
+            onward = self._scores(followed.plus(born).plus(self.roster), ahead, ahead.boxes_before())
+            parts = np.split(onward, [len(followed), len(followed) + len(born)])
+            chosen = best_links(links[tracks, now], tracks, now, *parts)
         else:
             best = pairs(links)
             chosen = np.isin(tracks * len(look.row) + now, best[:, 0] * len(look.row) + best[:, 1])
-        self._commit(look, tracks[chosen], now[chosen], followed.only(chosen))
+        self._commit(look, tracks[chosen], now[chosen], followed.only(chosen), born)
         self.before = look
 
     def _sight(self, frame: int) -> Sight:
@@ -144,17 +147,8 @@ class Tracker:
             scores += likeness_scores(roster.signature, look.signature, look.visible, self.knobs)
         return scores
 
-    def _with_next(
-        self, links: np.ndarray, tracks: np.ndarray, now: np.ndarray, followed: Roster, look: _Look, ahead: _Look
-    ) -> np.ndarray:
-        """(P,) which of the plausible links (tracks, now) are best in view of the next look."""
-        born = self._begun(look, np.arange(len(look.row)))
-        onward = self._scores(followed.plus(born).plus(self.roster), ahead, ahead.boxes_before())
-        parts = np.split(onward, [len(followed), len(followed) + len(born)])
-        return best_links(links[tracks, now], tracks, now, *parts)
-
-    def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray) -> Roster:
-        """The tracks (K,) after a detection (K,) each."""
+    def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray, at_border: np.ndarray) -> Roster:
+        """The tracks (K,) after a detection (K,) each. at_border: (M,) which of the look's detections are."""
         old, box, sight = self.roster, look.box_px[now], self._sight(look.frame)
         later = kalman.predicted(old.state[tracks], look.frame, sight.agility(self.knobs))
         hits = old.hits[tracks] + 1
@@ -163,28 +157,29 @@ class Tracker:
         return Roster(
             kalman.updated(later, box, look.frame, self.knobs.scatter, self.knobs.size_scatter),
             blended(signature, seen, look.visible[now], hits) if width else signature,
-            near_border(box, self.size),
+            at_border[now],
             old.number[tracks],
             hits,
         )
 
-    def _begun(self, look: _Look, now: np.ndarray) -> Roster:
-        """Tracks that begin with a detection (K,) each."""
-        box = look.box_px[now]
+    def _born(self, look: _Look) -> Roster:
+        """Tracks that would begin with each detection (M,) of a look, without numbers yet."""
+        box, count = look.box_px, len(look.row)
         return Roster(
             kalman.started(box, look.frame, self.knobs.scatter, self.pace.speed, self.knobs.size_scatter),
-            look.signature[now],
+            look.signature,
             near_border(box, self.size),
-            self.begun + np.arange(len(now)),
-            np.ones(len(now), np.int64),
+            np.full(count, -1),
+            np.ones(count, np.int64),
         )
 
-    def _commit(self, look: _Look, tracks: np.ndarray, now: np.ndarray, followed: Roster) -> None:
+    def _commit(self, look: _Look, tracks: np.ndarray, now: np.ndarray, followed: Roster, born: Roster) -> None:
         """Write down that these tracks (K,), now `followed`, have these detections (K,), and begin new ones."""
         unmatched = np.ones(len(look.row), bool)
         unmatched[now] = False
-        new = np.flatnonzero(unmatched & (look.score >= self.knobs.birth_score))
-        begun = self._begun(look, new)
+        beginning = unmatched & (look.score >= self.knobs.birth_score)
+        new = np.flatnonzero(beginning)
+        begun = replace(born.only(beginning), number=self.begun + np.arange(len(new)))
         self.begun += len(begun)
         if self.before is not None:
             self.births += int((~begun.at_border).sum())
