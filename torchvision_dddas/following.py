@@ -7,24 +7,21 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.sources.agreement import looked_at
 from torchvision_dddas.sources.detections import DetectionTable
-from torchvision_dddas.sources.source import Source
+from torchvision_dddas.sources.source import Source, looked_at
 from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.tracks import Tracker
 from torchvision_dddas.types import Adjustment, Detections, Followed, Frame, Scene, Tracks
 from torchvision_dddas.vision.camera import Camera
 from torchvision_dddas.vision.protocol import Vision
 
-
-def used(frame: int, interval: int) -> bool:
-    """Whether a frame is one of 1, 1 + interval, 1 + 2 interval, ..."""
-    return (frame - 1) % interval == 0
+if TYPE_CHECKING:
+    from torchvision_dddas.targets.paper import PaperTracker
 
 
 def follow_scenes(
@@ -43,7 +40,7 @@ def follow_scenes(
         adjustments += scene.adjustments
         seconds.update(scene.seconds)
         number = scene.frame.number
-        if not used(number, interval):
+        if not looked_at(number, interval):
             continue
         # A step that is not known counts as none: the others are nearer to the truth than a camera that stood still.
         known = [step for step in steps if step is not None]
@@ -114,7 +111,7 @@ def _frames(table: DetectionTable, interval: int, forgotten: int) -> Iterator[in
     if not len(table):
         return
     start, last = table.first + -(table.first - 1) % interval, table.last - (table.last - 1) % interval
-    for row in np.union1d(table.frame[looked_at(table, interval)], [last]).tolist():
+    for row in np.union1d(table.frame[looked_at(table.frame, interval)], [last]).tolist():
         quiet = range(start, min(row, start + forgotten), interval)
         yield from quiet
         yield from range(max(start + len(quiet) * interval, row - interval), row + 1, interval)
@@ -198,21 +195,7 @@ def _as_given(tracks: Tracks, given: Detections) -> Tracks:
     return replace(tracks, score=score)
 
 
-class _Associates(Protocol):
-    """What the trackers of both modes offer."""
-
-    def feed(
-        self,
-        frame: int,
-        detections: Detections,
-        now_from_before: np.ndarray | None = None,
-        appearance: Callable[[], np.ndarray] | None = None,
-    ) -> list[Tracks]: ...
-
-    def end(self) -> list[Tracks]: ...
-
-
-def _tracker(settings: Settings, interval: int, size: tuple[float, float] | None) -> _Associates:
+def _tracker(settings: Settings, interval: int, size: tuple[float, float] | None) -> "Tracker | PaperTracker":
     if settings.track.mode == "paper":
         from torchvision_dddas.targets.paper import PaperTracker
 

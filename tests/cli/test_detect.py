@@ -8,20 +8,11 @@ from pathlib import Path
 import cv2
 import pytest
 
+from tests.cli.mistakes import bad
 from torchvision_dddas.cli.detect import clip_names
 from torchvision_dddas.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def bad(result):
-    """The one line that a user's mistake leaves."""
-    assert result.exit_code == 2, result.output
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("dddas: ")
-    assert "Traceback" not in result.output
-    return lines[0]
 
 
 def test_masks_and_tables_for_every_frame_and_no_word_when_quiet(dddas, engine, clip, tmp_path):

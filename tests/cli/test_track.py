@@ -11,18 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.cli.mistakes import bad
+
 UNREAD = "the frame could not be read"
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def bad(result):
-    """The one line that a user's mistake leaves."""
-    assert result.exit_code == 2, result.output
-    lines = result.stderr.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("dddas: ")
-    assert "Traceback" not in result.output
-    return lines[0]
 
 
 def walker(frames, x=4.0):

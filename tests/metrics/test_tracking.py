@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluate import evaluate
 from torchvision_dddas.metrics import clear, hota, tracking
-from torchvision_dddas.metrics.matching import TrackTable, empty_table, pair
+from torchvision_dddas.metrics.matching import TrackTable, pair
 from torchvision_dddas.metrics.tracking import TrackCounts
 
 BOX = {"a": (0, 0, 10, 20), "b": (100, 0, 10, 20), "c": (0, 300, 10, 20)}
@@ -22,6 +22,9 @@ def table(*frames):
         np.array([name for _, name, _ in rows], np.int64),
         np.array([box for _, _, box in rows], float).reshape(-1, 4),
     )
+
+
+NOTHING = table()
 
 
 def walk(seed, people=5, frames=12):
@@ -113,12 +116,12 @@ def test_a_found_box_is_not_removed_if_a_true_box_that_counts_needs_it():
 
 
 def test_nothing_found_scores_zero_and_nothing_true_is_undefined():
-    m = scores(THREE, empty_table())
+    m = scores(THREE, NOTHING)
     assert {m[k] for k in ("hota", "deta", "assa", "mota", "idf1", "recall", "precision")} == {0}
     assert (m["mostly_lost"], m["loca"]) == (1, 1)
-    m = scores(empty_table(), THREE)
+    m = scores(NOTHING, THREE)
     assert all(math.isnan(m[k]) for k in ("hota", "assa", "loca", "mota", "idf1", "recall"))
-    assert tracking.count(empty_table(), empty_table()).clear == clear.Clear()
+    assert tracking.count(NOTHING, NOTHING).clear == clear.Clear()
 
 
 def test_pooled_counts_are_those_of_one_long_clip():

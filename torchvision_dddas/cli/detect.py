@@ -2,26 +2,18 @@
 
 import re
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 
 if TYPE_CHECKING:
     from torchvision_dddas.settings import Settings
     from torchvision_dddas.sinks.journal import Journal
-
-
-class Backend(StrEnum):
-    """The engines that --backend names."""
-
-    auto = "auto"
-    torch = "torch"
-    onboard = "onboard"
 
 
 @explained
@@ -33,25 +25,17 @@ def detect(
     out: Annotated[Path, typer.Option(help="Folder for the results; several inputs get a folder each in it.")] = Path(
         "dddas-out"
     ),
-    config: Annotated[
-        str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a knob; may be repeated.")
-    ] = None,
-    backend: Annotated[
-        Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")
-    ] = Backend.auto,
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Engine = Backend.auto,
     save: Annotated[
         str, typer.Option(metavar="NAMES", help="masks,overlay, all or none; the tables are always written.")
     ] = "all",
     telemetry: Annotated[
         Path | None, typer.Option(metavar="CSV", help="time_s,altitude_m,speed_m_s of the vehicle.")
     ] = None,
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
+    rate: Rate = None,
+    quiet: Quiet = False,
 ) -> None:
     """Find what moves in clips filmed by a moving camera.
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchvision_dddas.cli.detect import Backend
 from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
@@ -32,22 +32,14 @@ def track(
     ] = None,
     interval: Annotated[int, typer.Option(metavar="D", help="Look at every D-th frame: 1, 1+D, 1+2D, ...")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-tracks"),
-    config: Annotated[
-        str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a knob; may be repeated.")
-    ] = None,
-    backend: Annotated[
-        Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")
-    ] = Backend.auto,
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Engine = Backend.auto,
     save: Annotated[
         str | None, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
     ] = None,
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
+    rate: Rate = None,
+    quiet: Quiet = False,
 ) -> None:
     """Give the targets of a clip identities that last: its own detections, or those of a table, with or without clip.
 
@@ -93,8 +85,9 @@ def track_into(
         raise InputError(f"--detections {detections} is a file that this run writes; choose another folder with --out")
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.agreement import agreed, beginning, looked_at
+        from torchvision_dddas.sources.agreement import agreed, beginning
         from torchvision_dddas.sources.detections import read_detections
+        from torchvision_dddas.sources.source import looked_at
         from torchvision_dddas.vision import load
 
         table = read_detections(detections) if detections is not None else None
@@ -113,7 +106,9 @@ def track_into(
                 "rate_hz": source.rate_hz,
                 "announced_frames": source.count,
             },
-            "rows": None if table is None else {"given": len(table), "used": int(looked_at(table, interval).sum())},
+            "rows": None
+            if table is None
+            else {"given": len(table), "used": int(looked_at(table.frame, interval).sum())},
             "interval_frames": interval,
             "backend": vision and vision.name,
             "settings": settings.model_dump(),

@@ -56,11 +56,6 @@ class Paired(NamedTuple):
     found_boxes: np.ndarray
 
 
-def empty_table() -> TrackTable:
-    """A table without rows."""
-    return TrackTable(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4)))
-
-
 def pair(
     truth: TrackTable, found: TrackTable, ignored: TrackTable | None = None, ignoring: Ignoring = "dropped"
 ) -> Paired:

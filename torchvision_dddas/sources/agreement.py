@@ -4,12 +4,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.detections import DetectionTable
-from torchvision_dddas.sources.source import Source
-
-
-def looked_at(table: DetectionTable, interval: int) -> np.ndarray:
-    """(N,) bool: the rows on frames 1, 1 + interval, 1 + 2 interval, ..."""
-    return (table.frame - 1) % interval == 0
+from torchvision_dddas.sources.source import Source, looked_at
 
 
 def agreed(table: DetectionTable, interval: int, source: Source | None = None) -> list[str]:
@@ -29,7 +24,7 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
             f"{source.count} ({beyond} of {len(table)} rows lie beyond); is it the table of this clip?"
         )
     notes = []
-    left_out = len(table) - int(looked_at(table, interval).sum())
+    left_out = len(table) - int(looked_at(table.frame, interval).sum())
     if left_out == len(table):
         looks = ", ".join(str(1 + k * interval) for k in range(3))
         raise InputError(

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.source import Problem, quiet_opencv
+from torchvision_dddas.sources.source import Problem, looked_at, quiet_opencv
 from torchvision_dddas.types import Frame
 
 IMAGE_SUFFIXES = frozenset(
@@ -63,7 +63,7 @@ class ImageSource:
         saturated = False
         for number, file in enumerate(self.files, start=1):
             self.last = number
-            if (number - 1) % interval:
+            if not looked_at(number, interval):
                 continue
             image = read_image(file)
             if image is None:

@@ -3,9 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, overload
 
 import cv2
+import numpy as np
 
 from torchvision_dddas.types import Frame
 
@@ -46,6 +47,15 @@ class Source(Protocol):
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ... alone: the others are not decoded as far as that can be had."""
         ...
+
+
+@overload
+def looked_at(frame: int, interval: int) -> bool: ...
+@overload
+def looked_at(frame: np.ndarray, interval: int) -> np.ndarray: ...
+def looked_at(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
+    """Whether a frame, or which of several, is one of 1, 1 + interval, 1 + 2 interval, ..."""
+    return (frame - 1) % interval == 0
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.source import Problem, quiet_opencv
+from torchvision_dddas.sources.source import Problem, looked_at, quiet_opencv
 from torchvision_dddas.types import Frame
 
 # FFmpeg draws any text file as an old terminal would; nobody means that.
@@ -96,7 +96,7 @@ class VideoSource:
             if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
                 stamp_s = max((number - 1) / self.rate_hz, time_s)
             time_s = stamp_s
-            if (number - 1) % interval:
+            if not looked_at(number, interval):
                 continue
             decoded, image = capture.retrieve()
             if not decoded:
