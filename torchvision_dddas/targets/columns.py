@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csc_array, csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csc_array
 
 from torchvision_dddas.errors import InputError
 
 # A group with no more columns than this is tried first, and given to HiGHS after so many steps: fewer, and HiGHS, whose
 # call alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
 TRIED_COLUMNS, TRIED_STEPS = 200, 1000
-PRICE_ROUNDS = 6
-HAND_COLUMNS = 30
+# Tight prices bound the search; for fewer columns, finding them takes longer than they save.
+PRICE_ROUNDS, EASY_COLUMNS = 6, 30
 
 
 def best_columns(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Int[np.ndarray, "Z"]:
@@ -44,17 +43,18 @@ def good_columns(
         return np.zeros(0, np.int64), True
     kept = columns[order]
     gain = score[order] / score[order].max()
-    chosen, left_open = _by_hand(kept, gain)
-    certain = True
-    if left_open.any():
-        hard, worth = kept[left_open], gain[left_open]
-        incidence = _incidence(hard)
-        group = _groups(incidence)
-        tried, still = _tried(incidence, worth, group)
-        if still.any():
-            parts = (incidence[:, still], worth[still], group[still])
-            tried[still], certain = _programmed(*parts, most_branches)
-        chosen[left_open] = tried
+    held = [[3 * node + layer for layer, node in enumerate(column) if node >= 0] for column in kept.tolist()]
+    gains = gain.tolist()
+    chosen, left_open = np.zeros(len(gain), bool), np.full(len(gain), -1)
+    for name, members in enumerate(_joined(held)):
+        found = _tried([held[column] for column in members], [gains[column] for column in members])
+        if found is None:
+            left_open[members] = name
+        else:
+            chosen[[members[place] for place in found]] = True
+    certain, hard = True, left_open >= 0
+    if hard.any():
+        chosen[hard], certain = _programmed(_incidence(kept[hard]), gain[hard], left_open[hard], most_branches)
     return np.sort(order[chosen]), certain
 
 
@@ -94,38 +94,6 @@ def _solve(
     return (np.zeros(len(gain)) if solved.x is None else solved.x), bool(solved.success)
 
 
-def _by_hand(
-    columns: Int[np.ndarray, "C 3"], gain: Float[np.ndarray, "C"]
-) -> tuple[Bool[np.ndarray, "C"], Bool[np.ndarray, "C"]]:
-    """The columns chosen in the smallest groups, and those of larger groups, which are left open.
-
-    Most targets are nearly alone with themselves. For a handful of columns each call of NumPy costs more than this.
-    """
-    chosen, left_open = np.zeros(len(gain), bool), np.zeros(len(gain), bool)
-    gains = gain.tolist()
-    held = [[3 * node + layer for layer, node in enumerate(column) if node >= 0] for column in columns.tolist()]
-    for members in _joined(held):
-        if len(members) > HAND_COLUMNS:
-            left_open[members] = True
-            continue
-        price: dict[int, float] = {}
-        for column in members:
-            share = gains[column] / len(held[column])
-            for node in held[column]:
-                if price.get(node, 0.0) < share:
-                    price[node] = share
-        # Of one node a layer any two columns meet, unless one is a node alone: the best takes all.
-        if len({node % 3 for node in price}) == len(price) and min(len(held[column]) for column in members) > 1:
-            chosen[max(members, key=gains.__getitem__)] = True
-            continue
-        found = least_loss([held[c] for c in members], [gains[c] for c in members], price, TRIED_STEPS)
-        if found is None:
-            left_open[members] = True
-        else:
-            chosen[[members[place] for place in found]] = True
-    return chosen, left_open
-
-
 def _joined(held: list[list[int]]) -> list[list[int]]:
     """The groups of columns that share nodes, by their places; held: the nodes of each column."""
     home: dict[int, tuple[list[int], list[int]]] = {}  # of each node: its group's columns and nodes
@@ -147,30 +115,18 @@ def _joined(held: list[list[int]]) -> list[list[int]]:
     return list({id(group): sorted(group[0]) for group in home.values()}.values())
 
 
-def _tried(
-    incidence: csc_array, gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"]
-) -> tuple[Bool[np.ndarray, "C"], Bool[np.ndarray, "C"]]:
-    """The columns chosen by trying, and those of the groups that it leaves open."""
-    price = _prices(incidence, gain)
-    start, nodes, prices = incidence.indptr.tolist(), incidence.indices.tolist(), price.tolist()
-    members: dict[int, list[int]] = {}
-    for column, name in enumerate(group.tolist()):
-        members.setdefault(name, []).append(column)
-    gains = gain.tolist()
-    chosen, left_open = np.zeros(len(gain), bool), np.zeros(len(gain), bool)
-    for columns in members.values():
-        if len(columns) == 1:
-            chosen[columns[0]] = True
-            continue
-        found = None
-        if len(columns) <= TRIED_COLUMNS:
-            held = [nodes[start[column] : start[column + 1]] for column in columns]
-            found = least_loss(held, [gains[column] for column in columns], prices, TRIED_STEPS)
-        if found is None:
-            left_open[columns] = True
-        else:
-            chosen[[columns[c] for c in found]] = True
-    return chosen, left_open
+def _tried(held: list[list[int]], gain: list[float]) -> list[int] | None:
+    """The best choice in one group, as places in its list; None if that takes too long to try.
+
+    Most targets are nearly alone with themselves. Of one node a layer any two columns meet, unless one is a node alone:
+    the best takes all.
+    """
+    if len(held) > TRIED_COLUMNS:
+        return None
+    price = _prices(held, gain)
+    if len({node % 3 for node in price}) == len(price) and min(map(len, held)) > 1:
+        return [gain.index(max(gain))]
+    return least_loss(held, gain, price, TRIED_STEPS)
 
 
 def least_loss(
@@ -215,19 +171,25 @@ def least_loss(
     return best
 
 
-def _prices(incidence: csc_array, gain: Float[np.ndarray, "C"]) -> Float[np.ndarray, "V"]:
+def _prices(held: list[list[int]], gain: list[float]) -> dict[int, float]:
     """Prices of the nodes that pay for every column: gains shared evenly, then lowered by what is over."""
-    start, nodes = incidence.indptr[:-1], incidence.indices
-    count = np.diff(incidence.indptr)
-    price = np.zeros(incidence.shape[0])
-    np.maximum.at(price, nodes, np.repeat(gain / count, count))
+    price: dict[int, float] = {}
+    for nodes, worth in zip(held, gain, strict=True):
+        share = worth / len(nodes)
+        for node in nodes:
+            if price.get(node, 0.0) < share:
+                price[node] = share
+    if len(held) <= EASY_COLUMNS:
+        return price
+    place = {node: k for k, node in enumerate(price)}
+    at, count = np.array([place[node] for nodes in held for node in nodes]), np.array([len(nodes) for nodes in held])
+    start, level = np.cumsum(count) - count, np.array(list(price.values()))
     for _ in range(PRICE_ROUNDS):
-        over = np.add.reduceat(price[nodes], start) - gain
-        least = price * 3
-        np.minimum.at(least, nodes, np.repeat(over, count))
+        least = level * 3
+        np.minimum.at(least, at, np.repeat(np.add.reduceat(level[at], start) - gain, count))
         # A column holds up to three nodes: a third each keeps it paid for.
-        price -= np.maximum(least, 0.0) / 3
-    return price
+        level -= np.maximum(least, 0.0) / 3
+    return dict(zip(price, level.tolist(), strict=True))
 
 
 def _incidence(columns: Int[np.ndarray, "C 3"]) -> csc_array:
@@ -237,15 +199,6 @@ def _incidence(columns: Int[np.ndarray, "C 3"]) -> csc_array:
     known, nodes = np.unique(names, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(there.sum(axis=1))])
     return csc_array((np.ones(len(nodes)), nodes, start), shape=(len(known), len(columns)))
-
-
-def _groups(incidence: csc_array) -> Int[np.ndarray, "C"]:
-    """The number of the group of each column; columns that share a node share their group."""
-    height, width = incidence.shape
-    # One graph of columns and nodes; the nodes' own rows are empty.
-    start = np.concatenate([incidence.indptr, np.full(height, incidence.nnz)])
-    graph = csr_array((incidence.data, incidence.indices + width, start), shape=(width + height, width + height))
-    return connected_components(graph, directed=False)[1][:width]
 
 
 def _checked(
