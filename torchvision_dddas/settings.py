@@ -305,6 +305,74 @@ class PaperKnobs(Group):
     )
 
 
+class PeopleKnobs(Group):
+    """Recognizing people by HOG and a linear SVM (appendix A, III-B): which windows are scored, and what they yield."""
+
+    classifier: str = knob(
+        "opencv", "-", meaning="opencv: the coefficients of its default people detector; or a file of a linear SVM's"
+    )
+    window_width_px: int = knob(64, "px", 8, 1024, meaning="width of the window that the classifier sees")
+    window_height_px: int = knob(128, "px", 8, 1024, meaning="height of the window that the classifier sees")
+    cell_px: int = knob(8, "px", 2, 64, meaning="side of a cell, which has one histogram")
+    block_px: int = knob(16, "px", 2, 256, meaning="side of a block of cells, which is normalised as one")
+    block_stride_px: int = knob(8, "px", 1, 256, meaning="distance from block to block in a window")
+    window_stride_px: int = knob(8, "px", 1, 256, meaning="distance from window to window in each level of the pyramid")
+    bins: int = knob(9, "bins", 2, 36, meaning="directions of a histogram, over half a turn, or a whole one if signed")
+    signed: bool = knob(False, "-", meaning="tell a gradient from its opposite; false folds them together")
+    clip: float = knob(0.2, "-", 0.01, 1, meaning="largest share of a block's norm that one number may have (L2-Hys)")
+    gamma: bool = knob(True, "-", meaning="take square roots of the levels first")
+    scale_step: float = knob(1.05, "-", 1.01, 2, meaning="how much smaller each level of the pyramid is than the last")
+    enlarge: float = knob(
+        1.0,
+        "-",
+        1,
+        4,
+        meaning="the pyramid begins with the picture so many times larger, for people smaller than windows",
+    )
+    max_levels: int = knob(64, "levels", 1, 200, meaning="levels of the pyramid at most")
+    padding_px: int = knob(0, "px", 0, 256, meaning="border that each level is given by reflection, for people at it")
+    threshold: float = knob(0.0, "-", -10, 10, meaning="a window whose score is above it may be a person")
+    suppression: Literal["nms", "opencv", "none"] = knob(
+        "nms",
+        "-",
+        meaning="one box a person: nms keeps the best of windows that overlap; opencv averages groups; none keeps all",
+    )
+    overlap: float = knob(0.5, "-", 0, 1, meaning="nms: boxes that share more of their union show the same person")
+    group: int = knob(2, "windows", 0, 100, meaning="opencv: a group of no more windows than this is dropped")
+    group_distance: float = knob(0.2, "-", 0, 1, meaning="opencv: edges this close, in box sizes, make a group")
+    height_share: float = knob(0.75, "-", 0.1, 1, meaning="body height over window height")
+    width_share: float = knob(0.5, "-", 0.1, 1, meaning="width of the body's box over window width")
+    feet_share: float = knob(0.875, "-", 0.1, 1.2, meaning="from the window's top to the feet, over window height")
+    probability_slope: float = knob(2.0, "-", 0.01, 100, meaning="probability = 1 / (1 + exp(-slope (score - even)))")
+    probability_even: float = knob(0.5, "-", -10, 10, meaning="score at which a person is as likely as not")
+    search: Literal["everywhere", "regions"] = knob(
+        "everywhere",
+        "-",
+        meaning="look at the whole picture in every frame, or between whole looks only around what is expected there",
+    )
+    rescan_frames: int = knob(10, "frames", 1, 10_000, meaning="regions: every so many frames the whole picture")
+    region_margin: float = knob(0.5, "heights", 0, 5, meaning="regions: so far around a body that is expected")
+    region_scales: float = knob(1.3, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
+
+
+class GroundKnobs(Group):
+    """Where people stand, seen from the ground (appendix A, IV-C), and which of several sightings are one person."""
+
+    mode: Literal["default", "paper"] = knob(
+        "default", "-", meaning="default: height and foot row with covariances, on the ellipsoid; paper: eq. 13 to 15"
+    )
+    use: Literal["both", "height", "feet"] = knob(
+        "both",
+        "-",
+        meaning="what tells the distance: the body's height, the row of its feet, or both by their variances",
+    )
+    body_height_m: float = knob(1.75, "m", 0.3, 3, meaning="height of a typical person")
+    body_height_sigma_m: float = knob(0.1, "m", 0, 1, meaning="standard deviation of people's heights")
+    height_sigma: float = knob(0.05, "-", 0, 1, meaning="standard deviation of a box's height, in heights")
+    feet_sigma: float = knob(0.03, "-", 0, 1, meaning="standard deviation of the foot row, in box heights")
+    gate_sigmas: float = knob(3.0, "-", 0.5, 10, meaning="sightings further apart than this are not of one person")
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -319,6 +387,8 @@ class Settings(Group):
     gates: GateKnobs = GateKnobs()
     track: TrackKnobs = TrackKnobs()
     paper: PaperKnobs = PaperKnobs()
+    people: PeopleKnobs = PeopleKnobs()
+    ground: GroundKnobs = GroundKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -370,6 +440,8 @@ def range_of(field: FieldInfo) -> str:
         rules += [rule for entry in inner for rule in (entry.metadata if isinstance(entry, FieldInfo) else [entry])]
     if kind is bool:
         return "true or false"
+    if kind is str:
+        return "a name or a file"
     if get_origin(kind) is Literal:
         return " or ".join(str(choice) for choice in get_args(kind))
     low = next((rule.ge for rule in rules if getattr(rule, "ge", None) is not None), None)

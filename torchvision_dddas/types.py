@@ -71,6 +71,91 @@ class Detections:
 
 
 @dataclass(frozen=True)
+class Adjustment:
+    """A knob that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
+
+    frame: int
+    knob: str
+    old: float
+    new: float
+    cause: str
+
+
+@dataclass(frozen=True)
+class LinearSvm:
+    """What tells a person from anything else: score = weights . descriptor + bias.
+
+    weights: (F,) float32 in OpenCV's order: blocks and cells column by column, bins fastest. origin: whence they are.
+    """
+
+    weights: np.ndarray
+    bias: float
+    origin: str = ""
+
+
+@dataclass(frozen=True)
+class People:
+    """The people recognized in one frame, one row a person.
+
+    box_px: (N, 4) float64, the body: x, y of the top left pixel, width, height. score: (N,) probability in [0, 1].
+    margin: (N,) the classifier's own score. cut: (N,) bool, the picture's border cuts the body: its height is not to be
+    trusted. window_px: (N, 4) the window that was recognized; it has a margin around the body.
+    """
+
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    margin: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    cut: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    window_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def __len__(self) -> int:
+        return len(self.box_px)
+
+    @property
+    def feet_px(self) -> np.ndarray:
+        """(N, 2) u, v of the point between the feet, from the first pixel's centre: the middle of the lower edge."""
+        return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - 0.5
+
+
+@dataclass(frozen=True)
+class Recognized:
+    """All that is known of one frame after it was searched for people.
+
+    frame: the picture. people: whom it shows. regions_px: (R, 4) where it was searched; None: everywhere.
+    share: windows scored, as a share of all that a search everywhere scores.
+    cause: why nothing could be concluded; empty where all is well. adjustments, seconds: as in Scene.
+    """
+
+    frame: Frame
+    people: People
+    regions_px: np.ndarray | None = None
+    share: float = 1.0
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Where targets stand on the ground, one row a sighting, sorted by frame.
+
+    frame: (N,) int64 from 1. target: (N,) int64, the identity where there is one, else the row in its frame, from 1.
+    east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN where unknown. score: (N,) in [0, 1].
+    origin_deg: (longitude, latitude) of east = north = 0 on the WGS84 ellipsoid; None where there is no geographic one.
+    """
+
+    frame: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    target: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    covariance_m2: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    origin_deg: tuple[float, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
 class Tracks:
     """The targets of one frame with their identities, one row a target.
 
@@ -86,17 +171,6 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.identity)
-
-
-@dataclass(frozen=True)
-class Adjustment:
-    """A knob that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
-
-    frame: int
-    knob: str
-    old: float
-    new: float
-    cause: str
 
 
 @dataclass(frozen=True)

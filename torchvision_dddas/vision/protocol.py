@@ -87,3 +87,33 @@ class Vision(Protocol):
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """What moves in each window's reference frame."""
         ...
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rectangle of a level of the pyramid, in pixels of that level: the windows that lie in it are scored.
+
+    level: (width, height) that the picture is resized to. x, y: of the top left pixel, multiples of the window stride
+    from -padding on. width, height: of the part.
+    """
+
+    level: tuple[int, int]
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+class Recognizer(Protocol):
+    """A back end's scorer of windows, for one classifier and one layout of its descriptor (`PeopleKnobs`)."""
+
+    name: str
+
+    def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
+        """For every image its parts' score maps: (ny, nx) float32, [j, i] the window at (x + i stride, y + j stride).
+
+        images: uint8 (H, W) or (H, W, 3) BGR; resized as by OpenCV's INTER_LINEAR_EXACT, reflected (101) at the border.
+        A part does not see its own edge: its scores are those of the same windows in a search everywhere.
+        A part that is smaller than the window has an empty map.
+        """
+        ...

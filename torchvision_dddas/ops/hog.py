@@ -1,0 +1,220 @@
+"""Histograms of oriented gradients under a linear SVM, densely: the score of every window of a picture at once.
+
+Written so that scores are OpenCV's `HOGDescriptor` to 1e-4: square-root gamma, its polynomial for the arc tangent,
+circular bins, Gaussian and bilinear weights in a block, L2-Hys with its constants. Sums alone are in another order.
+Source: N. Dalal and B. Triggs, Histograms of oriented gradients for human detection, CVPR 2005.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.errors import InputError
+
+# OpenCV's odd polynomial for the arc tangent of 0 .. 1, in degrees (modules/core, mathfuncs_core: fastAtan).
+_ARC = tuple(
+    p * 180 / math.pi for p in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
+)
+_TINY = 2.220446049250313e-16  # what it adds to the divisor
+
+# L2-Hys: added to the norm before the clip, for each number of a block, and after it (modules/objdetect, hog.cpp).
+_SOFT_FIRST, _SOFT_SECOND = 0.1, 1e-3
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a descriptor's numbers come from; lengths in pixels.
+
+    window: (width, height). cell and block are squares. stride: from block to block. bins: over half a turn, or a whole
+    one if signed. clip: of L2-Hys. gamma: whether square roots of the levels are taken.
+    Raises InputError where cells do not fill the block, or blocks the window.
+    """
+
+    window: tuple[int, int] = (64, 128)
+    cell: int = 8
+    block: int = 16
+    stride: int = 8
+    bins: int = 9
+    signed: bool = False
+    clip: float = 0.2
+    gamma: bool = True
+
+    def __post_init__(self) -> None:
+        if self.block % self.cell:
+            raise InputError(f"a block of {self.block} px is no multiple of a cell of {self.cell} px")
+        for name, length in zip(("width", "height"), self.window, strict=True):
+            if length < self.block or (length - self.block) % self.stride:
+                raise InputError(
+                    f"blocks of {self.block} px every {self.stride} px do not fill a window {name} of {length} px; "
+                    f"wanted {self.block} + a multiple of {self.stride}"
+                )
+
+    @property
+    def cells(self) -> int:
+        """Cells along a block's side."""
+        return self.block // self.cell
+
+    @property
+    def blocks(self) -> tuple[int, int]:
+        """Blocks of a window, (across, down)."""
+        width, height = ((length - self.block) // self.stride + 1 for length in self.window)
+        return width, height
+
+    @property
+    def features(self) -> int:
+        """Numbers of a descriptor."""
+        return self.blocks[0] * self.blocks[1] * self.cells**2 * self.bins
+
+
+def gradient(bordered: Tensor, gamma: bool = True) -> tuple[Tensor, Tensor]:
+    """(B, 1, H, W) differences of neighbours across and down, of the channel where they are largest.
+
+    bordered: (B, C, H + 2, W + 2) levels 0 .. 255 with a border of one pixel, reflected (101) at the picture's edge.
+    Of equal channels the first wins, as in OpenCV's BGR order.
+    """
+    levels = bordered.sqrt() if gamma else bordered
+    across = levels[..., 1:-1, 2:] - levels[..., 1:-1, :-2]
+    down = levels[..., 2:, 1:-1] - levels[..., :-2, 1:-1]
+    square = across * across + down * down
+    dx, dy, largest = across[:, :1], down[:, :1], square[:, :1]
+    for channel in range(1, bordered.shape[1]):
+        here = slice(channel, channel + 1)
+        wins = square[:, here] > largest
+        dx, dy = torch.where(wins, across[:, here], dx), torch.where(wins, down[:, here], dy)
+        largest = torch.maximum(largest, square[:, here])
+    return dx, dy
+
+
+def angle(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
+    """Direction in bins, from -bins/2 - 0.5 to bins/2 - 0.5: 0 is the centre of the first bin.
+
+    By OpenCV's polynomial, up to 0.01 degrees off the true angle, and so are the trained weights.
+    """
+    x, y = dx.abs(), dy.abs()
+    ratio = torch.minimum(x, y) / (torch.maximum(x, y) + _TINY).clamp(min=_TINY)
+    square = ratio * ratio
+    degrees = (((_ARC[3] * square + _ARC[2]) * square + _ARC[1]) * square + _ARC[0]) * ratio
+    degrees = torch.where(x < y, 90 - degrees, degrees)
+    if layout.signed:
+        degrees = torch.where(dx < 0, 180 - degrees, degrees)
+        turned = torch.where(dy < 0, -degrees, degrees)
+    else:
+        turned = torch.where((dx < 0) ^ (dy < 0), -degrees, degrees)
+    return turned * (layout.bins / (360 if layout.signed else 180)) - 0.5
+
+
+def _knots(bins: int) -> list[int]:
+    """The whole numbers between which `angle` lies; knot k is the centre of bin k modulo bins."""
+    return list(range(math.floor(-bins / 2 - 0.5), math.ceil(bins / 2 - 0.5) + 1))
+
+
+def ramps(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
+    """(B, K, H, W): magnitude m, then relu(m (angle - k)) for all knots k but the last.
+
+    The share of m that goes to a bin is a hat over the angle, thus a sum of ramps: `_hats` says which, and as it is
+    linear it can wait until after the pooling, where there are 64 times fewer numbers.
+    """
+    magnitude = torch.sqrt((dx * dx + dy * dy).clamp(min=1e-30))
+    turn = magnitude * angle(dx, dy, layout)
+    knots = torch.tensor(_knots(layout.bins)[:-1], dtype=dx.dtype, device=dx.device).view(1, -1, 1, 1)
+    return torch.cat([magnitude, (turn - magnitude * knots).relu()], 1)
+
+
+def _hats(bins: int) -> Tensor:
+    """(bins, K) float64: the hats of the bins as sums of ramps."""
+    knots = _knots(bins)
+    last = len(knots) - 1
+    hats = torch.zeros(bins, last + 1, dtype=torch.float64)
+    for place, knot in enumerate(knots):
+        row = hats[knot % bins]
+        if place == 0:
+            row[0] += 1  # left of the next knot the hat is 1 - (t - k), plus what bends it to zero
+            row[1] -= 1
+            row[2] += 1
+        else:
+            row[place] += 1
+            if place < last:
+                row[place + 1] -= 2
+            if place + 2 <= last:
+                row[place + 2] += 1
+    return hats
+
+
+def _weights(layout: Layout) -> Tensor:
+    """(cells, block) float64: what a pixel of a block's row or column gives to each of its cells.
+
+    Gaussian with a sigma of a quarter of the block, centred half a pixel off as in OpenCV, times a bilinear hat.
+    """
+    place = torch.arange(layout.block, dtype=torch.float64)
+    sigma = layout.block / 4
+    gauss = torch.exp(-((place - layout.block / 2) ** 2) / (2 * sigma**2))
+    cell = torch.arange(layout.cells, dtype=torch.float64)[:, None]
+    hat = (1 - ((place + 0.5) / layout.cell - 0.5 - cell).abs()).clamp(min=0)
+    return gauss * hat
+
+
+def _pooled(maps: Tensor, layout: Layout) -> Tensor:
+    """(..., rows, N) -> (..., cells, blocks, N): weighted sums over the rows of each block."""
+    step = math.gcd(layout.block, layout.stride)
+    parts, hop = layout.block // step, layout.stride // step
+    strips = maps.shape[-2] // step
+    blocks = (strips - parts) // hop + 1
+    cut = maps[..., : strips * step, :].unflatten(-2, (strips, step))
+    weights = _weights(layout).to(maps).view(layout.cells, parts, step)
+    rows = torch.matmul(weights.flatten(0, 1), cut).unflatten(-2, (layout.cells, parts))  # (..., strips, c, parts, N)
+    total = None
+    for part in range(parts):
+        here = rows[..., part : part + (blocks - 1) * hop + 1 : hop, :, part, :]
+        total = here if total is None else total + here
+    assert total is not None
+    return total.transpose(-3, -2)
+
+
+def blocks(bordered: Tensor, layout: Layout) -> Tensor:
+    """(B, F, ny, nx) normalised histograms of every block, F = bins x cells down x cells across.
+
+    bordered: as in `gradient`; its inside must hold a block.
+    """
+    maps = ramps(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
+    down = _pooled(maps, layout)  # (B, K, cy, ny, W)
+    both = _pooled(down.transpose(-1, -2), layout)  # (B, K, cy, W, ny) -> (B, K, cy, cx, nx, ny)
+    hats = _hats(layout.bins).to(maps)
+    histogram = torch.matmul(hats, both.flatten(2)).unflatten(2, both.shape[2:])  # (B, bins, cy, cx, nx, ny)
+    histogram = histogram.transpose(-1, -2).flatten(1, 3)
+    size = layout.bins * layout.cells**2
+    norm = torch.sqrt((histogram * histogram).sum(1, keepdim=True).clamp(min=1e-30)) + size * _SOFT_FIRST
+    clipped = (histogram / norm).clamp(max=layout.clip)
+    return clipped / (torch.sqrt((clipped * clipped).sum(1, keepdim=True).clamp(min=1e-30)) + _SOFT_SECOND)
+
+
+def arranged(weights: Tensor, layout: Layout) -> Tensor:
+    """(down x across x F,) weights of a linear SVM in OpenCV's order, as (down, across, F) for `scores`.
+
+    OpenCV goes through a window's blocks, and a block's cells, column by column; the bins vary fastest.
+    """
+    across, down = layout.blocks
+    cells = layout.cells
+    return weights.view(across, down, cells, cells, layout.bins).permute(1, 0, 4, 3, 2).reshape(down, across, -1)
+
+
+def scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
+    """(B, ny - down + 1, nx - across + 1): the SVM's score of the window that begins at each block.
+
+    block_map: (B, F, ny, nx). weights: (down, across, F). bias: a number, added.
+    """
+    batch, _, ny, nx = block_map.shape
+    down, across, _ = weights.shape
+    part = torch.matmul(weights.flatten(0, 1), block_map.flatten(2))  # (B, down x across, ny nx)
+    # Sum over a window's blocks: that of part (i, j) lies i rows and j places further on. Parts read as if each were
+    # that much longer than it is stand above one another: a sum over the parts, with no copy for each.
+    places = ny * nx
+    part = (
+        torch.nn.functional.pad(part.reshape(batch, down, -1), (0, across)).unflatten(-1, (across, places + 1)).sum(2)
+    )
+    part = (
+        torch.nn.functional.pad(part.reshape(batch, -1), (0, down * nx)).unflatten(-1, (down, places + 1 + nx)).sum(1)
+    )
+    total = part[:, :places].unflatten(-1, (ny, nx))
+    return total[:, : ny - down + 1, : nx - across + 1] + bias
