@@ -4,10 +4,11 @@ import os
 from importlib.util import find_spec
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings
-from torchvision_dddas.vision.protocol import Foreground, View, Vision, Window
+from torchvision_dddas.settings import PeopleKnobs, Settings
+from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.vision.protocol import Foreground, Part, Recognizer, View, Vision, Window
 
-__all__ = ["Foreground", "View", "Vision", "Window", "load"]
+__all__ = ["Foreground", "Part", "Recognizer", "View", "Vision", "Window", "load", "load_recognizer"]
 
 
 def load(backend: str, settings: Settings) -> Vision:
@@ -15,10 +16,30 @@ def load(backend: str, settings: Settings) -> Vision:
 
     Raises InputError for another name, and for `torch` where the extra is not installed.
     """
-    if backend in ("auto", "onboard"):
+    if not _torch_wanted(backend):
         from torchvision_dddas.vision.onboard_vision import OnboardVision
 
         return OnboardVision(settings)
+    from torchvision_dddas.vision.torch_vision import TorchVision
+
+    return TorchVision(settings)
+
+
+def load_recognizer(backend: str, knobs: PeopleKnobs, svm: LinearSvm) -> Recognizer:
+    """What scores windows for people, on the back end that `load` would take. Raises InputError as `load` does."""
+    if not _torch_wanted(backend):
+        from torchvision_dddas.vision.onboard_people import OnboardRecognizer
+
+        return OnboardRecognizer(knobs, svm)
+    from torchvision_dddas.vision.torch_people import TorchRecognizer
+
+    return TorchRecognizer(knobs, svm)
+
+
+def _torch_wanted(backend: str) -> bool:
+    """Whether the back end is torch, which is then made ready to be imported."""
+    if backend in ("auto", "onboard"):
+        return False
     if backend != "torch":
         raise InputError(f"no back end is named '{backend}'; give auto, torch or onboard")
     if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
@@ -28,6 +49,4 @@ def load(backend: str, settings: Settings) -> Vision:
         )
     # Waiting threads that spin take the cores from the threads they wait for, minutes a frame on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from torchvision_dddas.vision.torch_vision import TorchVision
-
-    return TorchVision(settings)
+    return True
