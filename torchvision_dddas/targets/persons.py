@@ -1,0 +1,50 @@
+"""From windows that score to people: one box each, drawn around the body, with a probability."""
+
+import numpy as np
+from jaxtyping import Float
+
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.targets.suppress import group, nms
+from torchvision_dddas.types import People
+
+# A body that comes so near to the picture's border, in its own heights, may be cut by it.
+_NEAR = 0.03
+
+
+def people_of(
+    window_px: Float[np.ndarray, "N 4"],
+    margin: Float[np.ndarray, " N"],
+    size: tuple[int, int],
+    knobs: PeopleKnobs,
+) -> People:
+    """The people whom windows show, best first. size: (width, height) of the picture."""
+    window_px, margin = np.asarray(window_px, float).reshape(-1, 4), np.asarray(margin, float)
+    if knobs.suppression == "opencv":
+        window_px, margin = group(window_px, margin, knobs.group, knobs.group_distance)
+        order = np.argsort(-margin, kind="stable")
+    elif knobs.suppression == "nms":
+        order = nms(body(window_px, knobs), margin, knobs.overlap)
+    else:
+        order = np.argsort(-margin, kind="stable")
+    window_px, margin = window_px[order], margin[order]
+    box_px = body(window_px, knobs)
+    return People(box_px, probability(margin, knobs), margin, cut(box_px, size), window_px)
+
+
+def body(window_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Float[np.ndarray, "N 4"]:
+    """The body's box in a window, by ratios that were calibrated on true boxes."""
+    x, y, width, height = window_px.T
+    wide, tall = knobs.width_share * width, knobs.height_share * height
+    return np.stack([x + (width - wide) / 2, y + knobs.feet_share * height - tall, wide, tall], axis=1)
+
+
+def probability(margin: Float[np.ndarray, " N"], knobs: PeopleKnobs) -> Float[np.ndarray, " N"]:
+    """That a window of this score shows a person (Platt scaling)."""
+    return 1 / (1 + np.exp(-np.clip(knobs.probability_slope * (margin - knobs.probability_even), -50, 50)))
+
+
+def cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarray:
+    """(N,) bool: the picture's border cuts the body, or comes so near that it may."""
+    near = _NEAR * box_px[:, 3:]
+    low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
+    return (low < near).any(axis=1) | (high > np.array(size) - near).any(axis=1)

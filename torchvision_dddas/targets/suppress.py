@@ -1,0 +1,83 @@
+"""One box a person: many windows around each score, and either the best of them stays, or OpenCV's grouping decides."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+def nms(box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], overlap: float) -> Int[np.ndarray, " K"]:
+    """Rows of the boxes that no better one overlaps by more than `overlap` of their union, best first.
+
+    Only boxes that are kept put others out.
+    """
+    order = np.argsort(-score, kind="stable")
+    x, y, width, height = np.asarray(box_px, float)[order].T
+    right, bottom, area = x + width, y + height, width * height
+    left = np.ones(len(order), bool)
+    kept = []
+    for i in range(len(order)):
+        if not left[i]:
+            continue
+        kept.append(i)
+        rest = slice(i + 1, None)
+        across = np.minimum(right[i], right[rest]) - np.maximum(x[i], x[rest])
+        down = np.minimum(bottom[i], bottom[rest]) - np.maximum(y[i], y[rest])
+        shared = np.maximum(across, 0) * np.maximum(down, 0)
+        left[rest] &= shared <= overlap * (area[i] + area[rest] - shared)
+    return order[np.array(kept, np.int64)]
+
+
+def group(
+    box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], least: int, distance: float = 0.2
+) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, " G"]]:
+    """OpenCV's grouping of HOG detections: means of boxes that are alike, in whole pixels, and their best score.
+
+    box_px: whole numbers. least: groups of no more boxes are dropped; 0 leaves everything as it is. distance: boxes are
+    alike whose four edges differ by no more than this share of the mean of their smaller width and height; so are those
+    that a chain of such boxes links. A group inside another, which is larger and of more than three boxes, or itself of
+    less than three, is dropped.
+    Source: OpenCV, HOGDescriptor::groupRectangles (modules/objdetect, hog.cpp); detectMultiScale uses distance 0.2.
+    """
+    box_px, score = np.asarray(box_px, float), np.asarray(score, float)
+    if least <= 0 or not len(box_px):
+        return box_px, score
+    label = _alike(box_px, distance)
+    groups = int(label.max()) + 1
+    number = np.bincount(label, minlength=groups)
+    mean = np.stack([np.bincount(label, weights=part, minlength=groups) for part in box_px.T], axis=1)
+    mean = np.rint(mean * (1.0 / number)[:, None])
+    best = np.full(groups, -np.inf)
+    np.maximum.at(best, label, score)
+    large = number > least
+    mean, best, number = mean[large], best[large], number[large]
+    margin = np.rint(mean[:, 2:] * distance)
+    inside = (
+        (mean[:, None, :2] >= mean[None, :, :2] - margin).all(-1)
+        & (mean[:, None, :2] + mean[:, None, 2:] <= mean[None, :, :2] + mean[None, :, 2:] + margin).all(-1)
+        & ((number[None, :] > np.maximum(3, number[:, None])) | (number[:, None] < 3))
+    )
+    np.fill_diagonal(inside, False)
+    stays = ~inside.any(axis=1)
+    return mean[stays], best[stays]
+
+
+def _alike(box_px: np.ndarray, distance: float, rows: int = 512) -> np.ndarray:
+    """(N,) the group of each box, numbered as they first appear."""
+    low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
+    one, two = [], []
+    for start in range(0, len(box_px), rows):  # strips of the table of pairs, which may be large
+        here = slice(start, start + rows)
+        reach = distance * np.minimum(box_px[here, None, 2:], box_px[None, :, 2:]).sum(-1) * 0.5
+        near = (np.abs(low[here, None] - low[None]) <= reach[..., None]).all(-1)
+        near &= (np.abs(high[here, None] - high[None]) <= reach[..., None]).all(-1)
+        i, j = np.nonzero(near)
+        one.append(i + start)
+        two.append(j)
+    i, j = np.concatenate(one), np.concatenate(two)
+    table = coo_array((np.ones(len(i), bool), (i, j)), shape=(len(box_px), len(box_px)))
+    label = connected_components(table, directed=False)[1]
+    _, first, of_label = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[of_label]
