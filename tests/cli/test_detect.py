@@ -9,7 +9,6 @@ import cv2
 import pytest
 
 from tests.cli.mistakes import bad
-from torchvision_dddas.cli.detect import clip_names
 from torchvision_dddas.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -138,10 +137,3 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
     assert len((tmp_path / "out/detections.txt").read_text().splitlines()) == 2
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
     assert not list((tmp_path / "out").rglob("*.part*"))
-
-
-def test_clip_names_are_telling_and_different():
-    names = clip_names(
-        ["a/walk/frames", "b/walk/frames/", "x.mp4", "run/*.png", "camera:0", "rtsp://host/cam.1", "frames"]
-    )
-    assert names == ["walk", "walk-2", "x", "run", "camera-0", "cam", "frames"]

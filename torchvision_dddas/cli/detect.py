@@ -1,12 +1,12 @@
 """`dddas detect`: moving targets from a moving camera."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchvision_dddas.cli.clips import clip_facts, folders_for, last_lines
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
@@ -45,8 +45,7 @@ def detect(
     from torchvision_dddas.sinks import saved
 
     settings, names = load(config, set_ or []), saved(save)
-    folders = [out] if len(inputs) == 1 else [out / name for name in clip_names(inputs)]
-    for clip, folder in zip(inputs, folders, strict=True):
+    for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
         journal = detect_clip(clip, folder, settings, backend.value, names, telemetry, rate, quiet)
         if not quiet:
             for line in summary(journal, folder, names):
@@ -81,12 +80,7 @@ def detect_clip(
         facts = {
             "input": clip,
             "telemetry": telemetry,
-            "clip": {
-                "name": source.name,
-                "size": source.size,
-                "rate_hz": source.rate_hz,
-                "announced_frames": source.count,
-            },
+            "clip": clip_facts(source),
             "backend": vision.name,
             "settings": settings.model_dump(),
         }
@@ -101,29 +95,10 @@ def detect_clip(
     return journal
 
 
-def clip_names(inputs: Sequence[str]) -> list[str]:
-    """A folder name for each input, no two alike: its own name, or its parent's where that says more than `frames`."""
-    names: list[str] = []
-    for clip in inputs:
-        path = Path(clip.rstrip("/"))
-        dull = [p.name in ("", "frames", "images") or bool(re.search(r"[*?\[]", p.name)) for p in (path, *path.parents)]
-        named = path if all(dull) else (path, *path.parents)[dull.index(False)]
-        name = named.stem if named == path and not path.is_dir() else named.name
-        name = same = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "clip"
-        for k in range(2, len(inputs) + 1):
-            if same not in names:
-                break
-            same = f"{name}-{k}"
-        names.append(same)
-    return names
-
-
 def summary(journal: "Journal", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     saved = {"masks": "masks/", "overlay": "overlay.mp4"}
     made = ["detections.csv", "detections.txt", *(saved[name] for name in save), "run.json"]
     doubtful = f"{journal.unreliable_frames} frames with unreliable registration"
-    lines = [f"{journal.frames} frames, {journal.targets} targets, {doubtful}", f"{folder}: {', '.join(made)}"]
-    if count := len(journal.problems):
-        lines.insert(1, f"{count} problems while reading, the first: {journal.problems[0]} (all in run.json)")
-    return lines
+    first = f"{journal.frames} frames, {journal.targets} targets, {doubtful}"
+    return last_lines(first, journal, folder, made)

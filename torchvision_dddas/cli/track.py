@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
@@ -99,13 +100,7 @@ def track_into(
         facts = {
             "input": clip,
             "detections": detections,
-            "clip": source
-            and {
-                "name": source.name,
-                "size": source.size,
-                "rate_hz": source.rate_hz,
-                "announced_frames": source.count,
-            },
+            "clip": source and clip_facts(source),
             "rows": None
             if table is None
             else {"given": len(table), "used": int(looked_at(table.frame, interval).sum())},
@@ -159,11 +154,5 @@ def summary(journal: "TrackJournal", folder: Path, save: Sequence[str]) -> list[
     """What to tell the user at the end."""
     made = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in save), "run.json"]
     found = f"{journal.frames} frames, {journal.targets} detections, {journal.identities} identities"
-    lines = [
-        f"{found}, {journal.untracked} detections without one",
-        *(f"note: {note}" for note in journal.notes),
-        f"{folder}: {', '.join(made)}",
-    ]
-    if count := len(journal.problems):
-        lines.insert(1, f"{count} problems while reading, the first: {journal.problems[0]} (all in run.json)")
-    return lines
+    first = f"{found}, {journal.untracked} detections without one"
+    return last_lines(first, journal, folder, made, journal.notes)
