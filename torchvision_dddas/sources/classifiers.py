@@ -1,25 +1,233 @@
-"""Linear SVMs from files: the shipped coefficients, or a user's own."""
+"""Linear SVMs from files: the shipped coefficients, or a user's own as text, NumPy's or OpenCV's."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm
 
 SHIPPED = {"opencv": Path(__file__).parents[1] / "models" / "opencv_people.txt"}
 
+Layout = Mapping[str, object]
+"""What a file may say of the descriptor it was trained on: the keys of `layout_of`, all or some."""
 
-def read_classifier(name: str | Path, features: int) -> LinearSvm:
+_KNOBS = {
+    "window": "people.window_width_px and people.window_height_px",
+    "cell": "people.cell_px",
+    "block": "people.block_px",
+    "stride": "people.block_stride_px",
+    "bins": "people.bins",
+    "signed": "people.signed",
+    "clip": "people.clip",
+    "gamma": "people.gamma",
+}
+_DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
+
+
+def layout_of(knobs: PeopleKnobs) -> dict[str, object]:
+    """What the descriptor is, as a file tells it: window (width, height), cell, block, stride in px, and the rest."""
+    return {
+        "window": (knobs.window_width_px, knobs.window_height_px),
+        "cell": knobs.cell_px,
+        "block": knobs.block_px,
+        "stride": knobs.block_stride_px,
+        "bins": knobs.bins,
+        "signed": knobs.signed,
+        "clip": knobs.clip,
+        "gamma": knobs.gamma,
+    }
+
+
+def features_of(knobs: PeopleKnobs) -> int:
+    """Numbers of the descriptor of one window."""
+    blocks = [
+        max(0, (side - knobs.block_px) // knobs.block_stride_px + 1)
+        for side in (knobs.window_width_px, knobs.window_height_px)
+    ]
+    return blocks[0] * blocks[1] * (knobs.block_px // knobs.cell_px) ** 2 * knobs.bins
+
+
+def classifier_of(knobs: PeopleKnobs) -> LinearSvm:
+    """The classifier that the settings name. Raises InputError as `read_classifier`."""
+    return read_classifier(knobs.classifier, features_of(knobs), layout_of(knobs))
+
+
+def read_classifier(name: str | Path, features: int, wanted: Layout | None = None) -> LinearSvm:
     """The classifier of a shipped name, or of a file; features: the length of the descriptor it must fit.
 
-    Raises InputError with both lengths where it does not fit.
+    Files: text (numbers apart by blanks, commas or lines; `#` begins a comment), .npy, .npz (weights, bias, and any of
+    the keys of `layout_of`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor with its SVMDetector,
+    or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the descriptor in use, which
+    must be the one that the file tells of, if it does.
+    Raises InputError: no such file, not readable, another length (with both), another descriptor, not finite numbers.
     """
     path = SHIPPED.get(str(name), Path(name))
-    numbers = np.loadtxt(path, dtype=np.float64).astype(np.float32)
+    if not path.exists():
+        raise InputError(f"no classifier is named '{name}', nor is it a file; give {', '.join(SHIPPED)}, or a file")
+    reader = _READERS.get(path.suffix.lower(), _text)
+    try:
+        numbers, told = reader(path)
+    except OSError as error:
+        raise InputError(f"classifier {path} cannot be read: {error.strerror or error}") from None
+    if wanted is not None:
+        _agree(told, wanted, path)
+    return _svm(numbers, features, path)
+
+
+def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
+    numbers = np.asarray(numbers)
+    if numbers.dtype.kind not in "fiu":
+        raise InputError(f"classifier {path} holds {numbers.dtype}; wanted numbers")
+    with np.errstate(over="ignore"):
+        numbers = numbers.ravel().astype(np.float32)
+    if len(numbers) == 0:
+        raise InputError(f"classifier {path} is empty; wanted {features} weights, or these and a bias")
     if len(numbers) not in (features, features + 1):
         raise InputError(
-            f"{path} has {len(numbers)} numbers; a descriptor of these settings has {features}, so that {features} "
-            "weights, or these and a bias, are wanted"
+            f"classifier {path} has {len(numbers)} numbers; a descriptor of these settings has {features}, so that "
+            f"{features} weights, or these and a bias, are wanted; set people.window_width_px and its like as trained"
         )
+    if not np.isfinite(numbers).all():
+        first = int(np.argmin(np.isfinite(numbers)))
+        raise InputError(f"classifier {path}: number {first + 1} is {numbers[first]:g}; wanted finite numbers")
     return LinearSvm(numbers[:features], float(numbers[features:].sum()), str(path))
+
+
+def _agree(told: Layout, wanted: Layout, path: Path) -> None:
+    for name, knob in _KNOBS.items():
+        if name in told and name in wanted and not _same(told[name], wanted[name]):
+            raise InputError(
+                f"classifier {path} was trained with a {name} of {_shown(told[name], wanted[name])}, the "
+                f"settings say {_shown(wanted[name], wanted[name])}; change {knob}"
+            )
+
+
+def _same(one: object, other: object) -> bool:
+    a, b = np.ravel(np.asarray(one, float)), np.ravel(np.asarray(other, float))
+    return a.shape == b.shape and bool((np.abs(a - b) <= _DIGITS).all())
+
+
+def _shown(value: object, like: object) -> str:
+    if isinstance(like, bool):
+        return "false" if _same(value, 0) else "true"
+    return " x ".join(f"{number:g}" for number in np.ravel(np.asarray(value, float)))
+
+
+def _text(path: Path) -> tuple[np.ndarray, Layout]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"classifier {path} is no text: {error.reason}; wanted numbers, .npy, .npz or .yml") from None
+    numbers = []
+    for place, line in enumerate(lines, 1):
+        for cell in line.partition("#")[0].replace(",", " ").replace(";", " ").split():
+            try:
+                numbers.append(float(cell))
+            except ValueError:
+                raise InputError(f"classifier {path}, line {place}: '{cell[:40]}' is no number") from None
+            if not math.isfinite(numbers[-1]):
+                raise InputError(f"classifier {path}, line {place}: '{cell}'; wanted finite numbers")
+    return np.array(numbers, np.float64), {}
+
+
+def _numpy(path: Path) -> tuple[np.ndarray, Layout]:
+    try:
+        held = np.load(path, allow_pickle=False)
+        if isinstance(held, np.ndarray):
+            return held, {}
+        with held:
+            content = {name: held[name] for name in held.files}
+    except (ValueError, EOFError, KeyError) as error:
+        raise InputError(f"classifier {path} is no array of numbers in NumPy's format: {error}") from None
+    except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
+        if isinstance(error, OSError):
+            raise
+        raise InputError(f"classifier {path} is a broken file: {error}") from None
+    if "weights" not in content:
+        raise InputError(f"classifier {path} holds {', '.join(content) or 'nothing'}; wanted weights, and a bias")
+    parts = [np.ravel(content[name]) for name in ("weights", "bias") if name in content]
+    if len(parts) == 2 and parts[1].size != 1:
+        raise InputError(f"classifier {path} has a bias of {parts[1].size} numbers; wanted one")
+    told = {name: content[name] for name in _KNOBS if name in content}
+    if text := [name for name, value in told.items() if value.dtype.kind not in "fiub"]:
+        raise InputError(f"classifier {path}: {text[0]} is of type {told[text[0]].dtype}; wanted numbers")
+    return np.concatenate(parts), told
+
+
+def _opencv(path: Path) -> tuple[np.ndarray, Layout]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        top = storage.getFirstTopLevelNode()
+        # An SVM's node is the top one; a HOGDescriptor saved by hand may lie anywhere at the top.
+        inside = set() if top.empty() else set(top.keys()) if top.isMap() else set()
+    except (UnicodeDecodeError, cv2.error, SystemError):
+        raise InputError(f"classifier {path} is no file that OpenCV saved (YAML, XML or JSON)") from None
+    if "SVMDetector" in inside:
+        return _hog(top)
+    if "support_vectors" in inside:
+        return _support(top, path), {}
+    raise InputError(
+        f"classifier {path} has neither an SVMDetector (cv2.HOGDescriptor.save) nor the support vectors of cv2.ml"
+    )
+
+
+def _hog(node: "cv2.FileNode") -> tuple[np.ndarray, Layout]:
+    told: dict[str, object] = {}
+    for name, key in (("window", "winSize"), ("cell", "cellSize"), ("block", "blockSize"), ("stride", "blockStride")):
+        if not (entry := node.getNode(key)).empty():
+            pair = _numbers(entry)
+            told[name] = tuple(pair) if name == "window" or len(set(pair)) > 1 else pair[0]
+    for name, key in (
+        ("bins", "nbins"),
+        ("signed", "signedGradient"),
+        ("clip", "L2HysThreshold"),
+        ("gamma", "gammaCorrection"),
+    ):
+        if not (entry := node.getNode(key)).empty():
+            told[name] = entry.real()
+    return _numbers(node.getNode("SVMDetector")), told
+
+
+def _support(node: "cv2.FileNode", path: Path) -> np.ndarray:
+    """Weights and bias of a saved cv2.ml.SVM.
+
+    Its decision is alpha . K - rho. A classifier takes a positive one for its first label, the lower number; people are
+    the second, so the score is rho minus the rest. A regression gives the label itself, people having the higher one.
+    """
+    kind, kernel = node.getNode("svmType").string(), node.getNode("kernel").getNode("type").string()
+    if kernel != "LINEAR":
+        raise InputError(f"classifier {path} has the kernel {kernel or 'of no name'}; wanted a linear SVM")
+    vectors = node.getNode("support_vectors")
+    functions = node.getNode("decision_functions")
+    if kind in ("C_SVC", "NU_SVC"):
+        sign = -1.0
+    elif kind in ("EPS_SVR", "NU_SVR"):
+        sign = 1.0
+    else:
+        raise InputError(
+            f"classifier {path} is an SVM of type {kind or 'unknown'}; wanted C_SVC, NU_SVC or a regression"
+        )
+    if functions.size() != 1:
+        raise InputError(f"classifier {path} tells {functions.size()} pairs of classes apart; wanted two classes")
+    rows = np.array([_numbers(vectors.at(i)) for i in range(vectors.size())])
+    function = functions.at(0)
+    alpha = _numbers(function.getNode("alpha"))
+    index = function.getNode("index")
+    used = rows if index.empty() else rows[_numbers(index).astype(int)]
+    return sign * np.append(alpha @ used, -function.getNode("rho").real())
+
+
+def _numbers(node: "cv2.FileNode") -> np.ndarray:
+    """A sequence of numbers."""
+    if node.isSeq():
+        return np.array([node.at(i).real() for i in range(node.size())])
+    return np.array([node.real()])
+
+
+_READERS = {".npy": _numpy, ".npz": _numpy, ".yml": _opencv, ".yaml": _opencv, ".xml": _opencv, ".json": _opencv}
