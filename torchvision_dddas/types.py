@@ -136,12 +136,85 @@ class Recognized:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """A camera that looks at the ground from a height, and how well that is known; sigma: one standard deviation.
+
+    size_px: (width, height). focal_px: along u and v. centre_px: u, v of the optical axis. k1, k2: radial distortion
+    as OpenCV has it. roll_rad: turned clockwise, seen from behind. height_m: above the ground; NaN where unknown.
+    place: its point on the ground: longitude and latitude in degrees if geographic, else local metres east and north.
+    heading_rad: clockwise from true north. pitch_rad: how far the optical axis points below the horizon.
+    focal_sigma: as a share of the focal length. position_sigma_m: of the place, along east and along north each.
+    """
+
+    name: str
+    size_px: tuple[int, int]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    place: tuple[float, float] = (0.0, 0.0)
+    geographic: bool = False
+    heading_rad: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+    height_m: float = float("nan")
+    k1: float = 0.0
+    k2: float = 0.0
+    focal_sigma: float = 0.01
+    height_sigma_m: float = 0.05
+    pitch_sigma_rad: float = float(np.radians(0.5))
+    heading_sigma_rad: float = float(np.radians(2.0))
+    position_sigma_m: float = 1.43
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where a camera stood and looked, one row a picture or a sighting; the angles as in Camera.
+
+    place: (N, 2), in the camera's own kind. heading_rad, pitch_rad: (N,).
+    """
+
+    place: np.ndarray
+    heading_rad: np.ndarray
+    pitch_rad: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """People as cameras on the ground saw them, one row a person in a picture; metres are local.
+
+    east_north_m: (N, 2), NaN where no distance is known. distance_m: (N,) over the ground. bearing_rad: (N,) clockwise
+    from north. by: (N,) what told the distance: both, height, feet; or bearing, where nothing did.
+    The errors are split by whom they are common to: own_m2 (N, 2, 2) is the covariance of what is new in each sighting;
+    body_m (N, 2) the deviation by one sigma of the person's height, common to all that see the person; camera_m
+    (N, 2, 6) those by one sigma of the camera's east, north, heading, pitch, height and focal length, common to all
+    that the camera sees.
+    """
+
+    east_north_m: np.ndarray
+    distance_m: np.ndarray
+    bearing_rad: np.ndarray
+    by: np.ndarray
+    own_m2: np.ndarray
+    body_m: np.ndarray
+    camera_m: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.distance_m)
+
+    @property
+    def covariance_m2(self) -> np.ndarray:
+        """(N, 2, 2) of all errors together."""
+        camera = self.camera_m @ self.camera_m.swapaxes(1, 2)
+        return self.own_m2 + self.body_m[:, :, None] * self.body_m[:, None, :] + camera
+
+
+@dataclass(frozen=True)
 class Positions:
     """Where targets stand on the ground, one row a sighting, sorted by frame.
 
     frame: (N,) int64 from 1. target: (N,) int64, the identity where there is one, else the row in its frame, from 1.
     east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN where unknown. score: (N,) in [0, 1].
     origin_deg: (longitude, latitude) of east = north = 0 on the WGS84 ellipsoid; None where there is no geographic one.
+    lonlat_deg: (N, 2) longitude, latitude; None where there is no geographic origin.
     """
 
     frame: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -150,6 +223,7 @@ class Positions:
     covariance_m2: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 2)))
     score: np.ndarray = field(default_factory=lambda: np.zeros(0))
     origin_deg: tuple[float, float] | None = None
+    lonlat_deg: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
