@@ -311,6 +311,11 @@ class PeopleKnobs(Group):
     classifier: str = knob(
         "opencv", "-", meaning="opencv: the coefficients of its default people detector; or a file of a linear SVM's"
     )
+    graph: str = knob(
+        "shipped",
+        "-",
+        meaning="onboard: the ONNX graph of the scores; a file that export/people_graph.py made, or shipped",
+    )
     window_width_px: int = knob(64, "px", 8, 1024, meaning="width of the window that the classifier sees")
     window_height_px: int = knob(128, "px", 8, 1024, meaning="height of the window that the classifier sees")
     cell_px: int = knob(8, "px", 2, 64, meaning="side of a cell, which has one histogram")

@@ -172,10 +172,10 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
     return total.transpose(-3, -2)
 
 
-def blocks(bordered: Tensor, layout: Layout) -> Tensor:
+def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tensor:
     """(B, F, ny, nx) normalised histograms of every block, F = bins x cells down x cells across.
 
-    bordered: as in `gradient`; its inside must hold a block.
+    bordered: as in `gradient`; its inside must hold a block. clip: a number in place of the layout's.
     """
     maps = ramps(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
     down = _pooled(maps, layout)  # (B, K, cy, ny, W)
@@ -185,7 +185,8 @@ def blocks(bordered: Tensor, layout: Layout) -> Tensor:
     histogram = histogram.transpose(-1, -2).flatten(1, 3)
     size = layout.bins * layout.cells**2
     norm = torch.sqrt((histogram * histogram).sum(1, keepdim=True).clamp(min=1e-30)) + size * _SOFT_FIRST
-    clipped = (histogram / norm).clamp(max=layout.clip)
+    share = histogram / norm
+    clipped = share.clamp(max=layout.clip) if clip is None else torch.minimum(share, clip)
     return clipped / (torch.sqrt((clipped * clipped).sum(1, keepdim=True).clamp(min=1e-30)) + _SOFT_SECOND)
 
 
