@@ -378,6 +378,34 @@ class GroundKnobs(Group):
     gate_sigmas: float = knob(3.0, "-", 0.5, 10, meaning="sightings further apart than this are not of one person")
 
 
+class ConfirmKnobs(Group):
+    """When people seen from the ground decide what a blob seen from the air is: two fidelities (appendix A, III-B)."""
+
+    gate_probability: float = knob(
+        0.99, "-", 0.5, 0.9999, meaning="share of people who lie within the gate of their own blob, by both covariances"
+    )
+    spread_m: float = knob(
+        0.5, "m", 0, 20, meaning="standard deviation of people about their blob's position, which may be a crowd's"
+    )
+    unknown_sigma_m: float = knob(
+        2.0, "m", 0.01, 100, meaning="standard deviation of a position whose table gives no covariance"
+    )
+    inside_sigmas: float = knob(
+        2.0, "-", 0, 10, meaning="a blob so many of its standard deviations within a view is well within it"
+    )
+    body_width_m: float = knob(0.6, "m", 0, 10, meaning="what stands nearer, this close to a line of sight, hides")
+    detection_rate: float = knob(0.7, "-", 0.01, 0.999, meaning="share of looks at a person that recognize one")
+    false_rate: float = knob(0.05, "-", 0.001, 0.99, meaning="share of looks at another blob that recognize one there")
+    prior: float = knob(0.5, "-", 0.01, 0.99, meaning="share of the blobs that are people")
+    fresh: float = knob(
+        0.3, "-", 0, 1, meaning="weight of a look that follows another of the same vehicle: they err alike"
+    )
+    limit: float = knob(7.0, "-", 0.5, 50, meaning="log-odds never pass this, so that later looks can still turn them")
+    share: float = knob(
+        0.5, "-", 0.01, 1, meaning="in pictures: share of a person's box that lies in the box of their blob at least"
+    )
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -394,6 +422,7 @@ class Settings(Group):
     paper: PaperKnobs = PaperKnobs()
     people: PeopleKnobs = PeopleKnobs()
     ground: GroundKnobs = GroundKnobs()
+    confirm: ConfirmKnobs = ConfirmKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------
