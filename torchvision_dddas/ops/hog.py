@@ -74,7 +74,10 @@ def gradient(bordered: Tensor, gamma: bool = True) -> tuple[Tensor, Tensor]:
     bordered: (B, C, H + 2, W + 2) levels 0 .. 255 with a border of one pixel, reflected (101) at the picture's edge.
     Of equal channels the first wins, as in OpenCV's BGR order.
     """
-    levels = bordered.sqrt() if gamma else bordered
+    levels = bordered
+    if gamma:
+        # The root's slope at black is infinite, and would turn the gradient of all black pixels into NaN.
+        levels = (bordered.clamp(min=1e-30) if bordered.requires_grad else bordered).sqrt()
     across = levels[..., 1:-1, 2:] - levels[..., 1:-1, :-2]
     down = levels[..., 2:, 1:-1] - levels[..., :-2, 1:-1]
     square = across * across + down * down
