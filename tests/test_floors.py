@@ -25,6 +25,7 @@ FLOORS: dict[str, set[str]] = {
     # Labelling stays in OpenCV for every runtime: hence cv2 here.
     "targets": {"numpy", "scipy", "cv2", "pymap3d", "types", "settings", "errors"},
     "targets.scan": {"numpy", "vision.protocol", "types", "settings", "errors"},
+    "targets.regions": {"numpy", "scipy", "targets.scan", "vision.protocol", "types", "settings"},
     "vision": {"numpy", "targets.projective", "types", "settings", "errors"},
     "vision.torch_vision": {"torch", "numpy", "cv2", "ops", "types", "settings", "errors"},
     "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},
@@ -44,6 +45,7 @@ FLOORS: dict[str, set[str]] = {
     "control": {"numpy", "targets.gates", "types", "settings", "errors"},
     "run": {"numpy", "pipeline", "control", "windows", "sources", "vision", "targets", "types", "settings", "errors"},
     "recognizing": {"numpy", "sources", "vision", "targets", "types", "settings", "errors"},
+    "locating": {"numpy", "sources", "targets", "types", "settings", "errors"},
     "following": {"numpy", "sources", "vision", "targets", "types", "settings", "errors"},
     "sources": {"numpy", "cv2", "av", "simulation", "types", "errors"},
     "sources.classifiers": {"numpy", "cv2", "types", "settings", "errors"},
