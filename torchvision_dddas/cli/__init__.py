@@ -10,7 +10,9 @@ from torchvision_dddas import __version__
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
+from torchvision_dddas.cli.locate import locate
 from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
+from torchvision_dddas.cli.people import people
 from torchvision_dddas.cli.settings import settings
 from torchvision_dddas.cli.track import track
 
@@ -21,8 +23,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (detect, track, evaluate, demo, settings):
+for command in (detect, people, track, evaluate, demo, settings):
     app.command()(command)
+app.add_typer(locate, name="locate")
 
 
 def _version(wanted: bool) -> None:

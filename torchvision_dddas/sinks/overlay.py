@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.sinks.beside import Beside, Writer
+from torchvision_dddas.sinks.drawing import colour_picture, line_width
 from torchvision_dddas.sinks.whole import remove, temporary
 from torchvision_dddas.types import Scene
 
@@ -23,9 +24,8 @@ Item = TypeVar("Item")
 
 def drawn(scene: Scene) -> np.ndarray:
     """The frame with everything found in it, (H, W, 3) uint8 BGR."""
-    image = scene.frame.image
-    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-    thick = max(1, round(picture.shape[0] / 480))
+    picture = colour_picture(scene.frame.image)
+    thick = line_width(picture)
     foreground = (scene.mask > 0).astype(np.uint8)
     if foreground.any():
         where = foreground > 0

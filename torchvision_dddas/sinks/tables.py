@@ -6,6 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
+
 from torchvision_dddas.sinks.whole import remove, temporary
 from torchvision_dddas.types import Scene
 
@@ -17,10 +19,14 @@ COLUMNS = (
 
 def mot_lines(scene: Scene) -> str:
     """`frame,-1,x,y,width,height,score,-1,-1,-1`, a line a target: frames from 1, pixels from 0, -1 for no identity."""
-    d = scene.detections
+    return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)
+
+
+def mot_rows(number: int, box_px: np.ndarray, score: np.ndarray) -> str:
+    """The same for the boxes of any frame."""
     return "".join(
-        f"{scene.frame.number},-1,{x:.2f},{y:.2f},{w:.2f},{h:.2f},{score:.4f},-1,-1,-1\n"
-        for (x, y, w, h), score in zip(d.box_px, d.score, strict=True)
+        f"{number},-1,{x:.2f},{y:.2f},{w:.2f},{h:.2f},{score:.4f},-1,-1,-1\n"
+        for (x, y, w, h), score in zip(box_px, score, strict=True)
     )
 
 

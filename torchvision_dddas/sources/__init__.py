@@ -10,10 +10,13 @@ from torchvision_dddas.sources.video import VideoSource
 __all__ = ["Problem", "Source", "open_source"]
 
 
-def open_source(spec: str | Path, *, rate_hz: float | None = None, full_scale: int | None = None) -> Source:
+def open_source(
+    spec: str | Path, *, rate_hz: float | None = None, full_scale: int | None = None, single: bool = False
+) -> Source:
     """A clip from what the user typed: a video file, a folder or glob of images, `camera:0`, `rtsp://...`.
 
     rate_hz: frames a second; None takes the video's own, and 10 for images. full_scale: see ImageSource.
+    single: a file that is one image is a clip of one frame; else it is refused, as nothing can be seen to move in it.
     Raises InputError with one line when it cannot be read.
     """
     text = str(spec)
@@ -37,6 +40,8 @@ def open_source(spec: str | Path, *, rate_hz: float | None = None, full_scale: i
         return ImageSource(images_of_folder(path), text, rate_hz or 10.0, full_scale)
     if path.is_file():
         if path.suffix.lower() in IMAGE_SUFFIXES:
+            if single:
+                return ImageSource([path], text, rate_hz or 10.0, full_scale)
             raise InputError(
                 f"{path} is one image, not a clip; give its folder, or a glob in quotes such as 'frames/*.png'"
             )

@@ -16,13 +16,8 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
     name = f"detections {table.path}"
     if len(table) == 0:
         return [f"{name} holds no rows"]
-    if source is not None and source.exact and source.count is not None and table.last > source.count:
-        beyond = int((table.frame > source.count).sum())
-        line = int(table.line[table.frame > source.count].min())
-        raise InputError(
-            f"{name}, line {line}: the table goes on to frame {table.last} but {source.name} ends after frame "
-            f"{source.count} ({beyond} of {len(table)} rows lie beyond); is it the table of this clip?"
-        )
+    if source is not None:
+        within_clip(table, source)
     notes = []
     left_out = len(table) - int(looked_at(table.frame, interval).sum())
     if left_out == len(table):
@@ -46,6 +41,17 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
     if source is not None and (outside := int(_outside(table, source.size).sum())):
         notes.append(f"{outside} boxes lie wholly outside the picture; they are tracked like the others")
     return notes
+
+
+def within_clip(table: DetectionTable, source: Source) -> None:
+    """Raises InputError for a table that goes on after the end of a clip whose length is known."""
+    if source.exact and source.count is not None and table.last > source.count:
+        beyond = int((table.frame > source.count).sum())
+        line = int(table.line[table.frame > source.count].min())
+        raise InputError(
+            f"detections {table.path}, line {line}: the table goes on to frame {table.last} but {source.name} ends "
+            f"after frame {source.count} ({beyond} of {len(table)} rows lie beyond); is it the table of this clip?"
+        )
 
 
 def beginning(table: DetectionTable, birth_score: float) -> list[str]:

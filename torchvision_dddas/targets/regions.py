@@ -1,0 +1,188 @@
+"""Where people are looked for in a frame: everywhere, around those seen before, around what moves; the feedback rule.
+
+Between whole looks only the surroundings of people who are expected are searched, so that the cost follows the need.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.targets import scan
+from torchvision_dddas.types import Adjustment, People
+from torchvision_dddas.vision.protocol import Part
+
+Regions = tuple[np.ndarray, np.ndarray]
+"""region_px (R, 4), which a body must lie in; heights_px (R, 2), its least and largest height."""
+
+# Heights of bodies in a moving blob, in its own: it may be a group, or miss what does not move, such as feet and head.
+_BLOB_HEIGHTS = (1 / 3, 1.3)
+
+# Of the difference between where a person was expected and found, so much goes into place and size, and velocity.
+# Windows stand on a grid of 0.08 body heights: two looks alone would say little of a velocity.
+_PLACE_GAIN, _VELOCITY_GAIN = 0.6, 0.2
+_NEAR_HEIGHTS = 0.5  # a person expected no further from one that is found may be this one
+
+_DEAR = 0.8  # regions that cost more than this share of a whole look are not worth their name
+_CHANGED = 1.5  # a share of windows that grew or shrank by this factor since the last line is worth another
+
+
+@dataclass(frozen=True)
+class Look:
+    """What of a frame is searched. regions_px: (R, 4) where; None: everywhere. share: windows of all that there are."""
+
+    parts: list[Part]
+    regions_px: np.ndarray | None
+    share: float
+    adjustments: tuple[Adjustment, ...] = ()
+
+
+def around_blobs(box_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Regions:
+    """Around moving blobs: bodies from a third to 1.3 times as high."""
+    box_px = np.asarray(box_px, float).reshape(-1, 4)
+    margin = max(knobs.region_margin, _BLOB_HEIGHTS[1] - 1) * box_px[:, 3]
+    return grown(box_px, margin), box_px[:, 3:] * _BLOB_HEIGHTS
+
+
+def grown(box_px: Float[np.ndarray, "N 4"], margin_px: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
+    """Boxes with a margin on every side."""
+    return box_px + np.stack([-margin_px, -margin_px, 2 * margin_px, 2 * margin_px], axis=1)
+
+
+class Expected:
+    """Who is expected where: people that were found, moved on by their velocity.
+
+    One who is not found stays expected for twice as many frames as he was found in, at most `rescan_frames`: a person
+    who was missed comes back, and a window that looked like one for a frame is soon forgotten.
+    """
+
+    def __init__(self, knobs: PeopleKnobs) -> None:
+        self.knobs = knobs
+        self.frame = 0
+        self.place_px = np.zeros((0, 2))  # centres
+        self.velocity_px = np.zeros((0, 2))
+        self.size_px = np.zeros((0, 2))
+        self.found = np.zeros(0, int)  # looks in which each was found
+        self.seen = np.zeros(0, int)  # frame in which each was found last
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def box_px(self, frame: int) -> np.ndarray:
+        """(N, 4) boxes at a frame."""
+        place = self.place_px + self.velocity_px * (frame - self.frame)
+        return np.concatenate([place - self.size_px / 2, self.size_px], axis=1)
+
+    def regions(self, frame: int) -> Regions:
+        """Around them."""
+        box_px, knobs = self.box_px(frame), self.knobs
+        margin = knobs.region_margin * box_px[:, 3]
+        return grown(box_px, margin), box_px[:, 3:] * (1 / knobs.region_scales, knobs.region_scales)
+
+    def learn(self, frame: int, people: People) -> int:
+        """Take in whom a look found; returns how many of those expected are among them."""
+        steps = max(frame - self.frame, 1)
+        box_px = self.box_px(frame)
+        place, size = people.box_px[:, :2] + people.box_px[:, 2:] / 2, people.box_px[:, 2:]
+        row, column = _pairs(box_px, people.box_px, self.knobs.region_scales)
+        self.place_px = box_px[:, :2] + box_px[:, 2:] / 2
+        miss = place[column] - self.place_px[row]
+        self.place_px[row] += _PLACE_GAIN * miss
+        self.velocity_px[row] += _VELOCITY_GAIN * miss / steps
+        self.size_px[row] *= (size[column] / self.size_px[row]) ** _PLACE_GAIN
+        self.found[row] += 1
+        self.seen[row] = frame
+        stay = frame - self.seen <= np.minimum(2 * self.found, self.knobs.rescan_frames)
+        new = np.setdiff1d(np.arange(len(people)), column)
+        self.place_px = np.concatenate([self.place_px[stay], place[new]])
+        self.velocity_px = np.concatenate([self.velocity_px[stay], np.zeros((len(new), 2))])
+        self.size_px = np.concatenate([self.size_px[stay], size[new]])
+        self.found = np.concatenate([self.found[stay], np.ones(len(new), int)])
+        self.seen = np.concatenate([self.seen[stay], np.full(len(new), frame)])
+        self.frame = frame
+        return len(row)
+
+
+def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the expected and of the found boxes that are the same person: nearest in all, none beyond the gate."""
+    if not len(expected_px) or not len(found_px):
+        return np.zeros(0, int), np.zeros(0, int)
+    apart = expected_px[:, None, :2] + expected_px[:, None, 2:] / 2 - found_px[:, :2] - found_px[:, 2:] / 2
+    height = expected_px[:, None, 3]
+    far = np.linalg.norm(apart, axis=2) / height
+    ratio = np.abs(np.log(found_px[:, 3] / height))
+    beyond = (far > _NEAR_HEIGHTS) | (ratio > np.log(scales) + 0.05)
+    row, column = linear_sum_assignment(np.where(beyond, 1e3, far + ratio))
+    kept = ~beyond[row, column]
+    return row[kept], column[kept]
+
+
+class Search:
+    """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
+
+    `people.search = everywhere`: the whole picture. `regions`: the whole picture every `rescan_frames`, and at once
+    when all who were expected are lost, as after a cut; between, around those expected. blobs: (N, 4) boxes of a
+    frame's movers; with them only their surroundings are looked at, and with `regions` as well the whole picture and
+    those expected as said.
+    """
+
+    def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
+        self.knobs, self.blobs = knobs, blobs
+        self.steered = knobs.search == "regions"
+        self.expected = Expected(knobs)
+        self.whole = 0  # frame of the last whole look; 0: none yet
+        self.lost = 0  # people expected none of whom was found, since the last look
+        self.told = 1.0  # share of windows in the last line of the record
+
+    def look(self, frame: int, size: tuple[int, int]) -> Look:
+        """Where to search a frame of (width, height)."""
+        everywhere = scan.everywhere(size, self.knobs)
+        if not self.steered and self.blobs is None:
+            return Look(everywhere, None, 1.0)
+        if self.steered and (self.lost or not self.whole or frame - self.whole >= self.knobs.rescan_frames):
+            return self._whole(frame, everywhere, f"none of {self.lost} people expected was found" if self.lost else "")
+        region_px, heights_px = self._regions(frame)
+        parts = scan.within(region_px, heights_px, size, self.knobs)
+        share = scan.cost(parts, self.knobs) / scan.cost(everywhere, self.knobs)
+        if share > _DEAR:
+            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {share:.0%} of the windows")
+        return Look(parts, region_px, share, self._told(frame, share) if self.steered else ())
+
+    def learn(self, frame: int, people: People, look: Look) -> None:
+        """Take in what a look found."""
+        if not self.steered:
+            return
+        if look.regions_px is None:
+            self.whole = frame
+        there = len(self.expected)
+        again = self.expected.learn(frame, people)
+        # One alone is often missed for a frame, and a whole look that found nobody need not be repeated.
+        self.lost = there if there > 1 and not again and look.regions_px is not None else 0
+
+    def _regions(self, frame: int) -> Regions:
+        found = [self.expected.regions(frame)] if self.steered else []
+        if self.blobs is not None:
+            found.append(around_blobs(self.blobs(frame), self.knobs))
+        return np.concatenate([region for region, _ in found]), np.concatenate([heights for _, heights in found])
+
+    def _whole(self, frame: int, everywhere: list[Part], why: str) -> Look:
+        """A whole look; the record says why, if it is not simply time for one."""
+        moved: tuple[Adjustment, ...] = ()
+        if why and self.told != 1.0:
+            moved = (Adjustment(frame, "people.windows_share", self.told, 1.0, why),)
+            self.told = 1.0
+        return Look(everywhere, None, 1.0, moved)
+
+    def _told(self, frame: int, share: float) -> tuple[Adjustment, ...]:
+        """A line of the record, where the share of windows has changed much since the last one."""
+        least = 0.01
+        if max(share, least) < _CHANGED * max(self.told, least) and max(self.told, least) < _CHANGED * max(
+            share, least
+        ):
+            return ()
+        why = f"{len(self.expected)} people expected" + ("" if self.blobs is None else ", and what moves")
+        old, self.told = self.told, share
+        return (Adjustment(frame, "people.windows_share", round(old, 4), round(share, 4), why),)
