@@ -230,6 +230,26 @@ class Positions:
 
 
 @dataclass(frozen=True)
+class Located:
+    """All that is known of one frame after its people were located from the ground.
+
+    positions: the people, fused where several cameras see them. members: (P, V) which sighting of each camera is of
+    each of them, counted among those located; -1 for none. sightings: all, whether located or not, one row a box;
+    vehicle, target, cut, score (N,) and box_px (N, 4): whose camera it was, counted from 0, and what its table said.
+    """
+
+    frame: int
+    positions: Positions
+    members: np.ndarray
+    sightings: Sightings
+    vehicle: np.ndarray
+    target: np.ndarray
+    cut: np.ndarray
+    score: np.ndarray
+    box_px: np.ndarray
+
+
+@dataclass(frozen=True)
 class Tracks:
     """The targets of one frame with their identities, one row a target.
 

@@ -36,6 +36,8 @@ class DetectionTable:
 
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
     line: (N,) int64, where the row stands in the file, from 1. own: whether `dddas detect` says that all were moving.
+    identity: (N,) int64 from 1, -1 for a row without one. cut: (N,) bool, whether the picture's border cuts the target;
+    None where the table does not say.
     """
 
     path: str
@@ -44,6 +46,8 @@ class DetectionTable:
     score: np.ndarray
     line: np.ndarray
     own: bool = False
+    identity: np.ndarray | None = None
+    cut: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -99,11 +103,12 @@ class DetectionTable:
 def read_detections(path: str | Path) -> DetectionTable:
     """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names COLUMNS.
 
-    The id and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
-    without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
+    An id, or a column `identity`, that is no whole number from 1 is none. A column `cut` of 0 and 1 is kept; any other
+    and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table without
+    rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
     below 1 or above LAST_FRAME, a width or height below LEAST_PX, a place or size beyond FARTHEST_PX, a column named
-    twice, a few scores outside [0, 1] (see FEW_SHARE).
+    twice, a few scores outside [0, 1] (see FEW_SHARE), a cut that is neither 0 nor 1.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
@@ -112,18 +117,26 @@ def read_detections(path: str | Path) -> DetectionTable:
     except UnicodeDecodeError as error:
         raise InputError(f"detections {path} is no text: {error}") from None
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    own = False
+    own = cuts = False
     if content and _named(content[0][1]):
         number, header = content.pop(0)
         rows = list(_by_name(content, header, f"detections {path}", number))
         own = _all_moving(content, header)
+        cuts = "cut" in [cell.strip() for cell in header.split(",")]
     else:
         rows = list(_by_place(content, f"detections {path}"))
-    table = np.array(rows, np.float64).reshape(-1, 7)
+    table = np.array(rows, np.float64).reshape(-1, 9)
     _refuse_few_outside(table[:, 5], table[:, 6], f"detections {path}")
     table = table[np.argsort(table[:, 0], kind="stable")]
     return DetectionTable(
-        str(path), table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5], table[:, 6].astype(np.int64), own
+        str(path),
+        table[:, 0].astype(np.int64),
+        table[:, 1:5],
+        table[:, 5],
+        table[:, 6].astype(np.int64),
+        own,
+        table[:, 7].astype(np.int64),
+        table[:, 8] > 0 if cuts else None,
     )
 
 
@@ -140,7 +153,8 @@ def _by_place(content: Sequence[tuple[int, str]], name: str) -> Iterator[list[fl
             raise InputError(
                 f"{name}, line {number}: {len(cells)} column{'s' * (len(cells) != 1)}; wanted frame,id,x,y,w,h[,score]"
             )
-        yield _row((cells[0], *cells[2:6]), cells[6] if len(cells) > 6 else "", number, name)
+        row = _row((cells[0], *cells[2:6]), cells[6] if len(cells) > 6 else "", number, name)
+        yield [*row, _identity(cells[1]), 0.0]
 
 
 def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: int) -> Iterator[list[float]]:
@@ -153,12 +167,23 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
     if twice := [column for column in names if column and names.count(column) > 1]:
         raise InputError(f"{name}, line {line}: column {twice[0]} is named twice; wanted each name once")
     places = [names.index(column) for column in COLUMNS]
-    score = names.index("score") if "score" in names else len(names)
+    # A column that is not there is read as an empty cell after the last.
+    score, identity, cut = (names.index(n) if n in names else len(names) for n in ("score", "identity", "cut"))
     for number, text in content:
         cells = text.split(",")
         if len(cells) != len(names):
             raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
-        yield _row([cells[place].strip() for place in places], [*cells, ""][score].strip(), number, name)
+        cells = [*(cell.strip() for cell in cells), ""]
+        row = _row([cells[place] for place in places], cells[score], number, name)
+        if cells[cut] not in ("", "0", "1"):
+            raise InputError(f"{name}, line {number}: cut is '{cells[cut]}'; wanted 1 where the border cuts it, else 0")
+        yield [*row, _identity(cells[identity]), float(cells[cut] == "1")]
+
+
+def _identity(text: str) -> float:
+    """The identity that a cell names; -1 where it names none."""
+    value = _number(text)
+    return value if value is not None and 1 <= value <= 2**53 and value == int(value) else -1.0
 
 
 def _all_moving(content: Sequence[tuple[int, str]], header: str) -> bool:

@@ -1,0 +1,104 @@
+"""`dddas locate`: where targets stand on the ground."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.sinks.positions import PositionJournal
+
+locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
+
+
+@locate.command()
+@explained
+def ground(
+    tables: Annotated[
+        list[Path],
+        typer.Argument(metavar="TABLE...", help="Tables of people or tracks, CSV or MOTChallenge text, one a camera."),
+    ],
+    camera: Annotated[list[Path], typer.Option(metavar="FILE", help="The TOML of each table's camera.")],
+    poses: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in their order.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-positions"),
+    config: Config = None,
+    set_: Overrides = None,
+    rate: Rate = None,
+    quiet: Quiet = False,
+) -> None:
+    """Locate people seen by cameras on the ground, by their height and their feet; several cameras are fused.
+
+    Writes positions.csv, sightings.csv (what each camera alone says), tracks.geojson where longitudes are known, and
+    run.json under --out.
+    """
+    from torchvision_dddas.settings import load
+
+    journal = ground_into(out, tables, camera, poses or [], load(config, set_ or []), rate, quiet)
+    if not quiet:
+        for line in summary(journal, out):
+            typer.echo(line)
+
+
+def ground_into(
+    folder: Path,
+    tables: Sequence[Path],
+    cameras: Sequence[Path],
+    poses: Sequence[Path],
+    settings: "Settings",
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> "PositionJournal":
+    """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
+    from torchvision_dddas.locating import locate as located
+    from torchvision_dddas.sinks.positions import PositionOutput
+    from torchvision_dddas.sources.cameras import read_camera, read_poses
+    from torchvision_dddas.sources.detections import read_detections
+
+    if len(cameras) != len(tables):
+        raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
+    if poses and len(poses) != len(tables):
+        raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; wanted one --poses for each, or none")
+    for table in tables:
+        if table.resolve() in [(folder / name).resolve() for name in PositionOutput.files]:
+            raise InputError(f"{table} is a file that this run writes; choose another folder with --out")
+    with PositionOutput(folder) as output:
+        read = [read_detections(table) for table in tables]
+        kinds = [read_camera(camera) for camera in cameras]
+        where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
+        geographic = "longitude_deg" in where[0].values if where[0] else kinds[0].geographic
+        facts = {
+            "input": list(tables),
+            "cameras": list(cameras),
+            "poses": list(poses),
+            "rows": [len(table) for table in read],
+            "settings": settings.model_dump(),
+        }
+        journal = output.begin(facts, tuple(kind.name for kind in kinds), geographic)
+        with progress("locate", None, quiet) as tick:
+            for frame in located(read, kinds, where, settings, rate_hz):
+                output.write(frame)
+                tick()
+        if not any(len(table) for table in read):
+            journal.notes.append("the tables have no rows: nobody to locate")
+            journal.counts = {"people": 0, "sightings": journal.by, "notes": journal.notes}
+    return journal
+
+
+def summary(journal: "PositionJournal", folder: Path) -> list[str]:
+    """What to tell the user at the end."""
+    by = journal.by
+    told = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"
+    lines = [f"{journal.frames} frames, {journal.targets} sightings ({told}), {journal.people} positions"]
+    if by["bearing"]:
+        lines.append(f"note: {by['bearing']} sightings have a bearing but no distance (see sightings.csv)")
+    made = [name for name in ("positions.csv", "sightings.csv", "tracks.geojson") if (folder / name).exists()]
+    return [*lines, *(f"note: {note}" for note in journal.notes), f"{folder}: {', '.join([*made, 'run.json'])}"]

@@ -1,0 +1,140 @@
+"""One person seen by several vehicles: which sightings are of the same person, and where all of them together put it.
+
+What is common to sightings is estimated with the places, not counted anew with each: a vehicle's position, heading,
+pitch, camera height and focal length are common to all that it sees, a person's height to all that see the person. So
+two people seen by the same two vehicles tell how far the vehicles' GPS disagree, and each gains by the other. All is
+linear about the single sightings. Assumed independent: what is new in each sighting, and the vehicles from one another;
+a GPS error common to the whole team is in no covariance here and no fusion takes it away.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from torchvision_dddas.targets.assignment import pairs
+from torchvision_dddas.types import Sightings
+
+ROUNDS = 5
+"""Each vehicle's sightings are matched anew to what the others see so many times at most."""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """People seen by a team at one time, one row a person.
+
+    east_north_m: (P, 2). covariance_m2: (P, 2, 2). members: (P, V) the row of each vehicle's sighting, -1 for none.
+    """
+
+    east_north_m: np.ndarray
+    covariance_m2: np.ndarray
+    members: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+
+def fuse(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Fused:
+    """Fuse what several vehicles see at one time, the sightings of each vehicle in one item; all must be located.
+
+    gate_sigmas: sightings are of one person if their distance, by its covariance, is as likely as this many sigmas.
+    """
+    members = associate(team, gate_sigmas)
+    where, covariance, _ = together(team, members)
+    return Fused(where, covariance, members)
+
+
+def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.ndarray, "P V"]:
+    """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
+
+    The vehicle that sees most begins; each other's are matched to what is known by then (Hungarian, within the gate of
+    chi-square with two degrees). Then each vehicle in turn is matched anew to the others, whose disagreement is known
+    better by then, until nothing changes.
+    """
+    order = sorted(range(len(team)), key=lambda v: -len(team[v]))
+    members = np.zeros((0, len(team)), np.int64)
+    for vehicle in order:
+        members = _matched(team, members, vehicle, gate_sigmas)
+    for _ in range(ROUNDS if len(team) > 1 else 0):
+        before = {tuple(row) for row in members.tolist()}
+        for vehicle in order:
+            others = members.copy()
+            others[:, vehicle] = -1
+            members = _matched(team, others[(others >= 0).any(axis=1)], vehicle, gate_sigmas)
+        if {tuple(row) for row in members.tolist()} == before:
+            break
+    rank = [tuple(np.where(row < 0, 1_000_000, row)) for row in members]
+    return members[sorted(range(len(members)), key=rank.__getitem__)]
+
+
+def gate(sigmas: float) -> float:
+    """The squared distance, by its covariance in the plane, that is as likely exceeded as so many sigmas on a line."""
+    return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
+
+
+def together(
+    team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
+) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 2"], Float[np.ndarray, "V 6"]]:
+    """Places of people, their covariances, and each vehicle's errors in sigmas: least squares over all sightings.
+
+    Unknown are each person's place and height, and each vehicle's six errors; what is known of the heights and errors
+    beforehand is that their sigma is 1.
+    """
+    people, vehicles = members.shape
+    size = 3 * people + 6 * vehicles
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    normal[2 * people :, 2 * people :] = np.eye(size - 2 * people)
+    for person, vehicle in np.argwhere(members >= 0):
+        seen, row = team[vehicle], members[person, vehicle]
+        design = np.concatenate([np.eye(2), seen.body_m[row][:, None], seen.camera_m[row]], axis=1)
+        at = np.concatenate(
+            [
+                2 * person + np.arange(2),
+                [2 * people + person],
+                3 * people + 6 * vehicle + np.arange(6),
+            ]
+        )
+        weighed = design.T @ np.linalg.inv(seen.own_m2[row])
+        normal[np.ix_(at, at)] += weighed @ design
+        right[at] += weighed @ seen.east_north_m[row]
+    # Scaled to ones on the diagonal: metres and sigmas differ by orders of magnitude.
+    scale = 1 / np.sqrt(np.diag(normal))
+    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    found = covariance @ right
+    blocks = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
+    own = blocks[np.arange(people), :, np.arange(people)]
+    return found[: 2 * people].reshape(-1, 2), own, found[3 * people :].reshape(-1, 6)
+
+
+def crowd(east_north_m: Float[np.ndarray, "T P 2"], ahead: float = 1.0) -> Float[np.ndarray, "2"]:
+    """Where a crowd will be `ahead` looks after the last: the average of its people, moved on as it moved at last.
+
+    east_north_m: its people at the last looks, NaN where one was not seen; one look alone predicts that it stays.
+    Source: appendix A, IV-C: individuals' locations are averaged to predict the crowd's next one.
+    """
+    places = np.asarray(east_north_m, float)
+    seen = np.isfinite(places).all(axis=2)
+    # Only people seen at both looks tell how the crowd moved: one who comes or goes moves the average too.
+    average = places[-1, seen[-1]].mean(axis=0) if seen[-1].any() else np.full(2, np.nan)
+    both = seen[-2] & seen[-1] if len(places) > 1 else np.zeros(0, bool)
+    step = (places[-1, both] - places[-2, both]).mean(axis=0) if both.any() else np.zeros(2)
+    return average + ahead * step
+
+
+def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_sigmas: float) -> np.ndarray:
+    """The people known by other vehicles, with this vehicle's sightings among them; unmatched ones are new people."""
+    seen = team[vehicle]
+    members = known.copy()
+    left = np.ones(len(seen), bool)
+    if len(known) and len(seen):
+        where, covariance, _ = together(team, known)
+        apart = where[:, None] - seen.east_north_m
+        spread = covariance[:, None] + seen.covariance_m2
+        distance = np.einsum("pni,pnij,pnj->pn", apart, np.linalg.inv(spread), apart)
+        for person, row in pairs(gate(gate_sigmas) - distance):
+            members[person, vehicle], left[row] = row, False
+    new = np.full((left.sum(), len(team)), -1, np.int64)
+    new[:, vehicle] = np.flatnonzero(left)
+    return np.concatenate([members, new])

@@ -1,0 +1,50 @@
+"""Longitude and latitude to local metres and back: on the WGS84 ellipsoid, and as the source does (appendix A, IV-C).
+
+All in float64: longitude in float32 is 0.7 m coarse. Local metres are those of the plane that touches the ellipsoid at
+the origin: a kilometre from it they are 5 cm above the ground, and less than a millimetre off.
+"""
+
+import numpy as np
+import pymap3d
+from jaxtyping import Float
+
+Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
+"""Longitude and latitude."""
+
+DEGREE_M = 111_320.0
+"""Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m."""
+
+
+def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
+    """Metres east and north of an origin, both as (longitude, latitude)."""
+    lonlat = np.asarray(lonlat_deg, float).reshape(-1, 2)
+    east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
+    return np.stack([east, north], axis=1)
+
+
+def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
+    """(longitude, latitude) of local metres."""
+    metres = np.asarray(east_north_m, float).reshape(-1, 2)
+    latitude, longitude, _ = pymap3d.enu2geodetic(metres[:, 0], metres[:, 1], 0.0, origin_deg[1], origin_deg[0], 0.0)
+    return np.stack([longitude, latitude], axis=1)
+
+
+def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
+    """(longitude, latitude) as the source has them, eq. (14): K = 111 320 m a degree, K cos(latitude) of longitude.
+
+    0.3 m off in 150 m.
+    """
+    origin = np.asarray(origin_deg, float)
+    return origin + np.asarray(east_north_m, float) / _degree_m(origin)
+
+
+def plain_east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
+    """Metres east and north, the other way round."""
+    origin = np.asarray(origin_deg, float)
+    return (np.asarray(lonlat_deg, float) - origin) * _degree_m(origin)
+
+
+def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
+    """(..., 2) metres a degree of longitude and of latitude."""
+    latitude = origin_deg[..., 1]
+    return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)
