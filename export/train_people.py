@@ -1,0 +1,412 @@
+"""Train a linear SVM for people on your own pictures: the file that `--set people.classifier=FILE` takes.
+
+usage: python export/train_people.py POSITIVES NEGATIVES --out FILE.npz [--set people.window_width_px=32 ...]
+
+POSITIVES: a folder of crops, one person each, centred, with the margin around the body that windows shall have; of
+crops with more around them, `--crop 64x128` takes that much in the middle. NEGATIVES: a folder of pictures of anything
+else. It needs the extras `torch` and `train`. What it does:
+
+1. descriptors of the positives and their mirror images, and of random windows of the negatives, on every level;
+2. C by cross-validation (average precision), where --c does not give it;
+3. rounds of hard negatives: the windows of the negatives that the last classifier takes for people join them;
+4. accuracy, and windows missed against false ones, on a share of both folders that took no part in 1 to 3.
+
+The descriptor is that of the people settings, which the file tells of; use it with the same ones. Where the body lies
+in the window (people.height_share and its like) is that of your crops, and the score at which people are likely
+(people.probability_even) that of your data. The same pictures, settings and --seed give the same file.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import cv2
+import numpy as np
+import torch
+
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.ops import hog
+from torchvision_dddas.settings import PeopleKnobs, load
+from torchvision_dddas.sinks.whole import cannot_write, write_whole
+from torchvision_dddas.sources.classifiers import layout_of
+from torchvision_dddas.sources.images import IMAGE_SUFFIXES
+from torchvision_dddas.targets.scan import everywhere, levels
+from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.vision.onboard_people import bordered, resized
+from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.vision.torch_people import TorchRecognizer
+from torchvision_dddas.vision.torch_people import layout as descriptor
+
+CHOICES = (0.003, 0.01, 0.03, 0.1, 0.3)
+BATCH = 256
+# Mining and measuring go through the pyramid in steps of at least this: windows of closer levels are much the same.
+STEP = 1.2
+FALSE_PER_WINDOW = (1e-3, 1e-4, 1e-5)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to train. negatives: random windows at first. rounds, hard: of mining, and windows a picture in each.
+
+    c: of the SVM, or None to choose it. margin: windows of the negatives above this score are hard ones. held_out:
+    share of either folder that is only measured on.
+    """
+
+    negatives: int = 3000
+    rounds: int = 3
+    hard: int = 100
+    c: float | None = None
+    margin: float = -0.5
+    held_out: float = 0.2
+    seed: int = 0
+
+
+class Trained(NamedTuple):
+    """A classifier, and what was found on the way, to print."""
+
+    svm: LinearSvm
+    lines: list[str]
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Train and write. Exit code 2, with one line, for bad input."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("positives", type=Path)
+    parser.add_argument("negatives", type=Path)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".npz, or text by any other name")
+    parser.add_argument("--crop", metavar="WxH", help="the middle of each positive that becomes the window")
+    parser.add_argument("--config")
+    parser.add_argument("--set", nargs="*", default=[], dest="overrides", metavar="KNOB=VALUE")
+    parser.add_argument("--c", type=float, help="of the SVM; by default chosen by cross-validation")
+    parser.add_argument("--rounds", type=int, default=Plan.rounds, help="of hard negatives")
+    parser.add_argument("--windows", type=int, default=Plan.negatives, help="random windows of the negatives")
+    parser.add_argument("--held-out", type=float, default=Plan.held_out, help="share that is only measured on")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quiet", action="store_true")
+    options = parser.parse_args(words)
+    try:
+        knobs = load(options.config, options.overrides).people
+        plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
+        check(plan)
+        people = crops(options.positives, knobs, size_of(options.crop) if options.crop else None)
+        rest = pictures(options.negatives, knobs)
+        trained = train(people, rest, knobs, plan, options.quiet)
+        write(options.out, trained.svm, knobs)
+    except InputError as error:
+        print(f"train_people: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("train_people: stopped; nothing was written", file=sys.stderr)
+        return 130
+    for line in trained.lines:
+        print(line)
+    said = " ".join(f"--set {word}" for word in [f"people.classifier={options.out}", *options.overrides])
+    print(f"{options.out}: {trained.svm.weights.size} weights and a bias; use it by {said}")
+    return 0
+
+
+def check(plan: Plan) -> None:
+    """Raises InputError where a number makes no sense."""
+    for name, value, fine, wanted in (
+        ("--windows", plan.negatives, plan.negatives >= 1, "1 or more"),
+        ("--rounds", plan.rounds, plan.rounds >= 0, "0 or more"),
+        ("--c", plan.c, plan.c is None or 0 < plan.c < float("inf"), "a number above 0"),
+        ("--held-out", plan.held_out, 0 <= plan.held_out <= 0.9, "a share from 0 to 0.9"),
+    ):
+        if not fine:
+            raise InputError(f"{name} is {value}; wanted {wanted}")
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Pictures.
+
+
+def files(folder: Path) -> list[Path]:
+    """The images of a folder and of those in it, by name. Raises InputError if there are none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; wanted one that holds images")
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    if not found:
+        raise InputError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
+    return found
+
+
+def picture(path: Path) -> np.ndarray:
+    """uint8 (H, W, 3) BGR. Raises InputError where it cannot be decoded."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(f"{path} cannot be decoded; repair it or leave it out")
+    return image
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """(width, height) of `64x128`."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise InputError(f"--crop is '{text}'; wanted width x height in pixels, such as 64x128")
+    return int(width), int(height)
+
+
+def crops(folder: Path, knobs: PeopleKnobs, crop: tuple[int, int] | None = None) -> np.ndarray:
+    """(N, h + 2, w + 2, 3) uint8: the windows of a folder's crops with their neighbours, resized as a scan would.
+
+    Raises InputError: a crop of less than half the window's size, which would be a blur, or smaller than `crop`.
+    """
+    return np.stack([window(picture(path), path, knobs, crop) for path in files(folder)])
+
+
+def window(image: np.ndarray, path: Path, knobs: PeopleKnobs, crop: tuple[int, int] | None) -> np.ndarray:
+    """The middle of a picture as a window with one pixel around it."""
+    size, wanted = image.shape[1::-1], (knobs.window_width_px, knobs.window_height_px)
+    crop = crop or size
+    if crop[0] > size[0] or crop[1] > size[1]:
+        raise InputError(f"{path} is {size[0]} x {size[1]} px, smaller than --crop {crop[0]}x{crop[1]}")
+    if 2 * crop[0] < wanted[0] or 2 * crop[1] < wanted[1]:
+        raise InputError(
+            f"{path} gives {crop[0]} x {crop[1]} px, less than half the window of {wanted[0]} x {wanted[1]} px; "
+            "leave it out, or set a smaller people.window_width_px and people.window_height_px"
+        )
+    level = round(size[0] * wanted[0] / crop[0]), round(size[1] * wanted[1] / crop[1])
+    level = max(level[0], wanted[0]), max(level[1], wanted[1])
+    middle = Part(level, (level[0] - wanted[0]) // 2, (level[1] - wanted[1]) // 2, *wanted)
+    return bordered(image if level == size else resized(image, level), middle)
+
+
+def pictures(folder: Path, knobs: PeopleKnobs) -> list[np.ndarray]:
+    """The pictures of a folder that hold a window. Raises InputError if none does."""
+    every = [picture(path) for path in files(folder)]
+    held = [
+        image for image in every if image.shape[1] >= knobs.window_width_px and image.shape[0] >= knobs.window_height_px
+    ]
+    if not held:
+        raise InputError(
+            f"{folder}: none of {len(every)} pictures is as large as the window of {knobs.window_width_px} x "
+            f"{knobs.window_height_px} px"
+        )
+    return held
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Descriptors.
+
+
+def descriptors(windows: np.ndarray, knobs: PeopleKnobs) -> np.ndarray:
+    """(N, F) float32 in OpenCV's order, of (N, h + 2, w + 2, 3) windows with one pixel around them."""
+    layout = descriptor(knobs)
+    (across, down), cells = layout.blocks, layout.cells
+    found = [np.zeros((0, layout.features), np.float32)]
+    for begin in range(0, len(windows), BATCH):
+        batch = torch.from_numpy(np.ascontiguousarray(windows[begin : begin + BATCH])).permute(0, 3, 1, 2).float()
+        with torch.inference_mode():
+            blocks = hog.blocks(batch, layout)  # (B, bins x cells down x cells across, ny, nx)
+        blocks = blocks.view(-1, layout.bins, cells, cells, down, across).permute(0, 5, 4, 3, 2, 1)
+        found.append(blocks.reshape(len(batch), -1).numpy())
+    return np.concatenate(found)
+
+
+def random_windows(
+    images: Sequence[np.ndarray], knobs: PeopleKnobs, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """(count, h + 2, w + 2, 3) windows of any picture, level and place; coarse levels as often as fine ones."""
+    found = []
+    for index in np.sort(rng.integers(0, len(images), count)):
+        image = images[index]
+        found.append(cut(image, [_somewhere(image, knobs, rng)])[0])
+    return np.stack(found)
+
+
+def _somewhere(image: np.ndarray, knobs: PeopleKnobs, rng: np.random.Generator) -> Part:
+    known = levels(image.shape[1::-1], knobs)
+    size = known[rng.integers(len(known))].size
+    width, height = knobs.window_width_px, knobs.window_height_px
+    x, y = (int(rng.integers(0, have - need + 1)) for have, need in zip(size, (width, height), strict=True))
+    return Part(size, x, y, width, height)
+
+
+def cut(image: np.ndarray, places: Sequence[Part]) -> list[np.ndarray]:
+    """Windows of a picture with one pixel around them."""
+    kept: dict[tuple[int, int], np.ndarray] = {}
+    for place in places:
+        if place.level not in kept:
+            kept[place.level] = image if place.level == image.shape[1::-1] else resized(image, place.level)
+    return [bordered(kept[place.level], place) for place in places]
+
+
+def scored(
+    images: Sequence[np.ndarray], recognizer: TorchRecognizer, knobs: PeopleKnobs
+) -> Iterator[tuple[list[Part], list[np.ndarray]]]:
+    """The parts and score maps of each picture, on levels STEP apart."""
+    knobs = knobs.model_copy(update={"scale_step": max(knobs.scale_step, STEP)})
+    for image in images:
+        parts = everywhere(image.shape[1::-1], knobs)
+        yield parts, recognizer.scores([image], [parts])[0]
+
+
+def hardest(
+    parts: Sequence[Part], maps: Sequence[np.ndarray], knobs: PeopleKnobs, above: float, count: int
+) -> list[Part]:
+    """The windows that score highest, and above a number, best first."""
+    places = [np.argwhere(scores > above) for scores in maps]
+    values = np.concatenate([scores[scores > above] for scores in maps])
+    of = np.repeat(np.arange(len(maps)), [len(place) for place in places])
+    rows = np.concatenate(places)
+    stride, found = knobs.window_stride_px, []
+    for i in np.argsort(-values, kind="stable")[:count]:
+        part, (row, column) = parts[of[i]], rows[i]
+        x, y = part.x + int(column) * stride, part.y + int(row) * stride
+        found.append(Part(part.level, x, y, knobs.window_width_px, knobs.window_height_px))
+    return found
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Training.
+
+
+def train(
+    people: np.ndarray, rest: Sequence[np.ndarray], knobs: PeopleKnobs, plan: Plan, quiet: bool = False
+) -> Trained:
+    """A classifier of windows (as of `crops`) against all windows of pictures.
+
+    Raises InputError where there is too little of either, or scikit-learn is missing.
+    """
+    rng = np.random.default_rng(plan.seed)
+    people, tested = split(people, plan.held_out, rng, "positives")
+    order, kept_back = split(np.arange(len(rest)), plan.held_out if len(rest) > 1 else 0, rng, "negatives")
+    learned = [rest[i] for i in order]
+    positive = descriptors(mirrored(people), knobs)
+    negative = descriptors(random_windows(learned, knobs, plan.negatives, rng), knobs)
+    lines = [f"{len(people)} people and their mirror images, {len(negative)} random windows of {len(learned)} pictures"]
+    c = plan.c or choose(positive, negative, plan.seed, lines)
+    svm = fit(positive, negative, c, plan.seed)
+    for turn in range(plan.rounds):
+        found = mine(learned, knobs, svm, plan, f"hard negatives, round {turn + 1}", quiet)
+        lines.append(f"round {turn + 1}: {len(found)} windows taken for people, or nearly so")
+        if not len(found):
+            break
+        negative = np.unique(np.concatenate([negative, found]), axis=0)
+        svm = fit(positive, negative, c, plan.seed)
+    held = [rest[i] for i in kept_back]
+    return Trained(svm, lines + measured(svm, tested, held, knobs))
+
+
+def split(items: np.ndarray, share: float, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Items to learn from, and those to measure on. Raises InputError where too few remain."""
+    order = rng.permutation(len(items))
+    aside = round(share * len(items))
+    if len(items) - aside < (2 if name == "positives" else 1):
+        raise InputError(f"{len(items)} {name}, of which {aside} are held out, are too few to learn from; give more")
+    return items[np.sort(order[aside:])], items[np.sort(order[:aside])]
+
+
+def mirrored(windows: np.ndarray) -> np.ndarray:
+    """The windows, and after them their mirror images."""
+    return np.concatenate([windows, windows[:, :, ::-1]])
+
+
+def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[str]) -> float:
+    """C by cross-validation in which a person and its mirror image stay together; the smallest that is as good."""
+    model_selection, metrics = _sklearn("model_selection"), _sklearn("metrics")
+    x = np.concatenate([positive, negative])
+    y = np.arange(len(x)) < len(positive)
+    half = len(positive) // 2
+    groups = np.concatenate([np.tile(np.arange(half), 2), half + np.arange(len(negative))])
+    folds = min(4, half)
+    parts = list(model_selection.GroupKFold(folds, shuffle=True, random_state=seed).split(x, y, groups))
+    found = []
+    for c in CHOICES:
+        values = []
+        for learn, test in parts:
+            svm = fit(x[learn][y[learn]], x[learn][~y[learn]], c, seed)
+            values.append(metrics.average_precision_score(y[test], x[test] @ svm.weights))
+        found.append(float(np.mean(values)))
+    best = CHOICES[int(np.argmax(np.round(found, 3)))]
+    shown = ", ".join(f"{c:g}: {value:.3f}" for c, value in zip(CHOICES, found, strict=True))
+    lines.append(f"C = {best:g} by average precision in {folds} folds ({shown})")
+    return best
+
+
+def fit(positive: np.ndarray, negative: np.ndarray, c: float, seed: int) -> LinearSvm:
+    """A linear SVM with the hinge loss squared, both classes of equal weight in sum."""
+    svm = _sklearn("svm")
+    model = svm.LinearSVC(C=c, class_weight="balanced", dual=True, random_state=seed, max_iter=20_000)
+    x = np.concatenate([positive, negative])
+    model.fit(x, np.arange(len(x)) < len(positive))
+    return LinearSvm(model.coef_[0].astype(np.float32), float(model.intercept_[0]), "trained")
+
+
+def mine(
+    images: Sequence[np.ndarray], knobs: PeopleKnobs, svm: LinearSvm, plan: Plan, name: str, quiet: bool
+) -> np.ndarray:
+    """(N, F) descriptors of the windows that a classifier wrongly takes for people, on every level."""
+    recognizer = TorchRecognizer(knobs, svm)
+    found = [np.zeros((0, svm.weights.size), np.float32)]
+    with progress(name, len(images), quiet) as tick:
+        for image, (parts, maps) in zip(images, scored(images, recognizer, knobs), strict=True):
+            places = hardest(parts, maps, knobs, plan.margin, plan.hard)
+            if places:
+                found.append(descriptors(np.stack(cut(image, places)), knobs))
+            tick()
+    return np.concatenate(found)
+
+
+def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], knobs: PeopleKnobs) -> list[str]:
+    """Lines on pictures that took no part in the training."""
+    if not len(people) or not len(rest):
+        return ["nothing was held out, so nothing was measured"]
+    score = descriptors(people, knobs) @ svm.weights + svm.bias
+    recognizer = TorchRecognizer(knobs, svm)
+    false = np.concatenate([np.concatenate([m.ravel() for m in maps]) for _, maps in scored(rest, recognizer, knobs)])
+    right = ((score > 0).mean() + (false <= 0).mean()) / 2
+    missed, taken = int((score <= 0).sum()), int((false > 0).sum())
+    line = (
+        f"held out: {missed} of {len(people)} people missed, {taken} of {len(false)} windows of {len(rest)} pictures "
+    )
+    lines = [f"{line}taken for people; accuracy {right:.3f} with both alike"]
+    shown = []
+    for rate in FALSE_PER_WINDOW:
+        if rate * len(false) >= 1:
+            level = np.sort(false)[-int(rate * len(false))]
+            shown.append(f"{(score <= level).mean():.3f} at {rate:g} (score {level:.2f})")
+    return [*lines, f"miss rate at false positives per window: {', '.join(shown) or 'too few windows'}"]
+
+
+def write(path: Path, svm: LinearSvm, knobs: PeopleKnobs) -> None:
+    """As .npz with the layout, else as text that tells it in its comments. Raises InputError if the disk refuses."""
+    import io
+
+    layout = layout_of(knobs)
+    held = io.BytesIO()
+    if path.suffix.lower() == ".npz":
+        # The format keeps no names of its own in `layout`, so arrays of the same name do.
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in layout.items()}
+        np.savez(held, weights=svm.weights, bias=np.float32(svm.bias), **arrays)
+    else:
+        told = ", ".join(f"{name} {value}" for name, value in layout.items())
+        lines = [f"# Linear SVM for people: {svm.weights.size} weights, then the bias. {told}"]
+        lines += [f"{number:.9g}" for number in (*svm.weights.tolist(), svm.bias)]
+        held.write(("\n".join(lines) + "\n").encode())
+    try:
+        write_whole(path, held.getvalue())
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def _sklearn(name: str) -> Any:
+    """A module of scikit-learn. Raises InputError where it is not installed."""
+    import importlib
+
+    try:
+        return importlib.import_module(f"sklearn.{name}")
+    except ModuleNotFoundError:
+        raise InputError("training needs scikit-learn; pip install 'torchvision-dddas[torch,train]'") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
