@@ -402,7 +402,7 @@ class ConfirmKnobs(Group):
     )
     limit: float = knob(7.0, "-", 0.5, 50, meaning="log-odds never pass this, so that later looks can still turn them")
     share: float = knob(
-        0.5, "-", 0.01, 1, meaning="in pictures: share of the smaller box, person's or blob's, that lies in the other at least"
+        0.5, "-", 0.01, 1, meaning="in pictures: share of the smaller of a person's and a blob's box that both hold"
     )
 
 
