@@ -356,8 +356,8 @@ class PeopleKnobs(Group):
         meaning="look at the whole picture in every frame, or between whole looks only around what is expected there",
     )
     rescan_frames: int = knob(10, "frames", 1, 10_000, meaning="regions: every so many frames the whole picture")
-    region_margin: float = knob(0.5, "heights", 0, 5, meaning="regions: so far around a body that is expected")
-    region_scales: float = knob(1.3, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
+    region_margin: float = knob(0.15, "heights", 0, 5, meaning="regions: so far around a body that is expected")
+    region_scales: float = knob(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
 
 
 class GroundKnobs(Group):

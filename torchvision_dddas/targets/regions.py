@@ -18,8 +18,10 @@ from torchvision_dddas.vision.protocol import Part
 Regions = tuple[np.ndarray, np.ndarray]
 """region_px (R, 4), which a body must lie in; heights_px (R, 2), its least and largest height."""
 
-# Heights of bodies in a moving blob, in its own: it may be a group, or miss what does not move, such as feet and head.
-_BLOB_HEIGHTS = (1 / 3, 1.3)
+# What a blob says of a body, in blob heights: it may be a group, or the legs alone, whose body is above them.
+_BLOB_HEIGHTS = (0.5, 2.5)
+_ABOVE, _BELOW, _BESIDE = 1.5, 0.5, 0.35
+_EXPLAINED = 0.5  # a blob of which those expected cover this share is theirs
 
 # Of the difference between where a person was expected and found, so much goes into place and size, and velocity.
 # Windows stand on a grid of 0.08 body heights: two looks alone would say little of a velocity.
@@ -40,16 +42,16 @@ class Look:
     adjustments: tuple[Adjustment, ...] = ()
 
 
-def around_blobs(box_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Regions:
-    """Around moving blobs: bodies from a third to 1.3 times as high."""
+def around_blobs(box_px: Float[np.ndarray, "N 4"]) -> Regions:
+    """Around moving blobs: bodies from half to 2.5 times as high."""
     box_px = np.asarray(box_px, float).reshape(-1, 4)
-    margin = max(knobs.region_margin, _BLOB_HEIGHTS[1] - 1) * box_px[:, 3]
-    return grown(box_px, margin), box_px[:, 3:] * _BLOB_HEIGHTS
+    return grown(box_px, _BESIDE, _ABOVE, _BELOW), box_px[:, 3:] * _BLOB_HEIGHTS
 
 
-def grown(box_px: Float[np.ndarray, "N 4"], margin_px: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
-    """Boxes with a margin on every side."""
-    return box_px + np.stack([-margin_px, -margin_px, 2 * margin_px, 2 * margin_px], axis=1)
+def grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: float) -> Float[np.ndarray, "N 4"]:
+    """Boxes with margins, in their heights."""
+    more = np.array([-beside, -above, 2 * beside, above + below])
+    return box_px + box_px[:, 3:] * more
 
 
 class Expected:
@@ -79,8 +81,8 @@ class Expected:
     def regions(self, frame: int) -> Regions:
         """Around them."""
         box_px, knobs = self.box_px(frame), self.knobs
-        margin = knobs.region_margin * box_px[:, 3]
-        return grown(box_px, margin), box_px[:, 3:] * (1 / knobs.region_scales, knobs.region_scales)
+        margin = knobs.region_margin
+        return grown(box_px, margin, margin, margin), box_px[:, 3:] * (1 / knobs.region_scales, knobs.region_scales)
 
     def learn(self, frame: int, people: People) -> int:
         """Take in whom a look found; returns how many of those expected are among them."""
@@ -120,6 +122,13 @@ def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tupl
     return row[kept], column[kept]
 
 
+def _covered(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
+    """(N,) share of each box that the others cover, those that overlap counted twice."""
+    low = np.maximum(box_px[:, None, :2], other_px[:, :2])
+    high = np.minimum(box_px[:, None, :2] + box_px[:, None, 2:], other_px[:, :2] + other_px[:, 2:])
+    return np.clip(high - low, 0, None).prod(axis=2).sum(axis=1) / box_px[:, 2:].prod(axis=1)
+
+
 class Search:
     """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
 
@@ -134,7 +143,8 @@ class Search:
         self.steered = knobs.search == "regions"
         self.expected = Expected(knobs)
         self.whole = 0  # frame of the last whole look; 0: none yet
-        self.lost = 0  # people expected none of whom was found, since the last look
+        self.there = 0  # people whom the last look found
+        self.lost = 0  # how many the look before it had found, where it found none of them
         self.told = 1.0  # share of windows in the last line of the record
 
     def look(self, frame: int, size: tuple[int, int]) -> Look:
@@ -157,15 +167,18 @@ class Search:
             return
         if look.regions_px is None:
             self.whole = frame
-        there = len(self.expected)
         again = self.expected.learn(frame, people)
-        # One alone is often missed for a frame, and a whole look that found nobody need not be repeated.
-        self.lost = there if there > 1 and not again and look.regions_px is not None else 0
+        # One alone is often missed for a frame, and after a look that found nobody none is new.
+        self.lost = self.there if self.there > 1 and not again and look.regions_px is not None else 0
+        self.there = len(people)
 
     def _regions(self, frame: int) -> Regions:
         found = [self.expected.regions(frame)] if self.steered else []
         if self.blobs is not None:
-            found.append(around_blobs(self.blobs(frame), self.knobs))
+            box_px = self.blobs(frame)
+            if self.steered:
+                box_px = box_px[_covered(box_px, self.expected.box_px(frame)) < _EXPLAINED]
+            found.append(around_blobs(box_px))
         return np.concatenate([region for region, _ in found]), np.concatenate([heights for _, heights in found])
 
     def _whole(self, frame: int, everywhere: list[Part], why: str) -> Look:

@@ -1,0 +1,165 @@
+"""Where people are looked for: around those expected, around what moves, and when everywhere."""
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.targets import scan
+from torchvision_dddas.targets.regions import Expected, Search, around_blobs
+from torchvision_dddas.types import People
+
+SIZE = (640, 480)
+KNOBS = PeopleKnobs(search="regions", rescan_frames=10)
+
+
+def people(*boxes):
+    box_px = np.array(boxes, float).reshape(-1, 4)
+    n = len(box_px)
+    return People(box_px, np.full(n, 0.9), np.ones(n), np.zeros(n, bool), box_px)
+
+
+def walker(frame, x=100.0, speed=4.0):
+    return (x + speed * frame, 200, 40, 110)
+
+
+def looks(search, found, last, first=1):
+    """The looks at frames first .. last, where `found(frame)` is what each finds."""
+    made = {}
+    for frame in range(first, last + 1):
+        made[frame] = search.look(frame, SIZE)
+        search.learn(frame, found(frame), made[frame])
+    return made
+
+
+def inside(box, region):
+    return (box[:2] >= region[:2]).all() and (box[:2] + box[2:] <= region[:2] + region[2:]).all()
+
+
+def test_the_whole_picture_is_searched_in_every_frame_by_default():
+    made = looks(Search(PeopleKnobs()), lambda n: people(walker(n)), 12)
+    assert all(look.regions_px is None and look.share == 1 and not look.adjustments for look in made.values())
+    assert made[5].parts == scan.everywhere(SIZE, PeopleKnobs())
+
+
+def test_between_whole_looks_a_walker_is_searched_for_where_he_will_be():
+    made = looks(Search(KNOBS), lambda n: people(walker(n)), 30)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1, 11, 21]
+    for n in set(made) - {1, 11, 21}:
+        assert len(made[n].regions_px) == 1 and inside(np.array(walker(n)), made[n].regions_px[0])
+        assert 0 < made[n].share < 0.1
+
+
+def test_velocity_is_learnt_and_carries_over_frames_that_show_nobody():
+    expected = Expected(KNOBS)
+    for n in range(1, 21):
+        expected.learn(n, people(walker(n, speed=9)))
+    for n in (21, 22, 23):
+        expected.learn(n, people())
+    assert len(expected) == 1
+    assert expected.box_px(24)[0] == pytest.approx(walker(24, speed=9), abs=4)
+
+
+def test_one_who_is_missed_stays_expected_until_a_rescan_is_due_and_a_glimpse_is_soon_forgotten():
+    expected = Expected(KNOBS)
+    for n in range(1, 21):
+        expected.learn(n, people(walker(n)))
+    for n in range(21, 31):
+        expected.learn(n, people())
+        assert len(expected) == 1
+    expected.learn(31, people())
+    assert len(expected) == 0
+    expected.learn(32, people(walker(32)))
+    for n in (33, 34):
+        expected.learn(n, people())
+        assert len(expected) == 1
+    expected.learn(35, people())
+    assert len(expected) == 0
+
+
+def test_two_who_pass_each_other_keep_their_velocities():
+    expected = Expected(KNOBS)
+    for n in range(1, 31):
+        expected.learn(n, people(walker(n, x=0, speed=6), (*walker(n, x=300, speed=-6)[:1], 230, 40, 110)))
+    assert sorted(expected.velocity_px[:, 0]) == pytest.approx([-6, 6], abs=0.5)
+
+
+def test_people_do_not_depend_on_the_order_in_which_they_are_found():
+    both = [(50, 200, 40, 110), (400, 180, 60, 150)]
+    one, other = Expected(KNOBS), Expected(KNOBS)
+    for n in range(1, 6):
+        one.learn(n, people(*both))
+        other.learn(n, people(*both[:: 1 if n % 2 else -1]))
+    assert len(one) == len(other) == 2
+    assert np.array_equal(
+        one.box_px(6)[np.argsort(one.box_px(6)[:, 0])], other.box_px(6)[np.argsort(other.box_px(6)[:, 0])]
+    )
+
+
+def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost():
+    def found(n):
+        return people(walker(n), (400, 200, 40, 110)) if n < 5 else people()
+
+    made = looks(Search(KNOBS), found, 10)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1, 6]
+    assert [(a.old < 0.2, a.new, a.cause) for a in made[6].adjustments] == [
+        (True, 1.0, "none of 2 people expected was found")
+    ]
+
+
+def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():
+    made = looks(Search(KNOBS), lambda n: people(walker(n)), 110)
+    lines = [a for look in made.values() for a in look.adjustments]
+    assert [(a.frame, a.knob, a.old, a.cause) for a in lines] == [(2, "people.windows_share", 1.0, "1 people expected")]
+    assert lines[0].new == pytest.approx(made[2].share, abs=1e-4)
+
+
+def test_regions_that_would_cost_nearly_all_are_given_up_for_the_whole_picture():
+    knobs = PeopleKnobs(search="regions", region_margin=5, region_scales=4)
+    made = looks(Search(knobs), lambda n: people(*((x, 150, 60, 150) for x in range(0, 600, 60))), 3)
+    assert all(look.regions_px is None for look in made.values())
+
+
+def test_frames_that_are_left_out_bring_the_whole_look_nearer():
+    search = Search(KNOBS)
+    looks(search, lambda n: people(walker(n)), 3)
+    assert search.look(10, SIZE).regions_px is not None
+    assert search.look(11, SIZE).regions_px is None
+
+
+def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where_there_are_none():
+    blobs = {1: np.array([[200, 100, 50, 120.0]])}
+    made = looks(Search(PeopleKnobs(), lambda n: blobs.get(n, np.zeros((0, 4)))), lambda n: people(), 25)
+    assert len(made[1].regions_px) == 1 and 0 < made[1].share < 0.2
+    assert all(look.share == 0 and look.parts == [] and len(look.regions_px) == 0 for n, look in made.items() if n > 1)
+
+
+def test_with_blobs_and_regions_both_are_searched_and_the_whole_picture_when_it_is_time():
+    blob = np.array([[400, 100, 50, 120.0]])
+    made = looks(Search(KNOBS, lambda n: blob), lambda n: people(walker(n)), 12)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1, 11]
+    assert len(made[5].regions_px) == 2
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 1.7, 2.5])
+def test_bodies_from_half_a_blob_to_those_of_which_it_is_the_legs_are_looked_for(share):
+    blob = np.array([200, 160, 40, 100.0])
+    regions_px, heights_px = around_blobs(blob[None])
+    height = share * blob[3]
+    standing = blob[1] + blob[3] + (5 if share > 1 else 0) - height  # legs alone are at the lower end
+    body = np.array([blob[0] + 20 - 0.2 * height, standing, 0.4 * height, height])
+    assert heights_px[0, 0] <= height <= heights_px[0, 1]
+    assert inside(body, regions_px[0])
+
+
+def test_a_blob_that_those_expected_explain_is_not_searched_again():
+    blob = np.array([[0, 220, 30, 80.0], [400, 220, 30, 80]])
+    search = Search(KNOBS, lambda n: blob + np.array([4.0 * n + 105, 0, 0, 0]))
+    made = looks(search, lambda n: people(walker(n)), 6)
+    assert len(made[6].regions_px) == 2
+    assert inside(np.array(walker(6)), made[6].regions_px[0])
+    assert inside(search.blobs(6)[1], made[6].regions_px[1])
+
+
+def test_no_blob_gives_no_region():
+    regions_px, heights_px = around_blobs(np.zeros((0, 4)))
+    assert (regions_px.shape, heights_px.shape) == ((0, 4), (0, 2))
