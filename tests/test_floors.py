@@ -45,6 +45,7 @@ FLOORS: dict[str, set[str]] = {
     "control": {"numpy", "targets.gates", "types", "settings", "errors"},
     "run": {"numpy", "pipeline", "control", "windows", "sources", "vision", "targets", "types", "settings", "errors"},
     "recognizing": {"numpy", "sources", "vision", "targets", "types", "settings", "errors"},
+    "confirming": {"numpy", "sources", "targets", "types", "settings", "errors"},
     "locating": {"numpy", "sources", "targets", "types", "settings", "errors"},
     "following": {"numpy", "sources", "vision", "targets", "types", "settings", "errors"},
     "sources": {"numpy", "cv2", "av", "simulation", "types", "errors"},

@@ -250,6 +250,27 @@ class Located:
 
 
 @dataclass(frozen=True)
+class Confirmed:
+    """What vehicles on the ground say of the blobs of one frame, one row a blob.
+
+    row: (N,) int64, its place in the blobs' table, sorted by frame. kind: human, not_human or unseen, by all looks so
+    far. probability: (N,) of being human. seen_by: the vehicles that could tell something in this frame. people: (N,)
+    int64, recognized at it in this frame, by the vehicle that recognized most. nearest_m, nearest_sigmas: (N,) to the
+    nearest person in this frame, NaN where there is none. best: (N,) highest probability of its people, NaN without.
+    """
+
+    frame: int
+    row: np.ndarray
+    kind: tuple[str, ...]
+    probability: np.ndarray
+    seen_by: tuple[tuple[str, ...], ...]
+    people: np.ndarray
+    nearest_m: np.ndarray
+    nearest_sigmas: np.ndarray
+    best: np.ndarray
+
+
+@dataclass(frozen=True)
 class Tracks:
     """The targets of one frame with their identities, one row a target.
 

@@ -1,0 +1,220 @@
+"""`dddas confirm`: which blobs seen from the air are people, by those recognized from the ground."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.confirming import Vehicle
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.sinks.confirmed import ConfirmJournal
+    from torchvision_dddas.types import Confirmed
+
+
+@explained
+def confirm(
+    blobs: Annotated[
+        Path, typer.Argument(metavar="BLOBS", help="positions.csv of the blobs; or their boxes, of one camera's clip.")
+    ],
+    people: Annotated[
+        list[Path], typer.Argument(metavar="PEOPLE...", help="The same of people: a table for each ground vehicle.")
+    ],
+    camera: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE", help="The TOML of each table's camera, or of all of one fused table's: what they could see."
+        ),
+    ] = None,
+    poses: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in their order.")
+    ] = None,
+    interval: Annotated[
+        int, typer.Option(metavar="D", help="People were looked for at every D-th frame: 1, 1+D, 1+2D, ...")
+    ] = 1,
+    identities: Annotated[
+        bool | None,
+        typer.Option(
+            "--identities/--no-identities",
+            help="Whether the numbers of positions are targets that last, so that looks add up. [default: by table]",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-confirmed"),
+    config: Config = None,
+    set_: Overrides = None,
+    rate: Rate = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tell which blobs are people: human, not human, or unseen, by the people recognized near them.
+
+    Without cameras nothing is known of what the ground vehicles could see: blobs are then human or unseen.
+    Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
+    """
+    from torchvision_dddas.settings import load
+
+    settings = load(config, set_ or [])
+    if interval < 1:
+        raise InputError(f"--interval is {interval}; wanted 1 or more frames")
+    journal = confirm_into(out, blobs, people, camera or [], poses or [], settings, interval, identities, rate, quiet)
+    if not quiet:
+        for line in summary(journal, out):
+            typer.echo(line)
+
+
+def confirm_into(
+    folder: Path,
+    blobs: Path,
+    people: Sequence[Path],
+    cameras: Sequence[Path],
+    poses: Sequence[Path],
+    settings: "Settings",
+    interval: int = 1,
+    identities: bool | None = None,
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> "ConfirmJournal":
+    """Confirm and write under a folder; returns the record of the run. Raises InputError for bad input."""
+    from torchvision_dddas.sinks.confirmed import ConfirmOutput
+
+    for table in (blobs, *people):
+        if table.resolve() in [(folder / name).resolve() for name in ConfirmOutput.files]:
+            raise InputError(f"{table} is a file that this run writes; choose another folder with --out")
+    from torchvision_dddas.sources.rows import header_of
+
+    places = {path: "east_m" in header_of(path) for path in (blobs, *people)}
+    for path, of_places in places.items():
+        if of_places != places[blobs]:
+            raise InputError(
+                f"{blobs} has {_KIND[places[blobs]]}, {path} has {_KIND[of_places]}; give positions.csv for all "
+                "(dddas locate), or boxes of the same pictures for all"
+            )
+    with ConfirmOutput(folder) as output:
+        facts = {
+            "blobs": blobs,
+            "people": list(people),
+            "cameras": list(cameras),
+            "poses": list(poses),
+            "interval_frames": interval,
+            "settings": settings.model_dump(),
+        }
+        notes: list[str] = []
+        if places[blobs]:
+            header, rows, found = _on_the_ground(
+                blobs, people, cameras, poses, settings, interval, identities, rate_hz, notes
+            )
+        else:
+            if cameras or poses:
+                raise InputError(f"{blobs} has boxes: --camera and --poses are for positions on the ground")
+            header, rows, found = _in_pictures(blobs, people, settings, interval, identities)
+        journal = output.begin(facts, header, rows)
+        journal.notes += notes
+        if not rows:
+            journal.notes.append(f"{blobs} has no rows: nothing to confirm")
+            journal.counts = {"kinds": {}, "rows_looked_at": 0, "notes": journal.notes}
+        with progress("confirm", None, quiet) as tick:
+            for frame in found:
+                output.write(frame)
+                tick()
+    return journal
+
+
+_KIND = {True: "positions (east_m, north_m)", False: "boxes"}
+_Found = tuple[list[str], list[list[str]], "Iterator[Confirmed]"]
+
+
+def _on_the_ground(
+    blobs: Path,
+    people: Sequence[Path],
+    cameras: Sequence[Path],
+    poses: Sequence[Path],
+    settings: "Settings",
+    interval: int,
+    identities: bool | None,
+    rate_hz: float | None,
+    notes: list[str],
+) -> _Found:
+    from torchvision_dddas.confirming import confirm_positions, lasts
+    from torchvision_dddas.sinks.confirmed import COLUMNS
+    from torchvision_dddas.sources.positions import read_positions
+    from torchvision_dddas.sources.rows import read_rows
+
+    given = read_positions(blobs)
+    vehicles = _vehicles(people, cameras, poses)
+    if not cameras:
+        notes.append("without --camera nothing is known of what was seen: no blob can be found not human")
+    lasting = lasts(given) if identities is None else identities
+    if identities is None and not lasting:
+        notes.append("each frame counts its targets from 1: every row is judged alone (--identities adds looks up)")
+    return *read_rows(blobs, COLUMNS), confirm_positions(given, vehicles, settings, interval, lasting, rate_hz)
+
+
+def _vehicles(people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path]) -> "list[Vehicle]":
+    """The tables with their cameras: one each, or all of them to a single table. Raises InputError otherwise."""
+    from torchvision_dddas.confirming import Vehicle
+    from torchvision_dddas.sources.cameras import read_camera, read_poses
+    from torchvision_dddas.sources.positions import read_positions
+
+    if len(people) > 1 and cameras and len(cameras) != len(people):
+        raise InputError(
+            f"{len(people)} tables of people and {len(cameras)} cameras; wanted one --camera for each table, or none"
+        )
+    if poses and len(poses) != len(cameras):
+        raise InputError(
+            f"{len(cameras)} cameras and {len(poses)} files of poses; wanted one --poses for each, or none"
+        )
+    kinds = [read_camera(path) for path in cameras]
+    where = [read_poses(path) for path in poses] if poses else [None] * len(kinds)
+    tables = [read_positions(path) for path in people]
+    names = _names(people)
+    if len(people) == 1:
+        return [Vehicle(names[0], tables[0], tuple(kinds), tuple(where))]
+    if not cameras:
+        return [Vehicle(name, table) for name, table in zip(names, tables, strict=True)]
+    return [
+        Vehicle(name, table, (camera,), (pose,))
+        for name, table, camera, pose in zip(names, tables, kinds, where, strict=True)
+    ]
+
+
+def _in_pictures(
+    blobs: Path, people: Sequence[Path], settings: "Settings", interval: int, identities: bool | None
+) -> _Found:
+    from dataclasses import replace
+
+    from torchvision_dddas.confirming import confirm_pictures
+    from torchvision_dddas.sinks.confirmed import COLUMNS
+    from torchvision_dddas.sources.detections import read_detections
+    from torchvision_dddas.sources.rows import read_rows
+
+    given = read_detections(blobs)
+    if identities is False:
+        given = replace(given, identity=None)
+    tables = [read_detections(path) for path in people]
+    return *read_rows(blobs, COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
+
+
+def _names(people: Sequence[Path]) -> list[str]:
+    """A name for each table, no two alike: its folder's where all files have one name, as positions.csv has."""
+    names = [path.stem for path in people]
+    if len(set(names)) < len(names):
+        names = [path.resolve().parent.name for path in people]
+    if len(set(names)) < len(names):
+        names = [f"{name}-{k}" for k, name in enumerate(names, 1)]
+    return [name.replace(";", "-") for name in names]
+
+
+def summary(journal: "ConfirmJournal", folder: Path) -> list[str]:
+    """What to tell the user at the end."""
+    kinds = journal.kinds
+    told = f"{kinds['human']} human, {kinds['not_human']} not human, {kinds['unseen']} unseen"
+    return [
+        f"{journal.frames} frames, {journal.targets} blobs: {told}",
+        *(f"note: {note}" for note in journal.notes),
+        f"{folder}: confirmed.csv, run.json",
+    ]

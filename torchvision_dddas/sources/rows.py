@@ -1,0 +1,44 @@
+"""A table's own words: its column names and cells as they stand, to be written again with more beside them."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchvision_dddas.errors import InputError
+
+MOT = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
+"""What the columns of MOTChallenge text are, which has no first line that names them."""
+
+
+def header_of(path: str | Path) -> list[str]:
+    """The column names of a table, or MOT where its first line holds numbers. Raises InputError as `read_rows`."""
+    return _read(path)[0]
+
+
+def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """The column names and the cells of a table that its reader found valid, sorted by frame, as readers sort it.
+
+    without: columns to leave out. Raises InputError where it cannot be read.
+    """
+    header, rows = _read(path)
+    frame = header.index("frame")
+    rows.sort(key=lambda row: float(row[frame]))  # a stable sort
+    kept = [place for place, name in enumerate(header) if name not in without]
+    return [header[place] for place in kept], [[row[place] for place in kept] for row in rows]
+
+
+def _read(path: str | Path) -> tuple[list[str], list[list[str]]]:
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            rows = [[cell.strip() for cell in row] for row in csv.reader(file, skipinitialspace=True)]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} is no CSV text: {error}") from None
+    rows = [row for row in rows if any(row)]
+    if rows and rows[0][0][:1].isalpha():
+        return rows[0], [[*row, *[""] * (len(rows[0]) - len(row))] for row in rows[1:]]
+    rows = [row if len(row) > 1 else row[0].split() for row in rows]
+    widest = max((len(row) for row in rows), default=len(MOT))
+    header = [*MOT, *(f"column_{place}" for place in range(len(MOT) + 1, widest + 1))][: max(widest, 1)]
+    return header, [[*row, *[""] * (widest - len(row))] for row in rows]
