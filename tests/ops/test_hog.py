@@ -36,15 +36,18 @@ def bordered(picture: np.ndarray) -> torch.Tensor:
 
 
 def opencv(layout: Layout, weights: np.ndarray | None = None, bias: float = 0.0) -> cv2.HOGDescriptor:
-    sides = [(length, length) for length in (layout.block, layout.stride, layout.cell)]
-    made = cv2.HOGDescriptor(layout.window, *sides, layout.bins, 1, -1, 0, layout.clip, layout.gamma, 64, layout.signed)
+    block, stride, cell = ((side, side) for side in (layout.block, layout.stride, layout.cell))
+    made = cv2.HOGDescriptor(
+        layout.window, block, stride, cell, layout.bins, 1, -1, 0, layout.clip, layout.gamma, 64, layout.signed
+    )
     if weights is not None:
         made.setSVMDetector(np.append(weights, bias).astype(np.float32))
     return made
 
 
 def opencv_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias: float) -> np.ndarray:
-    places, found = opencv(layout, weights, bias).detect(picture, -1e9, (layout.stride, layout.stride), (0, 0))
+    hits = opencv(layout, weights, bias).detect(picture, -1e9, (layout.stride, layout.stride), (0, 0))
+    places, found = (np.asarray(hit) for hit in hits)
     down, across = (
         (have - need) // layout.stride + 1 for have, need in zip(picture.shape[:2], layout.window[::-1], strict=True)
     )
@@ -120,7 +123,7 @@ def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins,
     assume(window[0] % 4 == 0)
     layout = Layout(window, cell, block, every, bins, signed, gamma=gamma)
     picture = np.random.default_rng(seed).integers(0, 256, (window[1], window[0], 3), np.uint8)
-    wanted = opencv(layout).compute(picture)
+    wanted = np.asarray(opencv(layout).compute(picture))
     across, down = layout.blocks
     found = hog.blocks(bordered(picture), layout)[0].view(bins, cells, cells, down, across).permute(4, 3, 2, 1, 0)
     np.testing.assert_allclose(found.flatten().numpy(), wanted.ravel(), atol=2e-5, rtol=0)
@@ -160,7 +163,7 @@ def test_of_channels_that_differ_equally_opencvs_wins():
 def test_a_score_is_the_descriptor_times_the_weights_plus_the_bias(texture):
     picture = texture(4, 128, 64)
     weights, bias = random_svm(Layout())
-    wanted = opencv(Layout()).compute(picture).ravel() @ weights + bias
+    wanted = np.ravel(opencv(Layout()).compute(picture)) @ weights + bias
     found = own_scores(picture, Layout(), weights, bias)
     assert found.shape == (1, 1)
     assert found.item() == pytest.approx(wanted, abs=1e-5)
@@ -170,10 +173,10 @@ def test_a_batch_is_the_same_as_each_picture_alone(texture):
     layout = LAYOUTS["small cells"]
     pictures = torch.cat([bordered(texture(seed, 70, 81)) for seed in range(3)])
     weights, bias = random_svm(layout)
-    weights = hog.arranged(torch.from_numpy(weights), layout)
-    together = hog.scores(hog.blocks(pictures, layout), weights, torch.tensor(bias))
+    arranged = hog.arranged(torch.from_numpy(weights), layout)
+    together = hog.scores(hog.blocks(pictures, layout), arranged, torch.tensor(bias))
     for row, picture in enumerate(pictures):
-        alone = hog.scores(hog.blocks(picture[None], layout), weights, torch.tensor(bias))
+        alone = hog.scores(hog.blocks(picture[None], layout), arranged, torch.tensor(bias))
         torch.testing.assert_close(together[row], alone[0], atol=1e-6, rtol=0)
 
 

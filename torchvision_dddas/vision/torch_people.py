@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.ops import hog
 from torchvision_dddas.ops.resize import reflected, resize
 from torchvision_dddas.settings import PeopleKnobs
@@ -24,11 +25,19 @@ class TorchRecognizer:
     name = "torch"
 
     def __init__(self, knobs: PeopleKnobs, svm: LinearSvm, device: str | torch.device | None = None) -> None:
-        """device: by default the GPU where there is one."""
+        """device: by default the GPU where there is one.
+
+        Raises InputError where cells, blocks and window do not fit one another, or the SVM is of another length.
+        """
         self.knobs, self.svm = knobs, svm
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.layout = layout(knobs)
-        weights = torch.from_numpy(np.ascontiguousarray(svm.weights, np.float32))
+        if svm.weights.size != self.layout.features:
+            raise InputError(
+                f"the classifier {svm.origin} has {svm.weights.size} weights; "
+                f"a window of these settings has {self.layout.features}"
+            )
+        weights = torch.from_numpy(np.array(svm.weights, np.float32))
         self.weights = hog.arranged(weights, self.layout).to(self.device)
         self.bias = torch.tensor(svm.bias, dtype=torch.float32, device=self.device)
 
