@@ -17,8 +17,11 @@ from jaxtyping import Float, Int
 from torchvision_dddas.targets.assignment import pairs
 from torchvision_dddas.types import Sightings
 
-ROUNDS = 5
+ROUNDS = 3
 """Each vehicle's sightings are matched anew to what the others see so many times at most."""
+
+BELIEFS = 60
+"""So many pairs at most are tried as the one that tells how far a vehicle is off."""
 
 
 @dataclass(frozen=True)
@@ -42,22 +45,22 @@ def fuse(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Fused:
     gate_sigmas: sightings are of one person if their distance, by its covariance, is as likely as this many sigmas.
     """
     members = associate(team, gate_sigmas)
-    where, covariance, _ = together(team, members)
-    return Fused(where, covariance, members)
+    where, joint, _ = together(team, members)
+    own = joint[np.arange(len(members)), :, np.arange(len(members))]
+    return Fused(where, own, members)
 
 
 def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.ndarray, "P V"]:
     """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
 
-    The vehicle that sees most begins; each other's are matched to what is known by then (Hungarian, within the gate of
-    chi-square with two degrees). Then each vehicle in turn is matched anew to the others, whose disagreement is known
-    better by then, until nothing changes.
+    The vehicle that sees most begins; each other's are matched to what is known by then. Then each vehicle in turn is
+    matched anew to the others, whose disagreement is known better by then, until nothing changes.
     """
     order = sorted(range(len(team)), key=lambda v: -len(team[v]))
     members = np.zeros((0, len(team)), np.int64)
     for vehicle in order:
         members = _matched(team, members, vehicle, gate_sigmas)
-    for _ in range(ROUNDS if len(team) > 1 else 0):
+    for _ in range(ROUNDS if len(team) > 2 else 0):
         before = {tuple(row) for row in members.tolist()}
         for vehicle in order:
             others = members.copy()
@@ -65,8 +68,7 @@ def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.nda
             members = _matched(team, others[(others >= 0).any(axis=1)], vehicle, gate_sigmas)
         if {tuple(row) for row in members.tolist()} == before:
             break
-    rank = [tuple(np.where(row < 0, 1_000_000, row)) for row in members]
-    return members[sorted(range(len(members)), key=rank.__getitem__)]
+    return members[np.lexsort(np.where(members < 0, np.iinfo(np.int64).max, members).T[::-1])]
 
 
 def gate(sigmas: float) -> float:
@@ -76,8 +78,8 @@ def gate(sigmas: float) -> float:
 
 def together(
     team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
-) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 2"], Float[np.ndarray, "V 6"]]:
-    """Places of people, their covariances, and each vehicle's errors in sigmas: least squares over all sightings.
+) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 P 2"], Float[np.ndarray, "V 6"]]:
+    """Places of people, their joint covariance, and each vehicle's errors in sigmas: least squares over all sightings.
 
     Unknown are each person's place and height, and each vehicle's six errors; what is known of the heights and errors
     beforehand is that their sigma is 1.
@@ -86,26 +88,22 @@ def together(
     size = 3 * people + 6 * vehicles
     normal, right = np.zeros((size, size)), np.zeros(size)
     normal[2 * people :, 2 * people :] = np.eye(size - 2 * people)
-    for person, vehicle in np.argwhere(members >= 0):
-        seen, row = team[vehicle], members[person, vehicle]
-        design = np.concatenate([np.eye(2), seen.body_m[row][:, None], seen.camera_m[row]], axis=1)
-        at = np.concatenate(
-            [
-                2 * person + np.arange(2),
-                [2 * people + person],
-                3 * people + 6 * vehicle + np.arange(6),
-            ]
-        )
-        weighed = design.T @ np.linalg.inv(seen.own_m2[row])
-        normal[np.ix_(at, at)] += weighed @ design
-        right[at] += weighed @ seen.east_north_m[row]
+    for vehicle, seen in enumerate(team):
+        who = np.flatnonzero(members[:, vehicle] >= 0)
+        row, n = members[who, vehicle], len(who)
+        place = np.broadcast_to(np.eye(2), (n, 2, 2))
+        design = np.concatenate([place, seen.body_m[row][:, :, None], seen.camera_m[row]], axis=2)
+        errors = np.broadcast_to(3 * people + 6 * vehicle + np.arange(6), (n, 6))
+        at = np.concatenate([np.stack([2 * who, 2 * who + 1, 2 * people + who], axis=1), errors], axis=1)
+        weighed = design.swapaxes(1, 2) @ np.linalg.inv(seen.own_m2[row])
+        np.add.at(normal, (at[:, :, None], at[:, None, :]), weighed @ design)
+        np.add.at(right, at, np.einsum("nij,nj->ni", weighed, seen.east_north_m[row]))
     # Scaled to ones on the diagonal: metres and sigmas differ by orders of magnitude.
     scale = 1 / np.sqrt(np.diag(normal))
     covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
     found = covariance @ right
-    blocks = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
-    own = blocks[np.arange(people), :, np.arange(people)]
-    return found[: 2 * people].reshape(-1, 2), own, found[3 * people :].reshape(-1, 6)
+    joint = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
+    return found[: 2 * people].reshape(-1, 2), joint, found[3 * people :].reshape(-1, 6)
 
 
 def crowd(east_north_m: Float[np.ndarray, "T P 2"], ahead: float = 1.0) -> Float[np.ndarray, "2"]:
@@ -129,12 +127,46 @@ def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_si
     members = known.copy()
     left = np.ones(len(seen), bool)
     if len(known) and len(seen):
-        where, covariance, _ = together(team, known)
-        apart = where[:, None] - seen.east_north_m
-        spread = covariance[:, None] + seen.covariance_m2
-        distance = np.einsum("pni,pnij,pnj->pn", apart, np.linalg.inv(spread), apart)
-        for person, row in pairs(gate(gate_sigmas) - distance):
+        where, joint, _ = together(team, known)
+        for person, row in _pairs(where, joint, seen, gate(gate_sigmas)):
             members[person, vehicle], left[row] = row, False
     new = np.full((left.sum(), len(team)), -1, np.int64)
     new[:, vehicle] = np.flatnonzero(left)
     return np.concatenate([members, new])
+
+
+def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) -> np.ndarray:
+    """(K, 2) the people and the sightings that are the same, one to one.
+
+    The sightings may all be off together, by more than people stand apart. So each likely pair in turn is believed, and
+    what it says of the errors in common is taken from the rest before these are matched (Hungarian). The belief under
+    which most agrees holds.
+    """
+    apart = seen.east_north_m - where[:, None]
+    spread = joint[np.arange(len(where)), :, np.arange(len(where))][:, None] + seen.covariance_m2
+    distance = _squared(apart, spread)
+    common = np.einsum("nik,mjk->nimj", seen.camera_m, seen.camera_m)
+    best, most = np.zeros((0, 2), np.int64), 0.0
+    likely = np.argsort(distance, axis=None)[:BELIEFS]
+    for person, row in zip(*np.unravel_index(likely, distance.shape), strict=True):
+        if distance[person, row] >= limit:
+            break
+        # Covariance of what any other pair is apart with what this one is: (P, N, 2, 2).
+        cross = joint[:, :, person][:, None] + common[:, :, row][None]
+        gain = cross @ np.linalg.inv(spread[person, row])
+        left = apart - gain @ apart[person, row]
+        rest = _squared(left, spread - gain @ cross.swapaxes(-1, -2))
+        rest[person, :] = rest[:, row] = np.inf
+        rest[person, row] = distance[person, row]
+        found = pairs(np.where(rest < limit, limit - rest, -np.inf))
+        agreed = (limit - rest[found[:, 0], found[:, 1]]).sum()
+        if agreed > most:
+            best, most = found, agreed
+    return best
+
+
+def _squared(apart: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Squared distances by their covariances; (..., 2) and (..., 2, 2)."""
+    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    east, north = apart[..., 0], apart[..., 1]
+    return (c * east**2 - 2 * b * east * north + a * north**2) / (a * c - b**2)

@@ -29,7 +29,7 @@ SIDE_SIGMA = 0.15
 """What a box cut at its side misses the body's middle by, in box heights."""
 
 COARSEST = 0.5
-"""A distance whose standard deviation is a larger share of it is no distance."""
+"""A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors."""
 
 
 def sight(
