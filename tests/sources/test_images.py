@@ -178,3 +178,11 @@ def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path: Path) -> N
 def test_an_impossible_rate_or_scale_is_refused(tmp_path: Path, options: dict) -> None:
     with pytest.raises(InputError, match="will not do"):
         open_source(write_images(tmp_path), **options)
+
+
+def test_a_single_image_is_a_clip_of_one_frame_where_that_is_asked_for(tmp_path: Path) -> None:
+    file = write_images(tmp_path, range(1, 4)) / "frame2.png"
+    source = open_source(file, single=True)
+    (frame,) = source
+    assert (source.count, source.exact, source.last, frame.number, number_of(frame.image)) == (1, True, 1, 1, 2)
+    assert source.name == str(file)

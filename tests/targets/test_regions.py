@@ -109,7 +109,7 @@ def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost
 def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():
     made = looks(Search(KNOBS), lambda n: people(walker(n)), 110)
     lines = [a for look in made.values() for a in look.adjustments]
-    assert [(a.frame, a.knob, a.old, a.cause) for a in lines] == [(2, "people.windows_share", 1.0, "1 people expected")]
+    assert [(a.frame, a.knob, a.old, a.cause) for a in lines] == [(2, "people.windows_share", 1.0, "1 person expected")]
     assert lines[0].new == pytest.approx(made[2].share, abs=1e-4)
 
 

@@ -136,7 +136,8 @@ def _notes(journal: "PeopleJournal", name: str, rows: int, last: int, frames: in
 def summary(journal: "PeopleJournal", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     made = ["detections.csv", "detections.txt", *(journal.overlay for _ in save), "run.json"]
-    first = f"{journal.frames} frame{'s' * (journal.frames != 1)}, {journal.targets} people"
+    found = f"{journal.targets} {'person' if journal.targets == 1 else 'people'}"
+    first = f"{journal.frames} frame{'s' * (journal.frames != 1)}, {found}"
     if journal.cut:
         first += f", {journal.cut} of them cut by the border"
     if journal.share < 1:

@@ -196,6 +196,9 @@ class Search:
             share, least
         ):
             return ()
-        why = f"{len(self.expected)} people expected" + ("" if self.blobs is None else ", and what moves")
+        count = len(self.expected)
+        why = f"{count} {'person' if count == 1 else 'people'} expected" + (
+            "" if self.blobs is None else ", and what moves"
+        )
         old, self.told = self.told, share
         return (Adjustment(frame, "people.windows_share", round(old, 4), round(share, 4), why),)
