@@ -67,7 +67,8 @@ def test_a_single_picture_is_saved_whole_or_not_at_all(tmp_path):
     assert not (tmp_path / "overlay.png").exists()
     kept.close(complete=True)
     dropped.discard()
-    assert np.array_equal(cv2.imread(str(tmp_path / "overlay.png")), drawn_people(recognized()))
+    made = cv2.imread(str(tmp_path / "overlay.png"))
+    assert made is not None and np.array_equal(made, drawn_people(recognized()))
     assert not list((tmp_path / "no").iterdir())
     assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["overlay.png"]
 

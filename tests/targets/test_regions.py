@@ -153,11 +153,15 @@ def test_bodies_from_half_a_blob_to_those_of_which_it_is_the_legs_are_looked_for
 
 def test_a_blob_that_those_expected_explain_is_not_searched_again():
     blob = np.array([[0, 220, 30, 80.0], [400, 220, 30, 80]])
-    search = Search(KNOBS, lambda n: blob + np.array([4.0 * n + 105, 0, 0, 0]))
+
+    def blobs(n):
+        return blob + np.array([4.0 * n + 105, 0, 0, 0])
+
+    search = Search(KNOBS, blobs)
     made = looks(search, lambda n: people(walker(n)), 6)
     assert len(made[6].regions_px) == 2
     assert inside(np.array(walker(6)), made[6].regions_px[0])
-    assert inside(search.blobs(6)[1], made[6].regions_px[1])
+    assert inside(blobs(6)[1], made[6].regions_px[1])
 
 
 def test_no_blob_gives_no_region():
