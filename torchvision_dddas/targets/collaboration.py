@@ -111,16 +111,16 @@ def confirm_boxes(
 ) -> Look:
     """One picture in which both were found: boxes x, y, width, height of the blobs and of the people.
 
-    A person is at the blob that shares most with them, measured by the smaller box: a blob may be a crowd, or a part of
-    a body. least_px: a body less tall is not recognized, so that nothing is known of blobs less tall without a person.
+    A person is at the blob with the highest IoU among those that share enough with them, measured by the smaller box: a
+    blob may be a crowd, or a part of a body. least_px: a body less tall is not recognized, so that nothing is known of
+    blobs less tall without a person.
     """
     blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
     a, b = blob_px[:, None], person_px[None]
     side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    smaller = np.minimum(np.prod(a[..., 2:], axis=-1), np.prod(b[..., 2:], axis=-1))
-    share = np.prod(np.maximum(side, 0), axis=-1) / np.maximum(smaller, 1e-9)
-    inside = share >= knobs.share
-    people, best = _assigned(-share, inside, score)
+    common, areas = np.prod(np.maximum(side, 0), axis=-1), (np.prod(a[..., 2:], axis=-1), np.prod(b[..., 2:], axis=-1))
+    inside = common >= knobs.share * np.minimum(*areas)
+    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
     unknown = np.full(len(blob_px), np.nan)
     return Look((people > 0) | clear, people, unknown, unknown, best)
