@@ -3,13 +3,9 @@
 Its weights are rounded to 1/256, which moves a trained detector's scores by up to 0.15 against plain interpolation.
 """
 
-import math
-
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
-
-_UNITS = 256  # weights are whole numbers of 1/256
 
 
 def resize(
@@ -22,43 +18,39 @@ def resize(
     """The pictures in another size: (height, width).
 
     levels: 0 .. 255. rows, columns: those of the result that are wanted, in any order and number; all by default.
-    rounded: to whole levels, halves up. Whole levels make every sum a whole number below 2^24, which float32 holds
-    exactly: the result is OpenCV's on every device. Gradients go to the levels, and pass the rounding as if it were
-    not there; not rounded, the result is linear in the levels.
+    rounded: to whole levels, halves up. Of whole levels every sum is a whole number of 1/65536 below 256, which float32
+    holds exactly: the result is OpenCV's on every device. Gradients go to the levels, and pass the rounding as if it
+    were not there; not rounded, the result is linear in the levels.
     """
     height, width = levels.shape[-2:]
-    found = _along(levels, -2, *_taps(height, size[0]), rows)
-    found = _along(found, -1, *_taps(width, size[1]), columns) / _UNITS**2
+    found = _rows(levels, *_taps(height, size[0]), rows)
+    # Rows are copied as they lie in memory; columns one by one would take twice the time.
+    found = _rows(found.transpose(-1, -2).contiguous(), *_taps(width, size[1]), columns).transpose(-1, -2)
     if not rounded:
-        return found
-    return found + ((found.detach() + 0.5).floor() - found.detach()) if found.requires_grad else (found + 0.5).floor()
+        return found.contiguous()
+    whole = (found.detach() + 0.5).floor_()
+    return found + (whole - found.detach()) if found.requires_grad else whole.contiguous()
 
 
-def _taps(have: int, wanted: int) -> tuple[list[int], list[int]]:
-    """Of every place of the result the first of its two sources, and the weight of the second, in 1/256.
+def _taps(have: int, wanted: int) -> tuple[Int64[Tensor, "n"], Float64[Tensor, "n"]]:
+    """Of every place of the result the first of its two sources, and the share of the second, a multiple of 1/256.
 
     Computed as OpenCV does in doubles: 1 / (wanted / have), which is not have / wanted to the last bit.
     """
-    scale = 1.0 / (wanted / have)
-    first, weight = [], []
-    for place in range(wanted):
-        at = scale * (place + 0.5) - 0.5
-        left = math.floor(at)
-        inside = 0 <= left < have - 1
-        first.append(min(max(left, 0), have - 1))
-        weight.append(round((at - left) * _UNITS) if inside else 0)
-    return first, weight
+    at = (torch.arange(wanted, dtype=torch.float64) + 0.5) * (1.0 / (wanted / have)) - 0.5
+    left = at.floor()
+    inside = (left >= 0) & (left < have - 1)
+    share = torch.where(inside, ((at - left) * 256).round() / 256, torch.zeros_like(at))
+    return left.clamp(0, have - 1).long(), share
 
 
-def _along(levels: Tensor, axis: int, first: list[int], weight: list[int], places: Tensor | None) -> Tensor:
-    """256 times the interpolated levels along one axis."""
-    device = levels.device
-    left, share = torch.tensor(first, device=device), torch.tensor(weight, dtype=levels.dtype, device=device)
+def _rows(levels: Tensor, first: Tensor, share: Tensor, places: Tensor | None) -> Tensor:
+    """Interpolated rows: all, or those at the places."""
+    first, share = first.to(levels.device), share.to(levels)
     if places is not None:
-        left, share = left[places], share[places]
-    right = (left + 1).clamp(max=levels.shape[axis] - 1)
-    share = share.view(-1, *[1] * (-1 - axis))
-    return levels.index_select(axis, left) * (_UNITS - share) + levels.index_select(axis, right) * share
+        first, share = first[places], share[places]
+    second = (first + 1).clamp(max=levels.shape[-2] - 1)
+    return torch.lerp(levels.index_select(-2, first), levels.index_select(-2, second), share[:, None])
 
 
 def reflected(first: int, last: int, length: int, device: torch.device | None = None) -> Int64[Tensor, "n"]:
