@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from torchvision_dddas import __version__
+from torchvision_dddas.cli.calibrate import calibrate
 from torchvision_dddas.cli.confirm import confirm
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
@@ -24,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (detect, people, track, confirm, evaluate, demo, settings):
+for command in (detect, people, track, confirm, calibrate, evaluate, demo, settings):
     app.command()(command)
 app.add_typer(locate, name="locate")
 

@@ -14,7 +14,7 @@ import csv
 import math
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,8 @@ KEYS = (*LIMITS, "centre_px", "name")
 PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
 
 
-def read_camera(path: str | Path) -> Camera:
-    """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
+def camera_keys(path: str | Path) -> dict[str, Any]:
+    """The keys of a camera's file, complete or not. Raises InputError: unreadable, no TOML, a key that none has."""
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
@@ -81,6 +81,12 @@ def read_camera(path: str | Path) -> Camera:
                 f"camera {path} has the key {key}, which no camera has; "
                 + (f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}")
             )
+    return content
+
+
+def read_camera(path: str | Path) -> Camera:
+    """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
+    content = camera_keys(path)
     numbers = {key: _number(content[key], key, path) for key in LIMITS if key in content}
     if missing := [key for key in ("width_px", "height_px") if key not in numbers]:
         raise InputError(f"camera {path} lacks {', '.join(missing)}: the size of its pictures")
@@ -217,7 +223,7 @@ def poses_at(
     values = table.values
     for kind, geographic in zip(PLACES, (True, False), strict=True):
         if kind[0] in values:
-            camera = _moved(camera, geographic)
+            camera = replace(camera, geographic=geographic)
             place = np.stack([np.interp(when, table.at, values[key]) for key in kind], axis=1)
             break
     else:
@@ -229,12 +235,6 @@ def poses_at(
     if "pitch_deg" in values:
         pitch = np.interp(when, table.at, np.radians(values["pitch_deg"]))
     return camera, Poses(place, heading, pitch)
-
-
-def _moved(camera: Camera, geographic: bool) -> Camera:
-    from dataclasses import replace
-
-    return replace(camera, geographic=geographic)
 
 
 def _parse(lines: Iterable[str], path: str) -> PoseTable:
