@@ -33,6 +33,7 @@ FLOORS: dict[str, set[str]] = {
     "vision.torch_pixels": {"torch", "ops", "settings"},
     "vision.torch_people": {"torch", "numpy", "ops", "types", "settings", "errors"},
     "vision.onboard_people": {"cv2", "numpy", "onnxruntime", "types", "settings", "errors"},
+    "vision.onboard_gradient": {"cv2", "numpy"},
     "vision.exposure": {"cv2", "numpy"},
     "vision.histograms": {"cv2", "numpy"},
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "targets.silhouette", "types", "settings", "errors"},

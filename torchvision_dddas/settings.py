@@ -311,10 +311,8 @@ class PeopleKnobs(Group):
     classifier: str = knob(
         "opencv", "-", meaning="opencv: the coefficients of its default people detector; or a file of a linear SVM's"
     )
-    graph: str = knob(
-        "shipped",
-        "-",
-        meaning="onboard: the ONNX graph of the scores; a file that export/people_graph.py made, or shipped",
+    graphs: str = knob(
+        "shipped", "-", meaning="onboard: the ONNX graphs; a folder that export/people_graph.py made, or shipped"
     )
     window_width_px: int = knob(64, "px", 8, 1024, meaning="width of the window that the classifier sees")
     window_height_px: int = knob(128, "px", 8, 1024, meaning="height of the window that the classifier sees")
@@ -328,26 +326,42 @@ class PeopleKnobs(Group):
     gamma: bool = knob(True, "-", meaning="take square roots of the levels first")
     scale_step: float = knob(1.05, "-", 1.01, 2, meaning="how much smaller each level of the pyramid is than the last")
     enlarge: float = knob(
-        1.0,
+        1.5,
         "-",
         1,
         4,
-        meaning="the pyramid begins with the picture so many times larger, for people smaller than windows",
+        meaning="the pyramid begins with the picture so many times larger: bodies are found from height_share x "
+        "window_height_px / enlarge, 63 px; the cost grows with its square",
     )
     max_levels: int = knob(64, "levels", 1, 200, meaning="levels of the pyramid at most")
-    padding_px: int = knob(0, "px", 0, 256, meaning="border that each level is given by reflection, for people at it")
-    threshold: float = knob(0.0, "-", -10, 10, meaning="a window whose score is above it may be a person")
+    padding_px: int = knob(24, "px", 0, 256, meaning="border that each level is given by reflection, for people at it")
+    threshold: float = knob(0.1, "-", -10, 10, meaning="a window whose score is above it may be a person")
     suppression: Literal["nms", "opencv", "none"] = knob(
         "nms",
         "-",
         meaning="one box a person: nms keeps the best of windows that overlap; opencv averages groups; none keeps all",
     )
-    overlap: float = knob(0.5, "-", 0, 1, meaning="nms: boxes that share more of their union show the same person")
+    overlap: float = knob(0.4, "-", 0, 1, meaning="nms: bodies that share more of their union are the same person")
+    contained: float = knob(
+        0.7,
+        "-",
+        0,
+        1,
+        meaning="nms: so are those that share more of the smaller one, as legs do with the body; 1: none",
+    )
+    settle: float = knob(
+        0.7,
+        "-",
+        0,
+        1,
+        meaning="nms: the box is the mean, by score, of windows that share this much of their union with the best; "
+        "1: the best alone",
+    )
     group: int = knob(2, "windows", 0, 100, meaning="opencv: a group of no more windows than this is dropped")
     group_distance: float = knob(0.2, "-", 0, 1, meaning="opencv: edges this close, in box sizes, make a group")
-    height_share: float = knob(0.75, "-", 0.1, 1, meaning="body height over window height")
+    height_share: float = knob(0.737, "-", 0.1, 1, meaning="body height over window height")
     width_share: float = knob(0.5, "-", 0.1, 1, meaning="width of the body's box over window width")
-    feet_share: float = knob(0.875, "-", 0.1, 1.2, meaning="from the window's top to the feet, over window height")
+    feet_share: float = knob(0.845, "-", 0.1, 1.2, meaning="from the window's top to the feet, over window height")
     probability_slope: float = knob(2.0, "-", 0.01, 100, meaning="probability = 1 / (1 + exp(-slope (score - even)))")
     probability_even: float = knob(0.5, "-", -10, 10, meaning="score at which a person is as likely as not")
     search: Literal["everywhere", "regions"] = knob(

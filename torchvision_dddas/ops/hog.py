@@ -14,13 +14,13 @@ from torch import Tensor
 from torchvision_dddas.errors import InputError
 
 # OpenCV's odd polynomial for the arc tangent of 0 .. 1, in degrees (modules/core, mathfuncs_core: fastAtan).
-_ARC = tuple(
+ARC = tuple(
     p * 180 / math.pi for p in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-_TINY = 2.220446049250313e-16  # what it adds to the divisor
+TINY = 2.220446049250313e-16  # what it adds to the divisor
 
 # L2-Hys: added to the norm before the clip, for each number of a block, and after it (modules/objdetect, hog.cpp).
-_SOFT_FIRST, _SOFT_SECOND = 0.1, 1e-3
+SOFT_FIRST, SOFT_SECOND = 0.1, 1e-3
 
 
 @dataclass(frozen=True)
@@ -91,47 +91,47 @@ def gradient(bordered: Tensor, gamma: bool = True) -> tuple[Tensor, Tensor]:
 
 
 def angle(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
-    """Direction in bins, from -bins/2 - 0.5 to bins/2 - 0.5: 0 is the centre of the first bin.
+    """Direction in bins, from -0.5 to bins - 0.5: 0 is the centre of the first bin.
 
     By OpenCV's polynomial, up to 0.01 degrees off the true angle, and so are the trained weights.
     """
     x, y = dx.abs(), dy.abs()
-    ratio = torch.minimum(x, y) / (torch.maximum(x, y) + _TINY).clamp(min=_TINY)
+    ratio = torch.minimum(x, y) / (torch.maximum(x, y) + TINY).clamp(min=TINY)
     square = ratio * ratio
-    degrees = (((_ARC[3] * square + _ARC[2]) * square + _ARC[1]) * square + _ARC[0]) * ratio
+    degrees = (((ARC[3] * square + ARC[2]) * square + ARC[1]) * square + ARC[0]) * ratio
     degrees = torch.where(x < y, 90 - degrees, degrees)
     if layout.signed:
         degrees = torch.where(dx < 0, 180 - degrees, degrees)
-        turned = torch.where(dy < 0, -degrees, degrees)
+        degrees = torch.where(dy < 0, 360 - degrees, degrees)
     else:
-        turned = torch.where((dx < 0) ^ (dy < 0), -degrees, degrees)
-    return turned * (layout.bins / (360 if layout.signed else 180)) - 0.5
+        degrees = torch.where((dx < 0) ^ (dy < 0), 180 - degrees, degrees)
+    return degrees * (layout.bins / (360 if layout.signed else 180)) - 0.5
 
 
-def _knots(bins: int) -> list[int]:
+def knots(bins: int) -> list[int]:
     """The whole numbers between which `angle` lies; knot k is the centre of bin k modulo bins."""
-    return list(range(math.floor(-bins / 2 - 0.5), math.ceil(bins / 2 - 0.5) + 1))
+    return list(range(-1, bins + 1))
 
 
 def ramps(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
     """(B, K, H, W): magnitude m, then relu(m (angle - k)) for all knots k but the last.
 
-    The share of m that goes to a bin is a hat over the angle, thus a sum of ramps: `_hats` says which, and as it is
+    The share of m that goes to a bin is a hat over the angle, thus a sum of ramps: `hats` says which, and as it is
     linear it can wait until after the pooling, where there are 64 times fewer numbers.
     """
     magnitude = torch.sqrt((dx * dx + dy * dy).clamp(min=1e-30))
     turn = magnitude * angle(dx, dy, layout)
-    knots = torch.tensor(_knots(layout.bins)[:-1], dtype=dx.dtype, device=dx.device).view(1, -1, 1, 1)
-    return torch.cat([magnitude, (turn - magnitude * knots).relu()], 1)
+    at = torch.tensor(knots(layout.bins)[:-1], dtype=dx.dtype, device=dx.device).view(1, -1, 1, 1)
+    return torch.cat([magnitude, (turn - magnitude * at).relu()], 1)
 
 
-def _hats(bins: int) -> Tensor:
+def hats(bins: int) -> Tensor:
     """(bins, K) float64: the hats of the bins as sums of ramps."""
-    knots = _knots(bins)
-    last = len(knots) - 1
-    hats = torch.zeros(bins, last + 1, dtype=torch.float64)
-    for place, knot in enumerate(knots):
-        row = hats[knot % bins]
+    at = knots(bins)
+    last = len(at) - 1
+    rows = torch.zeros(bins, last + 1, dtype=torch.float64)
+    for place, knot in enumerate(at):
+        row = rows[knot % bins]
         if place == 0:
             row[0] += 1  # left of the next knot the hat is 1 - (t - k), plus what bends it to zero
             row[1] -= 1
@@ -142,10 +142,10 @@ def _hats(bins: int) -> Tensor:
                 row[place + 1] -= 2
             if place + 2 <= last:
                 row[place + 2] += 1
-    return hats
+    return rows
 
 
-def _weights(layout: Layout) -> Tensor:
+def cell_weights(layout: Layout) -> Tensor:
     """(cells, block) float64: what a pixel of a block's row or column gives to each of its cells.
 
     Gaussian with a sigma of a quarter of the block, centred half a pixel off as in OpenCV, times a bilinear hat.
@@ -165,7 +165,7 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
     strips = maps.shape[-2] // step
     blocks = (strips - parts) // hop + 1
     cut = maps[..., : strips * step, :].unflatten(-2, (strips, step))
-    weights = _weights(layout).to(maps).view(layout.cells, parts, step)
+    weights = cell_weights(layout).to(maps).view(layout.cells, parts, step)
     rows = torch.matmul(weights.flatten(0, 1), cut).unflatten(-2, (layout.cells, parts))  # (..., strips, c, parts, N)
     total = None
     for part in range(parts):
@@ -183,14 +183,15 @@ def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tens
     maps = ramps(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
     down = _pooled(maps, layout)  # (B, K, cy, ny, W)
     both = _pooled(down.transpose(-1, -2), layout)  # (B, K, cy, W, ny) -> (B, K, cy, cx, nx, ny)
-    hats = _hats(layout.bins).to(maps)
-    histogram = torch.matmul(hats, both.flatten(2)).unflatten(2, both.shape[2:])  # (B, bins, cy, cx, nx, ny)
+    histogram = torch.matmul(hats(layout.bins).to(maps), both.flatten(2)).unflatten(
+        2, both.shape[2:]
+    )  # (B, bins, cy, cx, nx, ny)
     histogram = histogram.transpose(-1, -2).flatten(1, 3)
     size = layout.bins * layout.cells**2
-    norm = torch.sqrt((histogram * histogram).sum(1, keepdim=True).clamp(min=1e-30)) + size * _SOFT_FIRST
+    norm = torch.sqrt((histogram * histogram).sum(1, keepdim=True).clamp(min=1e-30)) + size * SOFT_FIRST
     share = histogram / norm
     clipped = share.clamp(max=layout.clip) if clip is None else torch.minimum(share, clip)
-    return clipped / (torch.sqrt((clipped * clipped).sum(1, keepdim=True).clamp(min=1e-30)) + _SOFT_SECOND)
+    return clipped / (torch.sqrt((clipped * clipped).sum(1, keepdim=True).clamp(min=1e-30)) + SOFT_SECOND)
 
 
 def arranged(weights: Tensor, layout: Layout) -> Tensor:

@@ -1,11 +1,14 @@
-"""Scores of windows by an ONNX graph on ONNX Runtime, for a small CPU: no torch.
+"""Scores of windows by OpenCV and ONNX Runtime, for a small CPU: no torch.
 
-The graph is made from `ops.hog` by export/people_graph.py. It takes levels of the pyramid, or parts of them, that have
-their border of one pixel already, and the SVM's weights: any classifier of the same cells and blocks runs on it.
+The graphs are made from `ops.hog` by export/people_graph.py. A part goes through them in tiles that stay in the
+cache; parts are shared among threads, each of which runs the graphs on itself alone.
 """
 
 import math
+import threading
+from collections import defaultdict
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,11 +19,15 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.vision.onboard_gradient import Gradient
 from torchvision_dddas.vision.protocol import Part
 
-SHIPPED = Path(__file__).parents[1] / "graphs" / "people.onnx"
+SHIPPED = Path(__file__).parents[1] / "graphs"
 # What a graph has baked in; it names them in its metadata.
 BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
+
+# Side of a tile: its 16 maps take 1.2 MB, which should stay in a core's cache, and its neighbours' blocks overlap it.
+_TILE_PX = 136
 
 
 class OnboardRecognizer:
@@ -29,67 +36,122 @@ class OnboardRecognizer:
     name = "onboard"
 
     def __init__(self, knobs: PeopleKnobs, svm: LinearSvm) -> None:
-        """Raises InputError where the graph has another layout than the knobs, or the SVM another length."""
+        """Raises InputError where the SVM has another length than the descriptor."""
         self.knobs, self.svm = knobs, svm
-        self.graph = SHIPPED if knobs.graph == "shipped" else Path(knobs.graph)
         self.weights = arranged(svm, knobs)
+        self.bias, self.clip = np.array(svm.bias, np.float32), np.array(knobs.clip, np.float32)
+        self.local = threading.local()
 
     @cached_property
-    def session(self) -> Any:
-        """ONNX Runtime with the graph, made when first needed: it takes longer than a frame."""
-        import onnxruntime
+    def sessions(self) -> tuple[Any, Any]:
+        """The graphs of blocks and of scores, loaded when first needed: that takes longer than a frame."""
+        folder = SHIPPED if self.knobs.graphs == "shipped" else Path(self.knobs.graphs)
+        return opened(folder / "people_blocks.onnx", self.knobs), opened(folder / "people_scores.onnx", self.knobs)
 
-        options = onnxruntime.SessionOptions()
-        session = onnxruntime.InferenceSession(str(self.graph), options, providers=["CPUExecutionProvider"])
-        return session
+    @cached_property
+    def pool(self) -> ThreadPoolExecutor:
+        """As many threads as OpenCV takes."""
+        return ThreadPoolExecutor(max(1, cv2.getNumThreads()))
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
         """The score map of each part of each picture."""
-        return [self._of_picture(image, wanted) for image, wanted in zip(images, parts, strict=True)]
+        _ = self.sessions
+        jobs: dict[tuple[int, tuple[int, int]], list[int]] = defaultdict(list)
+        for picture, wanted in enumerate(parts):
+            for index, part in enumerate(wanted):
+                jobs[picture, part.level].append(index)
+        planes = [cv2.split(image) if image.ndim == 3 else (image,) for image in images]
+        maps: list[list[np.ndarray]] = [[np.empty(0)] * len(wanted) for wanted in parts]
 
-    def _of_picture(self, image: np.ndarray, parts: Sequence[Part]) -> list[np.ndarray]:
-        maps = []
-        for part in parts:
-            level = image if part.level == image.shape[1::-1] else resized(image, part.level)
-            maps.append(self._of_part(bordered(level, part)))
+        def score(job: tuple[int, tuple[int, int]]) -> None:
+            picture, level = job
+            size = planes[picture][0].shape[::-1]
+            resized = [
+                plane if level == size else cv2.resize(plane, level, interpolation=cv2.INTER_LINEAR_EXACT)
+                for plane in planes[picture]
+            ]
+            for index in jobs[job]:
+                maps[picture][index] = self._of_part(resized, parts[picture][index])
+
+        # The largest first, so that the threads end together.
+        order = sorted(jobs, key=lambda job: -sum(parts[job[0]][i].width * parts[job[0]][i].height for i in jobs[job]))
+        for _ in self.pool.map(score, order):
+            pass
         return maps
 
-    def _of_part(self, inside: np.ndarray) -> np.ndarray:
-        """The map of a part with its border, every window stride."""
-        knobs = self.knobs
-        stride, hop = knobs.window_stride_px, math.gcd(knobs.window_stride_px, knobs.block_stride_px)
-        width, height = (
-            max(0, (length - 2 - window) // stride + 1)
-            for length, window in zip(inside.shape[1::-1], (knobs.window_width_px, knobs.window_height_px), strict=True)
-        )
+    def _of_part(self, level: Sequence[np.ndarray], part: Part) -> np.ndarray:
+        """A part's scores, every window stride. level: planes uint8."""
+        knobs, stride = self.knobs, self.knobs.window_stride_px
+        width = max(0, (part.width - knobs.window_width_px) // stride + 1)
+        height = max(0, (part.height - knobs.window_height_px) // stride + 1)
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
-        # Windows whose offset is the same modulo the block stride share their blocks: one run of the graph for each.
-        phases, every = knobs.block_stride_px // hop, stride // hop
+        planes = np.stack([bordered(plane, part) for plane in level])
+        # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
+        common = math.gcd(stride, knobs.block_stride_px)
+        phases, every = knobs.block_stride_px // common, stride // common
         for row in range(min(phases, height)):
             for column in range(min(phases, width)):
-                found = self._run(inside[row * stride :, column * stride :])[::every, ::every]
+                found = self._scored(planes[:, row * stride :, column * stride :])[::every, ::every]
                 here = scores[row::phases, column::phases]
                 here[:] = found[: here.shape[0], : here.shape[1]]
         return scores
 
-    def _run(self, inside: np.ndarray) -> np.ndarray:
-        if inside.ndim == 2:
-            inside = cv2.cvtColor(inside, cv2.COLOR_GRAY2BGR)
-        feed = {
-            "image": np.ascontiguousarray(inside),
-            "weights": self.weights,
-            "bias": np.array(self.svm.bias, np.float32),
-            "clip": np.array(self.knobs.clip, np.float32),
-        }
-        (found,) = self.session.run(None, feed)
+    def _scored(self, planes: np.ndarray) -> np.ndarray:
+        """Scores of the windows at every block stride. planes: uint8 (C, H + 2, W + 2)."""
+        feed = {"blocks": self._blocks(planes), "weights": self.weights, "bias": self.bias}
+        (found,) = self.sessions[1].run(None, feed)
+        return found
+
+    def _blocks(self, planes: np.ndarray) -> np.ndarray:
+        """(F, ny, nx), tile by tile."""
+        gradient = getattr(self.local, "gradient", None)
+        if gradient is None:
+            gradient = self.local.gradient = Gradient(self.knobs.gamma, self.knobs.signed)
+        block, stride = self.knobs.block_px, self.knobs.block_stride_px
+        down, across = ((length - 2 - block) // stride + 1 for length in planes.shape[1:])
+        some = max(1, (_TILE_PX - block) // stride + 1)
+        found = np.empty((self.knobs.bins * (block // self.knobs.cell_px) ** 2, down, across), np.float32)
+        for top, bottom in spans(down, some):
+            rows = slice(top * stride, (bottom - 1) * stride + block + 2)
+            for left, right in spans(across, some):
+                columns = slice(left * stride, (right - 1) * stride + block + 2)
+                feed = {"polar": gradient(planes[:, rows, columns]), "clip": self.clip}
+                (found[:, top:bottom, left:right],) = self.sessions[0].run(None, feed)
         return found
 
 
-def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A level of the pyramid, as OpenCV's detector makes it."""
-    return cv2.resize(image, size, interpolation=cv2.INTER_LINEAR_EXACT)
+def spans(length: int, most: int) -> list[tuple[int, int]]:
+    """(begin, end) of stretches of about equal length that make up the whole."""
+    count = -(-length // most)
+    return [(length * i // count, length * (i + 1) // count) for i in range(count)]
+
+
+def opened(path: Path, knobs: PeopleKnobs) -> Any:
+    """An ONNX Runtime session of a graph, on one thread.
+
+    Raises InputError where the graph is not there, or has another layout baked in than the knobs.
+    """
+    import onnxruntime
+
+    make = "python export/people_graph.py --set people.cell_px=... --out FOLDER, then people.graphs=FOLDER"
+    if not path.exists():
+        raise InputError(f"no graph {path}; make it with {make}")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    made_for = session.get_modelmeta().custom_metadata_map
+    wrong = [name for name in BAKED if made_for.get(name) != str(int(getattr(knobs, name)))]
+    if wrong:
+        raise InputError(
+            f"the graph {path.name} is made for "
+            + ", ".join(f"people.{name} = {made_for.get(name)}" for name in wrong)
+            + ", not "
+            + ", ".join(f"{int(getattr(knobs, name))}" for name in wrong)
+            + f"; take --backend torch, or make one: {make}"
+        )
+    return session
 
 
 def bordered(level: np.ndarray, part: Part) -> np.ndarray:
