@@ -137,7 +137,7 @@ def test_pictures_of_any_size_go_together():
 def test_a_picture_smaller_than_the_window_is_one_line_with_both_sizes():
     small = Clip(numbers=(1,), last=1, images={1: np.zeros((100, 60), np.uint8)})
     with pytest.raises(InputError, match=r"60 x 100 px.* smaller than the window of 64 x 128 px.*people\.enlarge"):
-        list(recognize(small, Brightest(), settings()))
+        list(recognize(small, Brightest(), settings(enlarge=1.0)))
     assert len(list(recognize(small, Brightest(), settings(enlarge=1.5)))) == 1
 
 

@@ -15,7 +15,11 @@ from tests.cli.mistakes import bad
 from torchvision_dddas.sources.detections import read_detections
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = ("--set", "people.window_width_px=16", "--set", "people.window_height_px=32")
+SMALL = tuple(
+    word
+    for knob in ("window_width_px=16", "window_height_px=32", "padding_px=0", "enlarge=1.0")
+    for word in ("--set", f"people.{knob}")
+)
 
 
 class Stub:
@@ -103,7 +107,7 @@ def test_a_clip_gives_tables_a_film_and_a_record(dddas, stub, clip, tmp_path):
 
 
 def test_a_picture_gives_a_picture(dddas, stub, photo, tmp_path):
-    result = dddas("people", photo, "--out", tmp_path / "out")
+    result = dddas("people", photo, "--set", "people.padding_px=0", "--out", tmp_path / "out")
     assert result.stdout.splitlines() == [
         "1 frame, 1 person",
         f"{tmp_path / 'out'}: detections.csv, detections.txt, overlay.png, run.json",
