@@ -35,6 +35,11 @@ from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan, suppress
 from torchvision_dddas.vision import Recognizer, load_recognizer
 
+# What detectMultiScale does unless told otherwise, whatever the project's defaults.
+PLAIN = PeopleKnobs(
+    enlarge=1, padding_px=0, window_stride_px=8, scale_step=1.05, threshold=0, suppression="opencv", group=2
+)
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -60,7 +65,7 @@ def main() -> None:
             continue
         for padding in map(int, chosen.padding.split(",")):
             for stride in map(int, chosen.stride.split(",")):
-                knobs = PeopleKnobs(padding_px=padding, window_stride_px=stride, suppression="opencv")
+                knobs = PLAIN.model_copy(update={"padding_px": padding, "window_stride_px": stride})
                 images = (frame.image for frame in islice(open_source(name), 0, None, chosen.every))
                 for backend, found in compare(images, knobs, backends).items():
                     print(f"| {Path(name).name} | {padding} | {stride} | {backend} | {found.row()} |", flush=True)
@@ -171,30 +176,23 @@ def crops(folder: Path, backends: Sequence[str]) -> None:
     if not images:
         print(f"{folder} holds no PNG pictures: the crops are left out.")
         return
-    knobs = PeopleKnobs(suppression="none")
     middles = [middle(image) for image in images]
+    each, padded = (PLAIN.model_copy(update={"suppression": "none", "padding_px": pad}) for pad in (0, 8))
+    anywhere = [len(opencv_boxes(image, each, 0)) for image in images]
+    rules = {
+        "any window": (anywhere, images, each),
+        "any window, padding 8": ([len(opencv_boxes(image, padded, 0)) for image in images], images, padded),
+        "any group": ([len(opencv_boxes(image, PLAIN)) for image in images], images, PLAIN),
+        "the middle 64 x 128": ([len(opencv().detect(image)[0]) for image in middles], middles, each),
+        "any window, beside our default": (anywhere, images, PeopleKnobs()),
+    }
     print(f"\n| of {len(images)} crops | OpenCV |", *(f"{name} | its misses |" for name in backends))
     print("| --- | --: |", "--: | --: |" * len(backends))
-    svm = read_classifier(knobs.classifier, 3780)
-    rules = {
-        "any window": ([len(opencv_boxes(image, knobs, 0)) for image in images], images, knobs),
-        "any group": (
-            [len(opencv_boxes(image, knobs)) for image in images],
-            images,
-            PeopleKnobs(suppression="opencv"),
-        ),
-        "any window, padding 8": (
-            [len(opencv_boxes(image, PeopleKnobs(padding_px=8), 0)) for image in images],
-            images,
-            PeopleKnobs(suppression="none", padding_px=8),
-        ),
-        "the middle 64 x 128": ([len(opencv().detect(image)[0]) for image in middles], middles, knobs),
-        "any window, the default": ([len(opencv_boxes(image, knobs, 0)) for image in images], images, PeopleKnobs()),
-    }
-    for rule, (wanted, pictures, own) in rules.items():
+    svm = read_classifier(PLAIN.classifier, 3780)
+    for rule, (wanted, pictures, knobs) in rules.items():
         words = [f"| {rule} | {sum(map(bool, wanted))} |"]
         for name in backends:
-            found = accepted(pictures, load_recognizer(name, own, svm), own)
+            found = accepted(pictures, load_recognizer(name, knobs, svm), knobs)
             missed = sum(bool(right) and not one for right, one in zip(wanted, found, strict=True))
             words.append(f"{sum(found)} | {missed} |")
         print(*words, flush=True)

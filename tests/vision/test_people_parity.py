@@ -18,6 +18,8 @@ from torchvision_dddas.vision.torch_people import TorchRecognizer
 
 BACK_ENDS = "torch", "onboard"
 SVM = read_classifier("opencv", 3780)
+# What OpenCV does unless told otherwise, whatever the project's defaults.
+PLAIN = {"enlarge": 1.0, "padding_px": 0, "window_stride_px": 8, "scale_step": 1.05, "threshold": 0.0}
 
 
 def scene(seed: int, height: int, width: int) -> np.ndarray:
@@ -88,7 +90,7 @@ KNOBS = {
 @pytest.mark.parametrize("given", KNOBS.values(), ids=KNOBS)
 @pytest.mark.parametrize("grey", [False, True])
 def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
-    knobs = PeopleKnobs(**{"scale_step": 1.1} | given)
+    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1} | given)
     picture = scene(0, 171, 203)
     picture = picture[..., 1].copy() if grey else picture
     parts = scan.everywhere((203, 171), knobs)
@@ -105,7 +107,7 @@ def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
 @pytest.mark.parametrize("backend", BACK_ENDS)
 @pytest.mark.parametrize("size", [(48, 96), (96, 96), (16, 32)])
 def test_a_window_of_another_size_scores_as_in_opencv(backend, size):
-    knobs = PeopleKnobs(window_width_px=size[0], window_height_px=size[1], scale_step=1.3)
+    knobs = PeopleKnobs(**PLAIN | {"window_width_px": size[0], "window_height_px": size[1], "scale_step": 1.3})
     svm = random_svm(knobs)
     picture = scene(1, 120, 150)
     parts = scan.everywhere((150, 120), knobs)
@@ -126,7 +128,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("stride", [4, 6, 16])
 @pytest.mark.parametrize("given", LAYOUTS.values(), ids=LAYOUTS)
 def test_another_descriptor_scores_as_in_opencv_at_any_stride(given, stride):
-    knobs = PeopleKnobs(**given, window_stride_px=stride, padding_px=stride, scale_step=1.5)
+    knobs = PeopleKnobs(**PLAIN | given | {"window_stride_px": stride, "padding_px": stride, "scale_step": 1.5})
     svm = random_svm(knobs)
     picture = scene(2, 140, 160)
     parts = scan.everywhere((160, 140), knobs)
@@ -138,16 +140,15 @@ def test_another_descriptor_scores_as_in_opencv_at_any_stride(given, stride):
 
 @pytest.fixture(scope="module", params=BACK_ENDS)
 def recognizer(request) -> Recognizer:
-    return load_recognizer(request.param, PeopleKnobs(), SVM)
+    return load_recognizer(request.param, PeopleKnobs(**PLAIN), SVM)
 
 
 @effort(max_examples=25, deadline=None)
 @given(st.data())
 def test_a_part_scores_as_in_a_search_everywhere(recognizer, data):
-    knobs = PeopleKnobs(padding_px=16)
-    part_knobs = PeopleKnobs(padding_px=16, scale_step=1.1)
+    knobs = PeopleKnobs(**PLAIN | {"padding_px": 16, "scale_step": 1.1})
     picture = scene(3, 160, 190)
-    whole = data.draw(st.sampled_from(scan.everywhere((190, 160), part_knobs)))
+    whole = data.draw(st.sampled_from(scan.everywhere((190, 160), knobs)))
     stride = knobs.window_stride_px
     column = data.draw(st.integers(0, (whole.width - 64) // stride))
     row = data.draw(st.integers(0, (whole.height - 128) // stride))
@@ -161,7 +162,7 @@ def test_a_part_scores_as_in_a_search_everywhere(recognizer, data):
 
 def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
     pictures = [scene(4, 150, 170), scene(5, 150, 170), scene(6, 150, 170)[..., 0].copy(), scene(7, 180, 140)]
-    knobs = PeopleKnobs(scale_step=1.1)
+    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1})
     parts = [
         scan.everywhere(picture.shape[1::-1], knobs)[::step]
         for picture, step in zip(pictures, (1, 2, 1, 1), strict=True)
@@ -204,7 +205,9 @@ def test_a_view_into_a_larger_picture_scores_as_its_copy(recognizer):
 )
 def test_detections_by_opencvs_grouping_are_opencvs(backend, stride, pad, step, least):
     knobs = PeopleKnobs(
-        window_stride_px=stride, padding_px=pad, scale_step=step, suppression="opencv", group=least, threshold=-0.3
+        **PLAIN | {"window_stride_px": stride, "padding_px": pad, "scale_step": step, "threshold": -0.3},
+        suppression="opencv",
+        group=least,
     )
     picture = scene(10, 233, 311)
     rectangles, weights = opencv(knobs, SVM).detectMultiScale(
