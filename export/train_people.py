@@ -39,7 +39,6 @@ from torchvision_dddas.sources.classifiers import layout_of
 from torchvision_dddas.sources.images import IMAGE_SUFFIXES
 from torchvision_dddas.targets.scan import everywhere, levels
 from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.onboard_people import bordered, resized
 from torchvision_dddas.vision.protocol import Part
 from torchvision_dddas.vision.torch_people import TorchRecognizer
 from torchvision_dddas.vision.torch_people import layout as descriptor
@@ -95,6 +94,7 @@ def main(words: Sequence[str] | None = None) -> int:
         knobs = load(options.config, options.overrides).people
         plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
         check(plan)
+        _sklearn("svm")  # better missed before the work than after it
         people = crops(options.positives, knobs, size_of(options.crop) if options.crop else None)
         rest = pictures(options.negatives, knobs)
         trained = train(people, rest, knobs, plan, options.quiet)
@@ -176,7 +176,26 @@ def window(image: np.ndarray, path: Path, knobs: PeopleKnobs, crop: tuple[int, i
     level = round(size[0] * wanted[0] / crop[0]), round(size[1] * wanted[1] / crop[1])
     level = max(level[0], wanted[0]), max(level[1], wanted[1])
     middle = Part(level, (level[0] - wanted[0]) // 2, (level[1] - wanted[1]) // 2, *wanted)
-    return bordered(image if level == size else resized(image, level), middle)
+    return bordered(resized(image, level), middle)
+
+
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A level of the pyramid, as the recognizer makes it."""
+    return image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR_EXACT)
+
+
+def bordered(level: np.ndarray, place: Part) -> np.ndarray:
+    """A window of a level with one pixel around it; the level is reflected (101) beyond its edge."""
+    rows, columns = (
+        np.arange(begin - 1, begin + length + 1) for begin, length in ((place.y, place.height), (place.x, place.width))
+    )
+    return level[_reflected(rows, level.shape[0])][:, _reflected(columns, level.shape[1])]
+
+
+def _reflected(index: np.ndarray, length: int) -> np.ndarray:
+    period = max(2 * (length - 1), 1)
+    index = np.abs(index) % period
+    return np.where(index < length, index, period - index)
 
 
 def pictures(folder: Path, knobs: PeopleKnobs) -> list[np.ndarray]:
@@ -235,7 +254,7 @@ def cut(image: np.ndarray, places: Sequence[Part]) -> list[np.ndarray]:
     kept: dict[tuple[int, int], np.ndarray] = {}
     for place in places:
         if place.level not in kept:
-            kept[place.level] = image if place.level == image.shape[1::-1] else resized(image, place.level)
+            kept[place.level] = resized(image, place.level)
     return [bordered(kept[place.level], place) for place in places]
 
 
@@ -287,10 +306,12 @@ def train(
     svm = fit(positive, negative, c, plan.seed)
     for turn in range(plan.rounds):
         found = mine(learned, knobs, svm, plan, f"hard negatives, round {turn + 1}", quiet)
-        lines.append(f"round {turn + 1}: {len(found)} windows taken for people, or nearly so")
-        if not len(found):
+        both = np.unique(np.concatenate([negative, found]), axis=0)
+        new = len(both) - len(np.unique(negative, axis=0))
+        lines.append(f"round {turn + 1}: {len(found)} windows taken for people, or nearly so; {new} of them new")
+        if not new:
             break
-        negative = np.unique(np.concatenate([negative, found]), axis=0)
+        negative = both
         svm = fit(positive, negative, c, plan.seed)
     held = [rest[i] for i in kept_back]
     return Trained(svm, lines + measured(svm, tested, held, knobs))

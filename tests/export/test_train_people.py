@@ -1,0 +1,203 @@
+"""Training on pictures of one's own: what is trained finds again what it was trained for, and mistakes get a line."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")
+pytest.importorskip("torch")
+
+from export import train_people as script
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.sources.classifiers import classifier_of, features_of, read_classifier
+from torchvision_dddas.targets.persons import people_of
+from torchvision_dddas.targets.scan import everywhere, windows
+from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.vision import load_recognizer
+from torchvision_dddas.vision.protocol import Part
+
+SMALL = PeopleKnobs(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
+SET = [
+    "--set",
+    "people.window_width_px=32",
+    "people.window_height_px=64",
+    "people.scale_step=1.2",
+    "people.enlarge=1.0",
+]
+
+
+def background(rng, size):
+    """Blurred noise with a few lines."""
+    image = cv2.GaussianBlur(rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8), (0, 0), 3)
+    image = np.interp(image, (image.min(), image.max()), (40, 215)).astype(np.uint8)
+    for _ in range(8):
+        a, b = rng.integers(0, size, 2), rng.integers(0, size, 2)
+        cv2.line(image, tuple(map(int, a)), tuple(map(int, b)), tuple(map(int, rng.integers(0, 255, 3))), 2)
+    return image
+
+
+def stick(image, feet, height, rng):
+    """A stick person with legs apart, arms, and a head, dark or bright."""
+    x, y = feet
+    colour = tuple(int(v) for v in rng.integers(0, 30, 3) + (225 if rng.random() < 0.5 else 0))
+    thick = max(1, round(height / 12))
+    stride, arm = (rng.uniform(0.1, 0.18) * height for _ in range(2))
+    hip, neck = (x, y - 0.45 * height), (x, y - 0.8 * height)
+    hand = y - rng.uniform(0.4, 0.5) * height
+    limbs = [
+        ((x - stride, y), hip),
+        ((x + stride, y), hip),
+        (hip, neck),
+        (neck, (x - arm, hand)),
+        (neck, (x + arm, hand)),
+    ]
+    for a, b in limbs:
+        cv2.line(image, tuple(round(v) for v in a), tuple(round(v) for v in b), colour, thick)
+    cv2.circle(image, (round(x), round(y - 0.9 * height)), max(2, round(height / 10)), colour, -1)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Crops of 64 x 96 px with stick people of 48 px in the middle 32 x 64, and pictures without any."""
+    place = tmp_path_factory.mktemp("train")
+    rng = np.random.default_rng(0)
+    for name in ("people", "rest/deeper"):
+        (place / name).mkdir(parents=True)
+    for k in range(40):
+        image = background(rng, (64, 96))
+        stick(image, (32, 16 + 56), 48, rng)
+        cv2.imwrite(str(place / "people" / f"{k:02d}.png"), image)
+    for k in range(10):
+        cv2.imwrite(str(place / "rest" / "deeper" / f"{k:02d}.png"), background(rng, (160, 120)))
+    return place
+
+
+@pytest.fixture(scope="module")
+def trained(folders):
+    out = folders / "stick.npz"
+    words = [folders / "people", folders / "rest", "--out", out, "--crop", "32x64", "--windows", 300, "--quiet", *SET]
+    assert script.main([str(word) for word in words]) == 0
+    return out
+
+
+def test_what_was_trained_finds_people_again_in_other_pictures(trained):
+    rng = np.random.default_rng(99)
+    knobs = SMALL.model_copy(update={"classifier": str(trained)})
+    recognizer = load_recognizer("torch", knobs, classifier_of(knobs))
+    right = 0
+    for _ in range(10):
+        image = background(rng, (160, 120))
+        x, height = int(rng.integers(30, 130)), int(rng.integers(50, 70))
+        stick(image, (x, 100), height, rng)
+        parts = everywhere((160, 120), knobs)
+        found = people_of(*windows(parts, recognizer.scores([image], [parts])[0], (160, 120), knobs), (160, 120), knobs)
+        if len(found):
+            u, v = found.feet_px[0]
+            right += abs(u - x) < 12 and abs(v - 100) < 16
+    assert right >= 8
+
+
+def test_hard_negatives_push_the_background_below_zero(trained):
+    rng = np.random.default_rng(7)
+    knobs = SMALL.model_copy(update={"classifier": str(trained)})
+    recognizer = load_recognizer("torch", knobs, classifier_of(knobs))
+    image = background(rng, (320, 240))
+    parts = everywhere((320, 240), knobs)
+    scores = np.concatenate([m.ravel() for m in recognizer.scores([image], [parts])[0]])
+    assert (scores > 0).mean() < 0.02
+
+
+def test_the_same_pictures_and_seed_give_the_same_numbers_as_text_too(folders, trained, capsys):
+    words = [folders / "people", folders / "rest", "--crop", "32x64", "--windows", 300, *SET]
+    assert script.main([str(word) for word in [*words, "--out", folders / "stick.txt"]]) == 0
+    said = capsys.readouterr().out
+    for part in (
+        "C = ",
+        "round 1: ",
+        "held out: ",
+        "per window",
+        "--set people.classifier=",
+        "people.window_width_px=32",
+    ):
+        assert part in said
+    one, other = (read_classifier(path, 756) for path in (trained, folders / "stick.txt"))
+    np.testing.assert_array_equal(one.weights, other.weights)
+    assert one.bias == pytest.approx(other.bias, rel=1e-6)
+
+
+def test_the_file_tells_its_layout(trained):
+    with pytest.raises(InputError, match=r"window of 32 x 64, the settings say 64 x 128"):
+        classifier_of(PeopleKnobs(classifier=str(trained)))
+
+
+@pytest.mark.parametrize(
+    "knobs", [SMALL, PeopleKnobs(), PeopleKnobs(bins=18, signed=True, block_stride_px=4, gamma=False)]
+)
+def test_descriptors_under_the_weights_are_the_recognizers_scores(knobs):
+    rng = np.random.default_rng(1)
+    image = background(rng, (200, 170))
+    size = knobs.window_width_px, knobs.window_height_px
+    weights = rng.normal(size=features_of(knobs)).astype(np.float32)
+    parts = everywhere((200, 170), knobs)
+    maps = load_recognizer("torch", knobs, LinearSvm(weights, 0.5)).scores([image], [parts])[0]
+    places, wanted = [], []
+    for part, scores in zip(parts[::2], maps[::2], strict=True):
+        for row, column in {(0, 0), (scores.shape[0] - 1, scores.shape[1] - 1)}:
+            stride = knobs.window_stride_px
+            places.append(Part(part.level, part.x + column * stride, part.y + row * stride, *size))
+            wanted.append(scores[row, column])
+    found = script.descriptors(np.stack(script.cut(image, places)), knobs) @ weights + 0.5
+    np.testing.assert_allclose(found, wanted, atol=2e-4)
+
+
+def test_descriptors_are_opencvs():
+    window = background(np.random.default_rng(2), (66, 130))
+    theirs = np.ravel(cv2.HOGDescriptor().compute(window, winStride=(8, 8), locations=[(1, 1)]))
+    np.testing.assert_allclose(script.descriptors(window[None], PeopleKnobs())[0], theirs, atol=1e-5)
+
+
+def test_the_windows_that_score_highest_are_the_hardest():
+    parts = [Part((64, 96), 0, 0, 64, 96), Part((40, 70), 0, 0, 40, 70)]
+    maps = [np.array([[0.1, 0.9, -2], [0.3, -0.6, 0]], np.float32), np.array([[0.5, -0.4]], np.float32)]
+    found = script.hardest(parts, maps, SMALL, -0.5, 4)
+    assert [(part.level[0], part.x, part.y) for part in found] == [(64, 8, 0), (40, 0, 0), (64, 0, 8), (64, 0, 0)]
+    assert len(script.hardest(parts, maps, SMALL, -0.5, 100)) == 6
+    assert script.hardest(parts, maps, SMALL, 1.0, 4) == []
+
+
+def bad(capsys, *words):
+    assert script.main([str(word) for word in words]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "\n" not in said
+    return said
+
+
+def test_a_mistake_gets_one_line(folders, tmp_path, capsys):
+    people, rest = folders / "people", folders / "rest"
+    out = ["--out", tmp_path / "svm.npz"]
+    assert "is no folder" in bad(capsys, tmp_path / "absent", rest, *out)
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no images" in bad(capsys, people, tmp_path / "empty", *out)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "a.png").write_bytes(b"no picture")
+    assert "a.png cannot be decoded" in bad(capsys, tmp_path / "broken", rest, *out)
+    assert "smaller than --crop 100x200" in bad(capsys, people, rest, *out, "--crop", "100x200")
+    assert "wanted width x height" in bad(capsys, people, rest, *out, "--crop", "wide")
+    small = ["--set", "people.window_width_px=256", "people.window_height_px=512"]
+    assert "less than half the window of 256 x 512 px" in bad(capsys, people, rest, *out, *small)
+    assert "none of 10 pictures is as large as the window" in bad(capsys, people, rest, *out)
+    assert "--held-out is 2" in bad(capsys, people, rest, *out, "--held-out", 2)
+    assert "--c is -1" in bad(capsys, people, rest, *out, "--c", -1)
+    assert "unknown knob" in bad(capsys, people, rest, *out, "--set", "people.windows=3")
+    assert not (tmp_path / "svm.npz").exists()
+
+
+def test_without_scikit_learn_the_extra_is_named(folders, tmp_path, capsys, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "sklearn"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    words = [folders / "people", folders / "rest", "--crop", "32x64", "--out", tmp_path / "svm.npz", *SET]
+    assert "pip install 'torchvision-dddas[torch,train]'" in bad(capsys, *words)
