@@ -1,5 +1,7 @@
 """Both back ends score every window as cv2.HOGDescriptor does, wherever and with whatever else they are asked to."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from torchvision_dddas.vision.torch_people import TorchRecognizer
 BACK_ENDS = "torch", "onboard"
 SVM = read_classifier("opencv", 3780)
 # What OpenCV does unless told otherwise, whatever the project's defaults.
-PLAIN = {"enlarge": 1.0, "padding_px": 0, "window_stride_px": 8, "scale_step": 1.05, "threshold": 0.0}
+PLAIN: dict[str, Any] = {"enlarge": 1.0, "padding_px": 0, "window_stride_px": 8, "scale_step": 1.05, "threshold": 0.0}
 
 
 def scene(seed: int, height: int, width: int) -> np.ndarray:
