@@ -12,14 +12,13 @@ from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.fusion import fuse
 from torchvision_dddas.targets.ranging import sight, touches_border
-from torchvision_dddas.types import Camera, Located, Positions, Sightings
+from torchvision_dddas.types import Camera, Located, Poses, Positions, Sightings
 
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw: its table, and where it stood at each row."""
+    """What one camera saw: its table, where that puts everyone, as whom and whether cut, a row a box."""
 
-    camera: Camera
     table: DetectionTable
     sightings: Sightings
     target: np.ndarray
@@ -27,38 +26,33 @@ class View:
     lonlat_deg: np.ndarray | None
 
 
-def locate(
+@dataclass(frozen=True)
+class Survey:
+    """What all cameras saw. origin_deg: longitude and latitude of the local metres; None where there are none."""
+
+    views: list[View]
+    origin_deg: tuple[float, float] | None
+
+
+def survey(
     tables: Sequence[DetectionTable],
     cameras: Sequence[Camera],
     poses: Sequence[PoseTable | None],
     settings: Settings,
     rate_hz: float | None = None,
-) -> Iterator[Located]:
-    """Where people stand, frame by frame: one table and one camera a vehicle; of several the fused places.
+) -> Survey:
+    """Where each camera alone puts the people of its table; poses: None for a camera that stands still.
 
     Local metres are those of the cameras, or east and north of where the first camera stood first.
-    Raises InputError where the numbers of tables and cameras differ, cameras mix degrees and metres, poses do not cover
-    the frames, or ground.mode = paper is to fuse.
+    Raises InputError where the numbers of tables, cameras and poses differ, cameras mix degrees and metres, poses do
+    not cover the frames, or ground.mode = paper is to fuse.
     """
-    if len(tables) != len(cameras):
+    if not len(tables) == len(cameras) == len(poses):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
     if settings.ground.mode == "paper" and len(tables) > 1:
         raise InputError(
             f"ground.mode = paper knows no covariances to fuse {len(tables)} cameras by; give one table, or use default"
         )
-    views, origin = _views(tables, cameras, poses, settings, rate_hz)
-    names = _Names(len(views))
-    for frame in np.unique(np.concatenate([view.table.frame for view in views])).tolist():
-        yield _located(frame, views, names, origin, settings)
-
-
-def _views(
-    tables: Sequence[DetectionTable],
-    cameras: Sequence[Camera],
-    poses: Sequence[PoseTable | None],
-    settings: Settings,
-    rate_hz: float | None,
-) -> tuple[list[View], tuple[float, float] | None]:
     stood = [
         poses_at(camera, pose, table.frame, rate_hz) for camera, pose, table in zip(cameras, poses, tables, strict=True)
     ]
@@ -68,19 +62,107 @@ def _views(
     if stood and stood[0][0].geographic:
         first = next((where.place[0] for _, where in stood if len(where.place)), stood[0][0].place)
         origin = float(first[0]), float(first[1])
+    views = [_view(table, *seen, origin, settings) for table, seen in zip(tables, stood, strict=True)]
+    return Survey(views, origin)
+
+
+def _view(
+    table: DetectionTable, camera: Camera, where: Poses, origin: tuple[float, float] | None, settings: Settings
+) -> View:
     paper = settings.ground.mode == "paper"
-    to_metres = geodesy.plain_east_north if paper else geodesy.east_north
-    views = []
-    for (camera, where), table in zip(stood, tables, strict=True):
-        metres = where.place if origin is None else to_metres(where.place, origin)
-        cut = touches_border(table.box_px, camera.size_px) if table.cut is None else table.cut
-        seen = sight(table.box_px, cut, camera, where, metres, settings.ground)
-        degrees = None
-        if origin is not None:
-            offset = seen.east_north_m - metres
-            degrees = geodesy.plain_lonlat(offset, where.place) if paper else geodesy.lonlat(seen.east_north_m, origin)
-        views.append(View(camera, table, seen, _targets(table), cut, degrees))
-    return views, origin
+    metres = where.place
+    if origin is not None:
+        metres = (geodesy.plain_east_north if paper else geodesy.east_north)(where.place, origin)
+    cut = touches_border(table.box_px, camera.size_px) if table.cut is None else table.cut
+    seen = sight(table.box_px, cut, camera, where, metres, settings.ground)
+    degrees = None
+    if origin is not None and paper:
+        degrees = geodesy.plain_lonlat(seen.east_north_m - metres, where.place)
+    elif origin is not None:
+        degrees = geodesy.lonlat(seen.east_north_m, origin)
+    return View(table, seen, _targets(table), cut, degrees)
+
+
+def looks(views: Sequence[View], within_frames: int = 0) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """The number of the first frame of each look, and each view's rows in it.
+
+    A look holds at most one frame of each camera, none later than within_frames after the first: cameras need not take
+    their pictures together.
+    """
+    frames = [np.unique(view.table.frame).tolist() for view in views]
+    place = [0] * len(views)
+    while any(k < len(own) for k, own in zip(place, frames, strict=True)):
+        first = min(own[k] for k, own in zip(place, frames, strict=True) if k < len(own))
+        rows = []
+        for n, (view, own) in enumerate(zip(views, frames, strict=True)):
+            here = slice(0, 0)
+            if place[n] < len(own) and own[place[n]] <= first + within_frames:
+                here = view.table.rows(own[place[n]])
+                place[n] += 1
+            rows.append(np.arange(here.start, here.stop))
+        yield first, rows
+
+
+def locate(found: Survey, settings: Settings) -> Iterator[Located]:
+    """Where people stand, frame by frame: of several cameras the fused places."""
+    names = _Names()
+    for frame, here in looks(found.views, settings.ground.within_frames):
+        vehicle = np.repeat(np.arange(len(here)), [len(rows) for rows in here])
+        located = [rows[view.sightings.by[rows] != "bearing"] for view, rows in zip(found.views, here, strict=True)]
+        if len(found.views) == 1:
+            positions, members = _alone(frame, found.views[0], located[0], found.origin_deg)
+        else:
+            positions, members = _together(frame, found, located, names, settings.ground.gate_sigmas)
+        yield Located(
+            frame,
+            positions,
+            members,
+            _joined([_of(view.sightings, rows) for view, rows in zip(found.views, here, strict=True)]),
+            vehicle,
+            *(
+                np.concatenate([column[rows] for column, rows in zip(columns, here, strict=True)])
+                for columns in (
+                    [view.target for view in found.views],
+                    [view.cut for view in found.views],
+                    [view.table.score for view in found.views],
+                    [view.table.box_px for view in found.views],
+                )
+            ),
+        )
+
+
+def _alone(
+    frame: int, view: View, rows: np.ndarray, origin: tuple[float, float] | None
+) -> tuple[Positions, np.ndarray]:
+    positions = Positions(
+        np.full(len(rows), frame),
+        view.target[rows],
+        view.sightings.east_north_m[rows],
+        view.sightings.covariance_m2[rows],
+        view.table.score[rows],
+        origin,
+        None if view.lonlat_deg is None else view.lonlat_deg[rows],
+    )
+    return positions, np.arange(len(rows))[:, None]
+
+
+def _together(
+    frame: int, found: Survey, rows: Sequence[np.ndarray], names: "_Names", gate_sigmas: float
+) -> tuple[Positions, np.ndarray]:
+    views = found.views
+    fused = fuse([_of(view.sightings, own) for view, own in zip(views, rows, strict=True)], gate_sigmas)
+    seen = [[(v, rows[v][r]) for v, r in enumerate(row) if r >= 0] for row in fused.members.tolist()]
+    named = names.give([[(v, int(views[v].target[r])) for v, r in person] for person in seen])
+    positions = Positions(
+        np.full(len(fused), frame),
+        np.array(named, np.int64),
+        fused.east_north_m,
+        fused.covariance_m2,
+        np.array([max(views[v].table.score[r] for v, r in person) for person in seen], float),
+        found.origin_deg,
+        None if found.origin_deg is None else geodesy.lonlat(fused.east_north_m, found.origin_deg),
+    )
+    return positions, fused.members
 
 
 def _targets(table: DetectionTable) -> np.ndarray:
@@ -90,61 +172,11 @@ def _targets(table: DetectionTable) -> np.ndarray:
     return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
 
 
-def _located(
-    frame: int, views: Sequence[View], names: "_Names", origin: tuple[float, float] | None, settings: Settings
-) -> Located:
-    here = [np.arange(view.table.rows(frame).start, view.table.rows(frame).stop) for view in views]
-    vehicle = np.repeat(np.arange(len(views)), [len(rows) for rows in here])
-    seen = joined([_of(view.sightings, rows) for view, rows in zip(views, here, strict=True)])
-    sighted = [
-        np.concatenate([column[rows] for column, rows in zip(columns, here, strict=True)])
-        for columns in (
-            [view.target for view in views],
-            [view.cut for view in views],
-            [view.table.score for view in views],
-            [view.table.box_px for view in views],
-        )
-    ]
-    target, cut, score, box_px = sighted
-    found = [rows[view.sightings.by[rows] != "bearing"] for view, rows in zip(views, here, strict=True)]
-    if len(views) == 1:
-        view, rows = views[0], found[0]
-        positions = Positions(
-            np.full(len(rows), frame),
-            view.target[rows],
-            view.sightings.east_north_m[rows],
-            view.sightings.covariance_m2[rows],
-            view.table.score[rows],
-            origin,
-            None if view.lonlat_deg is None else view.lonlat_deg[rows],
-        )
-        members = np.arange(len(rows))[:, None]
-    else:
-        fused = fuse(
-            [_of(view.sightings, rows) for view, rows in zip(views, found, strict=True)], settings.ground.gate_sigmas
-        )
-        members = fused.members
-        own = [view.target[rows] for view, rows in zip(views, found, strict=True)]
-        scores = [view.table.score[rows] for view, rows in zip(views, found, strict=True)]
-        named = names.give([[(v, int(own[v][r])) for v, r in enumerate(row) if r >= 0] for row in members])
-        best = [max(scores[v][r] for v, r in enumerate(row) if r >= 0) for row in members]
-        positions = Positions(
-            np.full(len(members), frame),
-            np.array(named, np.int64),
-            fused.east_north_m,
-            fused.covariance_m2,
-            np.array(best, float),
-            origin,
-            None if origin is None else geodesy.lonlat(fused.east_north_m, origin),
-        )
-    return Located(frame, positions, members, seen, vehicle, target, cut, score, box_px)
-
-
 def _of(sightings: Sightings, rows: np.ndarray) -> Sightings:
     return replace(sightings, **{f.name: getattr(sightings, f.name)[rows] for f in fields(sightings)})
 
 
-def joined(parts: Sequence[Sightings]) -> Sightings:
+def _joined(parts: Sequence[Sightings]) -> Sightings:
     """The sightings of several cameras as one table."""
     return Sightings(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Sightings)))
 
@@ -155,7 +187,7 @@ class _Names:
     A person takes the number that most of the vehicles' targets had when they were seen last.
     """
 
-    def __init__(self, vehicles: int) -> None:
+    def __init__(self) -> None:
         self._number: dict[tuple[int, int], int] = {}
         self._last = 0
 

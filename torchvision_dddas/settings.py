@@ -367,10 +367,12 @@ class PeopleKnobs(Group):
     search: Literal["everywhere", "regions"] = knob(
         "everywhere",
         "-",
-        meaning="look at the whole picture in every frame, or between whole looks only around what is expected there",
+        meaning="look at the whole picture in every frame, or around what is expected there and at the rest in turns",
     )
-    rescan_frames: int = knob(10, "frames", 1, 10_000, meaning="regions: every so many frames the whole picture")
-    region_margin: float = knob(0.15, "heights", 0, 5, meaning="regions: so far around a body that is expected")
+    rescan_frames: int = knob(
+        10, "frames", 1, 10_000, meaning="regions: in so many frames the whole picture, some of its levels in each"
+    )
+    region_margin: float = knob(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
     region_scales: float = knob(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
 
 
@@ -390,6 +392,7 @@ class GroundKnobs(Group):
     height_sigma: float = knob(0.05, "-", 0, 1, meaning="standard deviation of a box's height, in heights")
     feet_sigma: float = knob(0.03, "-", 0, 1, meaning="standard deviation of the foot row, in box heights")
     gate_sigmas: float = knob(3.0, "-", 0.5, 10, meaning="sightings further apart than this are not of one person")
+    within_frames: int = knob(0, "frames", 0, 1000, meaning="frames of several cameras no further apart are one look")
 
 
 class ConfirmKnobs(Group):

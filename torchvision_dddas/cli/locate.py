@@ -59,6 +59,7 @@ def ground_into(
 ) -> "PositionJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.locating import locate as located
+    from torchvision_dddas.locating import survey
     from torchvision_dddas.sinks.positions import PositionOutput
     from torchvision_dddas.sources.cameras import read_camera, read_poses
     from torchvision_dddas.sources.detections import read_detections
@@ -74,7 +75,7 @@ def ground_into(
         read = [read_detections(table) for table in tables]
         kinds = [read_camera(camera) for camera in cameras]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
-        geographic = "longitude_deg" in where[0].values if where[0] else kinds[0].geographic
+        found = survey(read, kinds, where, settings, rate_hz)
         facts = {
             "input": list(tables),
             "cameras": list(cameras),
@@ -82,9 +83,9 @@ def ground_into(
             "rows": [len(table) for table in read],
             "settings": settings.model_dump(),
         }
-        journal = output.begin(facts, tuple(kind.name for kind in kinds), geographic)
+        journal = output.begin(facts, tuple(kind.name for kind in kinds), found.origin_deg is not None)
         with progress("locate", None, quiet) as tick:
-            for frame in located(read, kinds, where, settings, rate_hz):
+            for frame in located(found, settings):
                 output.write(frame)
                 tick()
         if not any(len(table) for table in read):

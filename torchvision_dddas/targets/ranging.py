@@ -7,7 +7,8 @@ the head, the distance ahead is
     camera height / feet             whatever the person's.
 With a level camera the first is the source's D = f H / h. Inverse distances, 1 / ahead, are linear in the pixels: so
 there the two are weighed, by the inverse of their covariance. They share the foot row, the pitch and the focal length,
-and those correlations count.
+and those correlations count. Where the two disagree beyond chance, as for a child or a body half hidden, nobody knows
+which is right: then the covariance grows towards the other.
 
 What the source does not do: D is the depth along the optical axis, and the way over the ground D / cos(alpha).
 `paper` takes D for it, as printed.
@@ -27,6 +28,9 @@ PIXEL_SIGMA = 0.5
 
 SIDE_SIGMA = 0.15
 """What a box cut at its side misses the body's middle by, in box heights."""
+
+BORDER_PX = 1.0
+"""A box whose edge is this near the picture's border touches it."""
 
 COARSEST = 0.5
 """A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors."""
@@ -61,16 +65,16 @@ def sight(
 # --------------------------------------------------------------------------------------------------------------------
 # Errors: each is a column, scaled to one standard deviation.
 
-OWN, BODY, CAMERA = slice(0, 3), 3, slice(4, 10)
-FEET, TALL, SIDE, EAST, NORTH, HEADING, PITCH, HEIGHT, FOCAL = 0, 1, 2, 4, 5, 6, 7, 8, 9
-COLUMNS = 10
+FEET, TALL, SIDE, DISPUTE, BODY, EAST, NORTH, HEADING, PITCH, HEIGHT, FOCAL = range(11)
+OWN, CAMERA = slice(FEET, BODY), slice(EAST, FOCAL + 1)
+COLUMNS = 11
 
 
 @dataclass(frozen=True)
 class _Rays:
     """The slopes of the feet and of the head, and metres to the right a metre ahead.
 
-    d_*: (N, 10) their derivatives by one sigma of each error. feet_inside: (N,) whether the picture holds the feet.
+    d_*: (N, 11) their derivatives by one sigma of each error. feet_inside: (N,) whether the picture holds the feet.
     """
 
     feet: np.ndarray
@@ -122,10 +126,6 @@ def _rays(box_px: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, kno
     return _Rays(feet, head, aside, d_feet, d_head, d_aside, inside)
 
 
-BORDER_PX = 1.0
-"""A box whose edge is this near the picture's border touches it."""
-
-
 def touches_border(box_px: Float[np.ndarray, "N 4"], size_px: tuple[int, int]) -> Bool[np.ndarray, "N"]:
     """Whether the picture's border may cut each body: for tables that do not say it."""
     box = np.asarray(box_px, float).reshape(-1, 4)
@@ -148,7 +148,7 @@ def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def _inverse_distance(
     rays: _Rays, cut: np.ndarray, camera: Camera, knobs: GroundKnobs
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """1 / ahead (N,), its (N, 10) derivatives, and what told it (N,)."""
+    """1 / ahead (N,), its (N, 11) derivatives, and what told it (N,)."""
     body, above = knobs.body_height_m, camera.height_m
     by_height, by_feet = (rays.feet - rays.head) / body, rays.feet / above
     can_height = (by_height > 0) & ~cut & (knobs.use != "feet")
@@ -169,6 +169,8 @@ def _inverse_distance(
         weighed = np.where(by == "bearing", np.nan, ours)
     share = np.where((weight == 0)[:, None], 0, weight[:, None] * d_height)
     share = share + np.where((weight == 1)[:, None], 0, (1 - weight[:, None]) * d_feet)
+    excess = np.abs(by_height - by_feet) - knobs.gate_sigmas * np.sqrt((gap**2).sum(axis=1))
+    share[:, DISPUTE] = np.where(by == "both", np.maximum(excess, 0) / 2, 0)
     # nan compares false: what is not surely fine enough is none.
     fine = (weighed > 0) & (np.sqrt((share**2).sum(axis=1)) < COARSEST * weighed)
     return np.where(fine, weighed, np.nan), share, np.where(fine, by, "bearing")
