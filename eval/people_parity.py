@@ -13,10 +13,13 @@ stride, both back ends beside cv2.HOGDescriptor with its default people detector
 or scoring the window in its middle alone, and how many of those each back end accepts by the same rule, and by the
 project's own default.
 
-What of detectMultiScale makes the difference: levels are numbered by scale_step ** i while the level, rounded half to
-even, holds the window, whatever the padding; the padding is rounded up to a multiple of the common divisor of window
-and block stride; a window's corner and size are rounded separately; a level of the picture's own size is not resized.
-OpenCV keeps the clip (L2-Hys) of the first descriptor of a process for all others, so other clips need their own.
+What of detectMultiScale one must follow: level i is the picture over scale_step ** i, its sides rounded half to even,
+for as long as they hold the window, whatever the padding; a level of the picture's own size is not resized. The padding
+is raised to a multiple of the common divisor of window and block stride: give such a one. A window's corner and size in
+the picture are rounded each by itself. Where two levels have the same rounded size OpenCV scores both, which counts in
+its groups; with a window of 64 x 128 and steps from 1.01 no two have. In pictures whose padded width is no multiple of 4
+another channel wins among equal ones in the columns that are left over, which no window of a stride of 4 or 8 sees.
+OpenCV keeps the clip (L2-Hys) of the first descriptor of a process for all others.
 """
 
 import argparse
