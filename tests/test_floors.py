@@ -34,6 +34,7 @@ FLOORS: dict[str, set[str]] = {
     "vision.torch_people": {"torch", "numpy", "ops", "types", "settings", "errors"},
     "vision.onboard_people": {"cv2", "numpy", "onnxruntime", "types", "settings", "errors"},
     "vision.onboard_gradient": {"cv2", "numpy"},
+    "vision.scratch": {"numpy"},
     "vision.exposure": {"cv2", "numpy"},
     "vision.histograms": {"cv2", "numpy"},
     "vision.onboard_vision": {"cv2", "numpy", "onnxruntime", "targets.silhouette", "types", "settings", "errors"},

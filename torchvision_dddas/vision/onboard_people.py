@@ -38,15 +38,18 @@ class OnboardRecognizer:
     def __init__(self, knobs: PeopleKnobs, svm: LinearSvm) -> None:
         """Raises InputError where the SVM has another length than the descriptor."""
         self.knobs, self.svm = knobs, svm
-        self.weights = arranged(svm, knobs)
-        self.bias, self.clip = np.array(svm.bias, np.float32), np.array(knobs.clip, np.float32)
+        self.svm_feed = {
+            "weights": arranged(svm, knobs),
+            "bias": np.array(svm.bias, np.float32),
+            "clip": np.array(knobs.clip, np.float32),
+        }
         self.local = threading.local()
 
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
-        """The graphs of blocks and of scores, loaded when first needed: that takes longer than a frame."""
+        """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
         folder = SHIPPED if self.knobs.graphs == "shipped" else Path(self.knobs.graphs)
-        return opened(folder / "people_blocks.onnx", self.knobs), opened(folder / "people_scores.onnx", self.knobs)
+        return opened(folder / "people_histograms.onnx", self.knobs), opened(folder / "people_scores.onnx", self.knobs)
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
@@ -87,7 +90,9 @@ class OnboardRecognizer:
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
-        planes = np.stack([bordered(plane, part) for plane in level])
+        planes = self._gradient.scratch("planes", (len(level), part.height + 2, part.width + 2), np.uint8)
+        for plane, held in zip(level, planes, strict=True):
+            np.copyto(held, bordered(plane, part))
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
         common = math.gcd(stride, knobs.block_stride_px)
         phases, every = knobs.block_stride_px // common, stride // common
@@ -100,26 +105,35 @@ class OnboardRecognizer:
 
     def _scored(self, planes: np.ndarray) -> np.ndarray:
         """Scores of the windows at every block stride. planes: uint8 (C, H + 2, W + 2)."""
-        feed = {"blocks": self._blocks(planes), "weights": self.weights, "bias": self.bias}
+        feed = {"histograms": self._histograms(planes), **self.svm_feed}
         (found,) = self.sessions[1].run(None, feed)
         return found
 
-    def _blocks(self, planes: np.ndarray) -> np.ndarray:
+    def _histograms(self, planes: np.ndarray) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
-        gradient = getattr(self.local, "gradient", None)
-        if gradient is None:
-            gradient = self.local.gradient = Gradient(self.knobs.gamma, self.knobs.signed)
+        gradient = self._gradient
+        polar = gradient(planes)
         block, stride = self.knobs.block_px, self.knobs.block_stride_px
-        down, across = ((length - 2 - block) // stride + 1 for length in planes.shape[1:])
+        down, across = ((length - block) // stride + 1 for length in polar.shape[1:])
         some = max(1, (_TILE_PX - block) // stride + 1)
-        found = np.empty((self.knobs.bins * (block // self.knobs.cell_px) ** 2, down, across), np.float32)
+        size = self.knobs.bins * (block // self.knobs.cell_px) ** 2
+        found = gradient.scratch("histograms", (size, down, across))
         for top, bottom in spans(down, some):
-            rows = slice(top * stride, (bottom - 1) * stride + block + 2)
+            begin, end = top * stride, (bottom - 1) * stride + block
             for left, right in spans(across, some):
-                columns = slice(left * stride, (right - 1) * stride + block + 2)
-                feed = {"polar": gradient(planes[:, rows, columns]), "clip": self.clip}
-                (found[:, top:bottom, left:right],) = self.sessions[0].run(None, feed)
+                here = polar[:, begin:end, left * stride : (right - 1) * stride + block]
+                tile = gradient.scratch("tile", here.shape)
+                np.copyto(tile, here)
+                (found[:, top:bottom, left:right],) = self.sessions[0].run(None, {"polar": tile[None]})
         return found
+
+    @property
+    def _gradient(self) -> Gradient:
+        """This thread's."""
+        if not hasattr(self.local, "gradient"):
+            self.local.gradient = Gradient(self.knobs.gamma, self.knobs.signed)
+        held: Gradient = self.local.gradient
+        return held
 
 
 def spans(length: int, most: int) -> list[tuple[int, int]]:
