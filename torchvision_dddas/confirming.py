@@ -123,7 +123,7 @@ def _confirmed(
     least = [np.stack([getattr(one, name) for one in all_looks]) for name in ("nearest_m", "nearest_sigmas")]
     nearest_m, nearest_sigmas = (np.where(np.isfinite(v), v, np.inf).min(axis=0) for v in least)
     people = np.stack([one.people for one in all_looks]).max(axis=0)
-    best = np.stack([np.where(one.people > 0, one.best, 0.0) for one in all_looks]).max(axis=0)
+    best = np.stack([np.nan_to_num(one.best) for one in all_looks]).max(axis=0)
     return Confirmed(
         number,
         np.arange(rows.start, rows.stop),
@@ -133,7 +133,7 @@ def _confirmed(
         people,
         np.where(np.isinf(nearest_m), np.nan, nearest_m),
         np.where(np.isinf(nearest_sigmas), np.nan, nearest_sigmas),
-        np.where(people > 0, best, np.nan),
+        np.where(best > 0, best, np.nan),
     )
 
 

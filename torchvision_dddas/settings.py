@@ -411,6 +411,9 @@ class ConfirmKnobs(Group):
         2.0, "-", 0, 10, meaning="a blob so many of its standard deviations within a view is well within it"
     )
     body_width_m: float = knob(0.6, "m", 0, 10, meaning="what stands nearer, this close to a line of sight, hides")
+    least_score: float = knob(
+        0.5, "-", 0.5, 1, meaning="a person less probable than this tells neither for nor against their blob"
+    )
     detection_rate: float = knob(0.7, "-", 0.01, 0.999, meaning="share of looks at a person that recognize one")
     false_rate: float = knob(0.05, "-", 0.001, 0.99, meaning="share of looks at another blob that recognize one there")
     prior: float = knob(0.5, "-", 0.01, 0.99, meaning="share of the blobs that are people")

@@ -256,7 +256,7 @@ class Confirmed:
     row: (N,) int64, its place in the blobs' table, sorted by frame. kind: human, not_human or unseen, by all looks so
     far. probability: (N,) of being human. seen_by: the vehicles that could tell something in this frame. people: (N,)
     int64, recognized at it in this frame, by the vehicle that recognized most. nearest_m, nearest_sigmas: (N,) to the
-    nearest person in this frame, NaN where there is none. best: (N,) highest probability of its people, NaN without.
+    nearest person in this frame, NaN where there is none. best: (N,) highest probability of anyone at it, NaN without.
     """
 
     frame: int

@@ -150,11 +150,21 @@ def test_a_look_weighs_as_bayes_says():
     assert evidence(one(False), knobs)[0] == 0
 
 
-def test_a_doubtful_person_is_weaker_evidence():
+def test_a_less_probable_person_is_weaker_evidence_and_none_is_proof():
     knobs = ConfirmKnobs()
-    weights = [evidence(one(True, 1, score), knobs)[0] for score in (0.1, 0.5, 0.9, 1.0)]
+    weights = [evidence(one(True, 1, score), knobs)[0] for score in (0.5, 0.7, 0.9, 1.0)]
     assert weights == sorted(weights)
+    assert weights[0] == 0
+    assert weights[1] == pytest.approx(math.log(0.7 / 0.3))
     assert weights[-1] == pytest.approx(math.log(knobs.detection_rate / knobs.false_rate))
+
+
+def test_an_improbable_person_leaves_the_blob_in_doubt():
+    for view in ((NORTH,), ()):
+        found = seen([0, 10], [0, 10], views=view, score=[0.4])
+        assert (found.looked[0], found.people[0], found.best[0]) == (False, 0, 0.4)
+    boxes = confirm_boxes(np.array([[0, 0, 400, 180.0]]), np.array([[90, 10, 60, 150.0]]), np.array([0.4]), KNOBS)
+    assert (boxes.looked[0], boxes.people[0]) == (False, 0)
 
 
 def test_what_was_never_seen_keeps_the_prior_and_is_unseen():

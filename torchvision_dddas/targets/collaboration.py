@@ -63,7 +63,8 @@ class Look:
 
     looked: (N,) bool, whether it tells anything: a person at the blob, or a clear view of it and none near.
     people: (N,) int64, recognized at it; a blob may be a crowd. nearest_m, nearest_sigmas: (N,) to the nearest person,
-    infinite without any; in boxes NaN. best: (N,) highest probability of its people, 0 without any.
+    infinite without any; in boxes NaN. best: (N,) highest probability of those at it, 0 without any; where it is below
+    confirm.least_score they are in doubt, and so is the blob.
     """
 
     looked: np.ndarray
@@ -85,7 +86,7 @@ def look(
     """One frame on the ground: places and covariances (NaN: unknown) of the blobs and of one vehicle's people.
 
     A person is at the blob that is nearest in standard deviations, if within its gate. A blob whose gate holds only
-    people of another blob is in doubt, so nothing is concluded. views: of the cameras that found these people.
+    improbable people, or those of another blob, is in doubt. views: of the cameras that found these people.
     """
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
     blob_m2, person_m2 = (_known(covariance, knobs) for covariance in (blob_m2, person_m2))
@@ -93,7 +94,7 @@ def look(
     both = blob_m2[:, None] + person_m2[None] + knobs.spread_m**2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
     inside = sigmas <= math.sqrt(-2 * math.log(1 - knobs.gate_probability))  # chi-square of two degrees of freedom
-    people, best = _assigned(sigmas, inside, score)
+    people, best = _assigned(sigmas, inside, score, knobs)
     clear = np.zeros(len(blob_m), bool)
     for view in views:
         clear |= _well_within(blob_m, blob_m2, view, knobs) & ~_hidden(blob_m, person_m, view, knobs)
@@ -120,7 +121,7 @@ def confirm_boxes(
     side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     common, areas = np.prod(np.maximum(side, 0), axis=-1), (np.prod(a[..., 2:], axis=-1), np.prod(b[..., 2:], axis=-1))
     inside = common >= knobs.share * np.minimum(*areas)
-    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score)
+    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, knobs)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
     unknown = np.full(len(blob_px), np.nan)
     return Look((people > 0) | clear, people, unknown, unknown, best)
@@ -162,13 +163,13 @@ class Beliefs:
 def evidence(seen: Look, knobs: ConfirmKnobs) -> Float[np.ndarray, "N"]:
     """What a look adds to the log-odds, (N,); 0 without a look.
 
-    With d and f the detection and false-alarm rates: ln d/f for a sure person, ln (1 - d)/(1 - f) for none; for a
-    person of probability s the two likelihood ratios are mixed by s.
+    With d and f the detection and false-alarm rates: ln (1 - d)/(1 - f) where nobody is; for a person the odds of their
+    own probability, and ln d/f at most: a probability of 1 is no proof.
     """
     d, f = knobs.detection_rate, knobs.false_rate
-    sure, none = d / f, (1 - d) / (1 - f)
-    ratio = np.where(seen.people > 0, seen.best * sure + (1 - seen.best) * none, none)
-    return np.where(seen.looked, np.log(ratio), 0.0)
+    sure = 1 / (1 + f / d)  # the probability whose odds are d/f
+    best = np.clip(seen.best, 0.5, max(sure, 0.5))
+    return np.where(seen.looked, np.where(seen.people > 0, np.log(best / (1 - best)), math.log((1 - d) / (1 - f))), 0.0)
 
 
 def _log_odds(probability: float) -> float:
@@ -183,17 +184,21 @@ def _known(covariance_m2: np.ndarray, knobs: ConfirmKnobs) -> np.ndarray:
 
 
 def _assigned(
-    distance: Float[np.ndarray, "N M"], inside: Bool[np.ndarray, "N M"], score: Float[np.ndarray, "M"]
+    distance: Float[np.ndarray, "N M"],
+    inside: Bool[np.ndarray, "N M"],
+    score: Float[np.ndarray, "M"],
+    knobs: ConfirmKnobs,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each person to the nearest blob whose gate they are in: (N,) people, (N,) the highest of their scores."""
+    """Each person to the nearest blob whose gate they are in: (N,) probable people, (N,) the highest score of any."""
     blobs = len(distance)
     people, best = np.zeros(blobs, np.int64), np.zeros(blobs)
     if not inside.any():
         return people, best
-    nearest = np.where(inside, distance, np.inf).argmin(axis=0)
     ours = inside.any(axis=0)
-    np.add.at(people, nearest[ours], 1)
-    np.maximum.at(best, nearest[ours], np.nan_to_num(np.asarray(score, float)[ours], nan=1.0))
+    nearest = np.where(inside, distance, np.inf).argmin(axis=0)[ours]
+    known = np.nan_to_num(np.asarray(score, float)[ours], nan=1.0)
+    np.add.at(people, nearest[known >= knobs.least_score], 1)
+    np.maximum.at(best, nearest, known)
     return people, best
 
 
