@@ -15,8 +15,8 @@ from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm
 from torchvision_dddas.vision.protocol import Part
 
-# So many pixels of parts at once: about 100 bytes a pixel, and larger temporaries cost page faults on a CPU.
-_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
+# So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
+_PIXELS = {"cpu": 1 << 18, "cuda": 1 << 24}
 
 
 class TorchRecognizer:
@@ -52,7 +52,7 @@ class TorchRecognizer:
         # A picture goes to the device once, for all its parts.
         held: dict[int, Tensor] = {}
         for (_, part), where in places.items():
-            some = max(1, _PIXELS.get(self.device.type, 1 << 20) // (part.width * part.height))
+            some = max(1, _PIXELS.get(self.device.type, 1 << 22) // (part.width * part.height))
             for begin in range(0, len(where), some):
                 chunk = where[begin : begin + some]
                 for picture, _ in chunk:
