@@ -17,8 +17,8 @@ What of detectMultiScale one must follow: level i is the picture over scale_step
 for as long as they hold the window, whatever the padding; a level of the picture's own size is not resized. The padding
 is raised to a multiple of the common divisor of window and block stride: give such a one. A window's corner and size in
 the picture are rounded each by itself. Where two levels have the same rounded size OpenCV scores both, which counts in
-its groups; with a window of 64 x 128 and steps from 1.01 no two have. Where the padded width is no multiple of 4 another
-channel wins among equal ones in the columns that are left over, which no window of a stride of 4 or 8 sees.
+its groups; with a window of 64 x 128 and steps from 1.01 no two have. Where the padded width is no multiple of 4,
+another channel wins among equal ones in the columns that are left over, which no window of a stride of 4 or 8 sees.
 OpenCV keeps the clip (L2-Hys) of the first descriptor of a process for all others.
 """
 
