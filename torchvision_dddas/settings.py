@@ -350,7 +350,7 @@ class PeopleKnobs(Group):
         meaning="nms: so are those that share more of the smaller one, as legs do with the body; 1: none",
     )
     settle: float = knob(
-        0.7,
+        0.75,
         "-",
         0,
         1,

@@ -20,11 +20,10 @@ def people_of(
     """The people whom windows show, best first. size: (width, height) of the picture."""
     window_px, margin = np.asarray(window_px, float).reshape(-1, 4), np.asarray(margin, float)
     if knobs.suppression == "nms":
-        box_px = body(window_px, knobs)
-        kept = nms(box_px, margin, knobs.overlap, knobs.contained)
-        # The best windows are the best placed ones: squared, so that those that hardly passed say little.
-        weight = (margin - knobs.threshold) ** 2
-        window_px, margin = around(settled(box_px, weight, kept, knobs.settle), knobs), margin[kept]
+        kept = nms(body(window_px, knobs), margin, knobs.overlap, knobs.contained)
+        # The best windows are the best placed ones: cubed, so that those that hardly passed say little.
+        window_px = settled(window_px, (margin - knobs.threshold) ** 3, kept, knobs.settle)
+        margin = margin[kept]
     else:
         if knobs.suppression == "opencv":
             window_px, margin = group(window_px, margin, knobs.group, knobs.group_distance)
@@ -39,13 +38,6 @@ def body(window_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Float[np.nd
     x, y, width, height = window_px.T
     wide, tall = knobs.width_share * width, knobs.height_share * height
     return np.stack([x + (width - wide) / 2, y + knobs.feet_share * height - tall, wide, tall], axis=1)
-
-
-def around(box_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Float[np.ndarray, "N 4"]:
-    """The window that has its body in a box: what undoes `body`."""
-    x, y, wide, tall = box_px.T
-    width, height = wide / knobs.width_share, tall / knobs.height_share
-    return np.stack([x - (width - wide) / 2, y + tall - knobs.feet_share * height, width, height], axis=1)
 
 
 def probability(margin: Float[np.ndarray, " N"], knobs: PeopleKnobs) -> Float[np.ndarray, " N"]:

@@ -64,20 +64,18 @@ def within(
     """The parts whose windows show a body that lies in a region: few of them, merged where they overlap.
 
     regions_px: x, y, width, height in the picture. heights_px: least and largest height of the body that is looked for
-    there; NaN: any. Windows stand where a search everywhere has them. Where no level's body has such a height the
-    nearest level is taken, if it is no more than a scale step off.
+    there; NaN: any that the region holds. Half a scale step more is allowed, so that there is always a level for a body
+    that the pyramid reaches. Windows stand where a search everywhere has them.
     """
+    regions_px, heights_px = np.asarray(regions_px, float).reshape(-1, 4), np.asarray(heights_px, float).reshape(-1, 2)
+    slack = knobs.scale_step**0.5
+    least = np.where(np.isnan(heights_px[:, 0]), 0.0, heights_px[:, 0]) / slack
+    largest = np.where(np.isnan(heights_px[:, 1]), regions_px[:, 3], heights_px[:, 1]) * slack
     parts: list[Part] = []
     for level in levels(size, knobs):
         body = knobs.height_share * knobs.window_height_px * level.scale
-        spans = []
-        for region, (least, largest) in zip(np.asarray(regions_px, float), np.asarray(heights_px, float), strict=True):
-            slack = knobs.scale_step**0.5
-            if not (np.isnan(least) or least / slack <= body) or not (np.isnan(largest) or body <= largest * slack):
-                continue
-            span = _span(region, level, knobs)
-            if span is not None:
-                spans.append(span)
+        wanted = regions_px[(least <= body) & (body <= largest)]
+        spans = [span for region in wanted if (span := _span(region, level, knobs)) is not None]
         parts += [_part(span, level, knobs) for span in _merged(spans, knobs)]
     return parts
 
