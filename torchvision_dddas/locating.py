@@ -134,11 +134,12 @@ def locate(found: Survey, settings: Settings) -> Iterator[Located]:
 def _alone(
     frame: int, view: View, rows: np.ndarray, origin: tuple[float, float] | None
 ) -> tuple[Positions, np.ndarray]:
+    seen = _of(view.sightings, rows)
     positions = Positions(
         np.full(len(rows), frame),
         view.target[rows],
-        view.sightings.east_north_m[rows],
-        view.sightings.covariance_m2[rows],
+        seen.east_north_m,
+        seen.covariance_m2,
         view.table.score[rows],
         origin,
         None if view.lonlat_deg is None else view.lonlat_deg[rows],

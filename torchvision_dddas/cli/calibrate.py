@@ -44,9 +44,9 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length from a person of known height at a known distance, f = D h / H.
 
-    The camera looks level at the person. Give --distance with --pixels, or with the boxes of one person alone; or a
-    CSV of several distances. With people all over the picture and a --camera whose focal length is known, it finds the
-    camera's height and pitch instead.
+    The camera looks level at the person. Give --distance with --pixels or the boxes of one person; or several distances.
+
+    With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
     from torchvision_dddas.settings import load
     from torchvision_dddas.sources.measurements import has_measurements
@@ -75,9 +75,8 @@ def calibrate(
         typer.echo(text, nl=False)
     else:
         _write(out, text)
-        typer.echo(
-            f"{out}: the camera" + ("" if "width_px" in known else "; add width_px and height_px, or give --size")
-        )
+        lacks = "" if "width_px" in known else "; it still lacks width_px and height_px (--size)"
+        typer.echo(f"{out}: the camera{lacks}")
 
 
 def _from_measurements(table: Path, body_height_m: float) -> Found:

@@ -18,6 +18,9 @@ from torchvision_dddas.types import Camera
 FEWEST = 20
 """Boxes that it takes."""
 
+NARROW = 0.3
+"""The rows that hold the feet of all but a tenth on either side must be so many body heights at least."""
+
 BLOCKS = 10
 """The boxes are left out in so many stretches of time in turn, to learn how much the answer hangs on single people."""
 
@@ -52,6 +55,12 @@ def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: floa
     box = np.asarray(box_px, float).reshape(-1, 4)
     if len(box) < FEWEST:
         raise InputError(f"{len(box)} whole boxes of people; wanted {FEWEST} at least to tell how the camera stands")
+    low, high = np.percentile(box[:, 1] + box[:, 3], [10, 90])
+    if high - low < NARROW * np.median(box[:, 3]):
+        raise InputError(
+            f"most feet lie within {high - low:.0f} rows of the picture, which does not tell how the camera stands; "
+            "give people near and far"
+        )
     u = box[:, 0] + box[:, 2] / 2 - 0.5
     feet, head = (level(u, v - 0.5, camera)[1] for v in (box[:, 1] + box[:, 3], box[:, 1]))
 
