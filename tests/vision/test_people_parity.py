@@ -15,7 +15,7 @@ from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan, suppress
 from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision import Part, Recognizer, load_recognizer
+from torchvision_dddas.vision import Part, Recognizer, load_recognizer, torch_people
 from torchvision_dddas.vision.torch_people import TorchRecognizer
 
 BACK_ENDS = "torch", "onboard"
@@ -174,6 +174,16 @@ def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
     assert [len(maps) for maps in together] == [len(wanted) for wanted in parts]
     for picture, wanted, maps in zip(pictures, parts, together, strict=True):
         same(maps, recognizer.scores([picture], [wanted])[0], within=2e-6)
+
+
+def test_how_many_pictures_share_a_batch_changes_nothing(monkeypatch):
+    recognizer = TorchRecognizer(PeopleKnobs(**PLAIN), SVM, "cpu")
+    pictures, part = [scene(seed, 140, 90) for seed in range(5)], Part((84, 131), 0, 0, 84, 131)
+    at_once = recognizer.scores(pictures, [[part]] * 5)
+    monkeypatch.setattr(torch_people, "_PIXELS", {"cpu": 2 * 84 * 131})
+    for maps, others in zip(at_once, recognizer.scores(pictures, [[part]] * 5), strict=True):
+        same(maps, others, within=2e-6)
+    assert len({maps[0][0, 0].item() for maps in at_once}) == 5
 
 
 def test_nothing_asked_for_is_nothing_found(recognizer):
