@@ -70,12 +70,14 @@ def confirm_pictures(
     """Blobs and people of the same pictures, as `dddas people` found them at frames 1, 1 + interval, ..."""
     knobs = settings.people
     least_px = knobs.height_share * knobs.window_height_px / knobs.enlarge
+    aspect = knobs.width_share * knobs.window_width_px / (knobs.height_share * knobs.window_height_px)
 
     def looks(frame: int, rows: slice) -> Iterator[tuple[str, Look]]:
         for name, table in zip(names, people, strict=True):
             there = table.rows(frame)
             score = table.score[there] if table.probable else np.ones(there.stop - there.start)
-            yield name, confirm_boxes(blobs.box_px[rows], table.box_px[there], score, settings.confirm, least_px)
+            box_px = blobs.box_px[rows]
+            yield name, confirm_boxes(box_px, table.box_px[there], score, settings.confirm, least_px, aspect)
 
     identity = blobs.identity if blobs.identity is not None else np.full(len(blobs), -1)
     return _frames(blobs.frame, identity, looks, settings, interval)

@@ -416,6 +416,9 @@ class ConfirmKnobs(Group):
     )
     detection_rate: float = knob(0.7, "-", 0.01, 0.999, meaning="share of looks at a person that recognize one")
     false_rate: float = knob(0.05, "-", 0.001, 0.99, meaning="share of looks at another blob that recognize one there")
+    crowd_share: float = knob(
+        0.5, "-", 0, 1, meaning="in pictures: detection rate in a blob as wide as several people, over that of one"
+    )
     prior: float = knob(0.5, "-", 0.01, 0.99, meaning="share of the blobs that are people")
     fresh: float = knob(
         0.3, "-", 0, 1, meaning="weight of a look that follows another of the same vehicle: they err alike"

@@ -167,6 +167,20 @@ def test_an_improbable_person_leaves_the_blob_in_doubt():
     assert (boxes.looked[0], boxes.people[0]) == (False, 0)
 
 
+def test_one_chance_hit_makes_no_crowd_of_a_car():
+    person, car, crowd = [[0, 0, 50, 130]], [[0, 0, 400, 130]], [[0, 0, 400, 130]]
+    one_hit, many = [[5, 5, 45, 120.0]], [[x, 5, 45, 120.0] for x in range(5, 350, 80)]
+
+    def weight(blob, people):
+        found = confirm_boxes(np.array(blob, float), np.array(people), np.full(len(people), 0.8), KNOBS)
+        return evidence(found, KNOBS)[0]
+
+    assert weight(person, one_hit) > 0.5
+    assert weight(car, one_hit) < 0
+    assert weight(crowd, many) > 0
+    assert weight(car, np.zeros((0, 4))) < weight(person, np.zeros((0, 4)))
+
+
 def test_what_was_never_seen_keeps_the_prior_and_is_unseen():
     beliefs = Beliefs(ConfirmKnobs(prior=0.3))
     beliefs.add(["blob"], [("ugv", one(False))])

@@ -64,7 +64,8 @@ class Look:
     looked: (N,) bool, whether it tells anything: a person at the blob, or a clear view of it and none near.
     people: (N,) int64, recognized at it; a blob may be a crowd. nearest_m, nearest_sigmas: (N,) to the nearest person,
     infinite without any; in boxes NaN. best: (N,) highest probability of those at it, 0 without any; where it is below
-    confirm.least_score they are in doubt, and so is the blob.
+    confirm.least_score they are in doubt, and so is the blob. places: (N,) people that fit into the blob side by side,
+    1 or more; None: one each.
     """
 
     looked: np.ndarray
@@ -72,6 +73,7 @@ class Look:
     nearest_m: np.ndarray
     nearest_sigmas: np.ndarray
     best: np.ndarray
+    places: np.ndarray | None = None
 
 
 def look(
@@ -109,12 +111,13 @@ def confirm_boxes(
     score: Float[np.ndarray, "M"],
     knobs: ConfirmKnobs,
     least_px: float = 0.0,
+    aspect: float = 0.4,
 ) -> Look:
     """One picture in which both were found: boxes x, y, width, height of the blobs and of the people.
 
     A person is at the blob with the highest IoU among those that share enough with them, measured by the smaller box: a
     blob may be a crowd, or a part of a body. least_px: a body less tall is not recognized, so that nothing is known of
-    blobs less tall without a person.
+    blobs less tall without a person. aspect: of a body, width over height.
     """
     blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
     a, b = blob_px[:, None], person_px[None]
@@ -124,7 +127,8 @@ def confirm_boxes(
     people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, knobs)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
     unknown = np.full(len(blob_px), np.nan)
-    return Look((people > 0) | clear, people, unknown, unknown, best)
+    places = np.maximum(blob_px[:, 2] / np.maximum(aspect * blob_px[:, 3], 1e-9), 1.0)
+    return Look((people > 0) | clear, people, unknown, unknown, best, places)
 
 
 @dataclass
@@ -164,12 +168,16 @@ def evidence(seen: Look, knobs: ConfirmKnobs) -> Float[np.ndarray, "N"]:
     """What a look adds to the log-odds, (N,); 0 without a look.
 
     With d and f the detection and false-alarm rates: ln (1 - d)/(1 - f) where nobody is; for a person the odds of their
-    own probability, and ln d/f at most: a probability of 1 is no proof.
+    own probability, and ln d/f at most: a probability of 1 is no proof. Each further place in a blob as wide as several
+    people where nobody is says ln (1 - c d)/(1 - f), c = crowd_share: one chance hit makes no crowd of a car.
     """
     d, f = knobs.detection_rate, knobs.false_rate
     sure = 1 / (1 + f / d)  # the probability whose odds are d/f
     best = np.clip(seen.best, 0.5, max(sure, 0.5))
-    return np.where(seen.looked, np.where(seen.people > 0, np.log(best / (1 - best)), math.log((1 - d) / (1 - f))), 0.0)
+    first = np.where(seen.people > 0, np.log(best / (1 - best)), math.log((1 - d) / (1 - f)))
+    places = np.ones(len(best)) if seen.places is None else seen.places
+    empty = np.maximum(places - np.maximum(seen.people, 1), 0)
+    return np.where(seen.looked, first + empty * min(math.log((1 - knobs.crowd_share * d) / (1 - f)), 0.0), 0.0)
 
 
 def _log_odds(probability: float) -> float:
