@@ -177,7 +177,7 @@ def test_in_regions_the_share_of_windows_is_told_and_recorded_with_its_cause(ddd
     result = dddas("people", clip, *words, "--out", tmp_path / "out")
     assert "% of the windows searched" in result.stdout
     kept = record(tmp_path / "out")
-    assert kept["searched"]["frames_everywhere"] == 2
+    assert kept["searched"]["frames_everywhere"] == 1
     assert kept["adjustments"][0]["cause"] == "1 person expected"
 
 

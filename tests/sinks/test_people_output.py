@@ -25,7 +25,7 @@ def record(folder):
 
 
 def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(tmp_path):
-    line = Adjustment(2, "people.windows_share", 1.0, 0.2, "2 people expected")
+    line = Adjustment(2, "people.regions_share", 1.0, 0.2, "2 people expected")
     with PeopleOutput(tmp_path / "out", ()) as output:
         output.begin({"input": "x"}, 10)
         for one in (

@@ -1,8 +1,11 @@
 """Where people are looked for in a frame: everywhere, around those seen before, around what moves; the feedback rule.
 
-Between whole looks only the surroundings of people who are expected are searched, so that the cost follows the need.
+The surroundings of people who are expected are searched in every frame, the rest of the picture a few levels at a time,
+so that the cost follows the need. A person scores at several neighbouring levels: the first of them to have its turn
+shows him, so that searching a tenth of the levels in each frame finds newcomers sooner than all levels in each tenth.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,12 +32,16 @@ _PLACE_GAIN, _VELOCITY_GAIN = 0.6, 0.2
 _NEAR_HEIGHTS = 0.5  # a person expected no further from one that is found may be this one
 
 _DEAR = 0.8  # regions that cost more than this share of a whole look are not worth their name
-_CHANGED = 1.5  # a share of windows that grew or shrank by this factor since the last line is worth another
+_CHANGED, _LITTLE = 2.0, 0.02  # a share that grew or shrank by this factor is worth a line; less than that is none
+_TURN = 0.382  # levels that have their turn in frames after one another are so far apart, as a share of the round
 
 
 @dataclass(frozen=True)
 class Look:
-    """What of a frame is searched. regions_px: (R, 4) where; None: everywhere. share: windows of all that there are."""
+    """What of a frame is searched. regions_px: (R, 4) where, beside the levels whose turn it is; None: everywhere.
+
+    share: windows searched, of all that there are.
+    """
 
     parts: list[Part]
     regions_px: np.ndarray | None
@@ -57,8 +64,8 @@ def grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: 
 class Expected:
     """Who is expected where: people that were found, moved on by their velocity.
 
-    One who is not found stays expected for twice as many frames as he was found in, at most `rescan_frames`: a person
-    who was missed comes back, and a window that looked like one for a frame is soon forgotten.
+    One who is not found stays expected for four times as many frames as he was found in, at most twice `rescan_frames`:
+    a person who was missed comes back, and a window that looked like one for a frame is soon forgotten.
     """
 
     def __init__(self, knobs: PeopleKnobs) -> None:
@@ -97,7 +104,7 @@ class Expected:
         self.size_px[row] *= (size[column] / self.size_px[row]) ** _PLACE_GAIN
         self.found[row] += 1
         self.seen[row] = frame
-        stay = frame - self.seen <= np.minimum(2 * self.found, self.knobs.rescan_frames)
+        stay = frame - self.seen <= np.minimum(4 * self.found, 2 * self.knobs.rescan_frames)
         new = np.setdiff1d(np.arange(len(people)), column)
         self.place_px = np.concatenate([self.place_px[stay], place[new]])
         self.velocity_px = np.concatenate([self.velocity_px[stay], np.zeros((len(new), 2))])
@@ -132,17 +139,19 @@ def _covered(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
 class Search:
     """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
 
-    `people.search = everywhere`: the whole picture. `regions`: the whole picture every `rescan_frames`, and at once
-    when all who were expected are lost, as after a cut; between, around those expected. blobs: (N, 4) boxes of a
-    frame's movers; with them only their surroundings are looked at, and with `regions` as well the whole picture and
-    those expected as said.
+    `people.search = everywhere`: the whole picture. `regions`: around those expected, and the whole picture level by
+    level in `rescan_frames` frames; all of it at first, and at once when all who were expected are lost, as after a
+    cut. blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their surroundings are then looked at; with
+    `regions` those too, where no one expected explains them.
     """
 
     def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
         self.knobs, self.blobs = knobs, blobs
         self.steered = knobs.search == "regions"
         self.expected = Expected(knobs)
-        self.whole = 0  # frame of the last whole look; 0: none yet
+        self.looks = 0
+        n = knobs.rescan_frames
+        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
         self.there = 0  # people whom the last look found
         self.lost = 0  # how many the look before it had found, where it found none of them
         self.told = 1.0  # share of windows in the last line of the record
@@ -152,25 +161,35 @@ class Search:
         everywhere = scan.everywhere(size, self.knobs)
         if not self.steered and self.blobs is None:
             return Look(everywhere, None, 1.0)
-        if self.steered and (self.lost or not self.whole or frame - self.whole >= self.knobs.rescan_frames):
-            return self._whole(frame, everywhere, f"none of {self.lost} people expected was found" if self.lost else "")
+        if self.steered and (not self.looks or frame - self.expected.frame > self.knobs.rescan_frames):
+            return Look(everywhere, None, 1.0)
+        if self.lost:
+            return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
         region_px, heights_px = self._regions(frame)
-        parts = scan.within(region_px, heights_px, size, self.knobs)
-        share = scan.cost(parts, self.knobs) / scan.cost(everywhere, self.knobs)
-        if share > _DEAR:
-            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {share:.0%} of the windows")
-        return Look(parts, region_px, share, self._told(frame, share) if self.steered else ())
+        parts, all_windows = scan.within(region_px, heights_px, size, self.knobs), scan.cost(everywhere, self.knobs)
+        around = scan.cost(parts, self.knobs) / all_windows
+        if around > _DEAR:
+            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
+        if not self.steered:
+            return Look(parts, region_px, around)
+        due = everywhere[self._turn() :: self.knobs.rescan_frames]
+        levels = {part.level for part in due}
+        parts = due + [part for part in parts if part.level not in levels]
+        return Look(parts, region_px, scan.cost(parts, self.knobs) / all_windows, self._told(frame, around))
 
     def learn(self, frame: int, people: People, look: Look) -> None:
         """Take in what a look found."""
+        self.looks += 1
         if not self.steered:
             return
-        if look.regions_px is None:
-            self.whole = frame
         again = self.expected.learn(frame, people)
         # One alone is often missed for a frame, and after a look that found nobody none is new.
         self.lost = self.there if self.there > 1 and not again and look.regions_px is not None else 0
         self.there = len(people)
+
+    def _turn(self) -> int:
+        """The first of the levels whose turn it is: each comes once in a round, far from the one before."""
+        return self.looks * self.step % self.knobs.rescan_frames
 
     def _regions(self, frame: int) -> Regions:
         found = [self.expected.regions(frame)] if self.steered else []
@@ -182,23 +201,20 @@ class Search:
         return np.concatenate([region for region, _ in found]), np.concatenate([heights for _, heights in found])
 
     def _whole(self, frame: int, everywhere: list[Part], why: str) -> Look:
-        """A whole look; the record says why, if it is not simply time for one."""
-        moved: tuple[Adjustment, ...] = ()
-        if why and self.told != 1.0:
-            moved = (Adjustment(frame, "people.windows_share", self.told, 1.0, why),)
-            self.told = 1.0
+        """A look at all, which the record explains."""
+        old, self.told = self.told, 1.0
+        moved = (Adjustment(frame, "people.regions_share", old, 1.0, why),) if old != 1.0 else ()
         return Look(everywhere, None, 1.0, moved)
 
     def _told(self, frame: int, share: float) -> tuple[Adjustment, ...]:
-        """A line of the record, where the share of windows has changed much since the last one."""
-        least = 0.01
-        if max(share, least) < _CHANGED * max(self.told, least) and max(self.told, least) < _CHANGED * max(
-            share, least
-        ):
+        """A line of the record, where the share of windows in regions has changed much since the last one."""
+        low, high = sorted((max(share, _LITTLE), max(self.told, _LITTLE)))
+        if high < _CHANGED * low:
             return ()
-        count = len(self.expected)
-        why = f"{count} {'person' if count == 1 else 'people'} expected" + (
-            "" if self.blobs is None else ", and what moves"
-        )
-        old, self.told = self.told, share
-        return (Adjustment(frame, "people.windows_share", round(old, 4), round(share, 4), why),)
+        why = f"{_persons(len(self.expected))} expected" + ("" if self.blobs is None else ", and what moves")
+        old, self.told = self.told, round(share, 4)
+        return (Adjustment(frame, "people.regions_share", old, self.told, why),)
+
+
+def _persons(count: int) -> str:
+    return f"{count} {'person' if count == 1 else 'people'}"
