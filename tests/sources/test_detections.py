@@ -197,3 +197,18 @@ def test_whatever_stands_in_a_file_is_read_or_refused_in_one_line(tmp_path_facto
     except InputError as error:
         said = str(error)
     assert str(path) in said
+
+
+def test_identities_and_cuts_are_kept_where_a_table_has_them(table):
+    named = "frame,identity,x_px,y_px,width_px,height_px,cut\n1,7,0,0,5,5,1\n1,,0,0,5,5,0\n2,x,0,0,5,5,\n"
+    found = read_detections(table(named))
+    assert found.identity is not None and found.identity.tolist() == [7, -1, -1]
+    assert found.cut is not None and found.cut.tolist() == [True, False, False]
+    by_place = read_detections(table("1,3,0,0,5,5\n1,-1,0,0,5,5\n1,nan,0,0,5,5\n"))
+    assert by_place.identity is not None and by_place.identity.tolist() == [3, -1, -1]
+    assert by_place.cut is None
+
+
+def test_a_cut_that_is_neither_0_nor_1_is_named(table):
+    with pytest.raises(InputError, match="line 2: cut is 'maybe'; wanted 1 where the border cuts it, else 0"):
+        read_detections(table("frame,x_px,y_px,width_px,height_px,cut\n1,0,0,5,5,maybe\n"))

@@ -128,13 +128,13 @@ def test_four_vehicles_halve_the_error_of_one_and_say_how_large_it_is():
 
 
 def test_a_crowd_goes_on_as_its_people_went():
-    looks = [[[0, 0], [2, 0]], [[1, 1], [3, 1]]]
+    looks = np.array([[[0, 0], [2, 0]], [[1, 1], [3, 1]]])
     assert np.allclose(crowd(looks), (3, 2))
     assert np.allclose(crowd(looks[1:]), (2, 1))
 
 
 def test_who_joins_or_leaves_does_not_move_a_crowd():
     gone = [np.nan, np.nan]
-    looks = [[[0, 0], [2, 0], [50, 50]], [[1, 0], [3, 0], gone]]
+    looks = np.array([[[0, 0], [2, 0], [50, 50]], [[1, 0], [3, 0], gone]])
     assert np.allclose(crowd(looks), (3, 0))
-    assert np.isnan(crowd([[gone, gone]])).all()
+    assert np.isnan(crowd(np.array([[gone, gone]]))).all()

@@ -44,7 +44,7 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length from a person of known height at a known distance, f = D h / H.
 
-    The camera looks level at the person. Give --distance with --pixels or the boxes of one person; or several distances.
+    The camera looks level at the person. Give --distance with --pixels or the boxes of one person; or many distances.
 
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """

@@ -1,0 +1,112 @@
+"""`dddas calibrate`: the camera that it writes, and one line for each mistake."""
+
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from tests.upright import boxes, camera
+from torchvision_dddas.sources.cameras import read_camera
+
+PERSON = ("--body-height", 1.8, "--distance", 9)
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(name, text):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_a_person_at_a_known_distance_gives_the_focal_length(dddas, tmp_path):
+    out = tmp_path / "camera.toml"
+    result = dddas("calibrate", *PERSON, "--pixels", 200, "--size", "640x480", "--out", out)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == [
+        "focal length 1000.0 ± 30.0 px from 1 measurement",
+        f"{out}: the camera",
+    ]
+    found = read_camera(out)
+    assert (found.focal_px, found.size_px) == ((1000.0, 1000.0), (640, 480))
+    assert found.focal_sigma == pytest.approx(0.03)
+
+
+def test_without_out_the_camera_alone_is_on_stdout(dddas):
+    result = dddas("calibrate", *PERSON, "--pixels", 200, "--pixels", 202)
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[0] == "focal_px = 1005.0"
+    assert "focal length 1005.0" in result.stderr
+
+
+def test_many_distances_and_an_outlier(dddas, file, tmp_path):
+    text = "distance_m,height_px\n3,600\n6,300\n9,200\n12,90\n18,100\n"
+    out = tmp_path / "camera.toml"
+    result = dddas("calibrate", file("m.csv", text), "--body-height", 1.8, "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "1 of 5 left out as outliers, the first 90 px at 12 m" in result.stdout
+    assert "it still lacks width_px and height_px (--size)" in result.stdout
+    assert "focal_px = 1000.0" in out.read_text()
+
+
+def test_the_boxes_of_one_person_are_measurements(dddas, file):
+    table = file("t.txt", "1,-1,10,10,50,200,1\n2,-1,12,10,50,200,1\n")
+    assert "focal length 1000.0" in dddas("calibrate", table, *PERSON).stderr
+
+
+def test_people_all_over_the_picture_tell_how_the_camera_stands(dddas, file, tmp_path):
+    rng = np.random.default_rng(0)
+    people = np.stack([rng.uniform(-3, 3, 60), rng.uniform(8, 25, 60)], axis=1)
+    lines = [
+        f"{n},-1," + ",".join(f"{v:.3f}" for v in box) + ",1"
+        for n, box in enumerate(boxes(people, 1.75, camera(height_m=3.0, pitch_rad=0.1)), 1)
+    ]
+    known = file("known.toml", "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheading_deg = 30\n")
+    out = tmp_path / "camera.toml"
+    words = ("--camera", known, "--body-height", 1.75, "--out", out)
+    result = dddas("calibrate", file("t.txt", "\n".join(lines)), *words)
+    assert result.exit_code == 0, result.output
+    found = read_camera(out)
+    assert found.height_m == pytest.approx(3.0, abs=0.01)
+    assert found.pitch_rad == pytest.approx(0.1, abs=1e-3)
+    assert found.heading_rad == pytest.approx(np.radians(30))
+
+
+def test_a_camera_without_focal_length_is_completed(dddas, file, tmp_path):
+    place = "longitude_deg = -110.1234567\nlatitude_deg = 32\n"
+    known = file("known.toml", f'name = "a \\"rover\\""\nwidth_px = 640\nheight_px = 480\n{place}')
+    out = tmp_path / "camera.toml"
+    assert dddas("calibrate", *PERSON, "--pixels", 200, "--camera", known, "--out", out).exit_code == 0
+    found = read_camera(out)
+    assert (found.name, found.focal_px[0], found.place) == ('a "rover"', 1000.0, (-110.1234567, 32.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "nothing to calibrate by: give --distance with --pixels, or a table"),
+        (["--pixels", 200], "--pixels needs --distance"),
+        (["--pixels", -5, "--distance", 3], "a height in pixels of -5 will not do"),
+        (["--pixels", 200, "--distance", 0], "a distance of 0 will not do"),
+        (["--pixels", 200, "--distance", 3, "--body-height", 0], "a body height of 0 will not do"),
+        (["crowd.txt", "--distance", 3], "has 2 boxes in frame 1; --distance wants one person alone"),
+        (["crowd.txt", "--distance", 3, "--pixels", 9], "--pixels and a table were given"),
+        (["crowd.txt"], "has boxes without distances: give --distance for one person's, or --camera"),
+        (["crowd.txt", "--camera", "known.toml"], "2 whole boxes of people; wanted 20"),
+        (["crowd.txt", "--camera", "none.toml"], "has no focal length"),
+        (["far.csv", "--distance", 3], "has its own distances"),
+        (["wrong.csv"], "line 2: distance_m is 'far'; wanted a number above 0"),
+        (["gone.csv"], "cannot be read: No such file"),
+        (["--pixels", 200, "--distance", 3, "--size", "640"], "--size is '640'; wanted WIDTHxHEIGHT"),
+    ],
+)
+def test_a_mistake_leaves_one_line(dddas, file, tmp_path, words, says):
+    file("crowd.txt", "1,-1,10,10,50,200,1\n1,-1,110,10,50,200,1\n")
+    file("known.toml", "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\n")
+    file("none.toml", "width_px = 1280\nheight_px = 960\n")
+    file("far.csv", "distance_m,height_px\n3,100\n")
+    file("wrong.csv", "distance_m,height_px\nfar,100\n")
+    given = [tmp_path / word if str(word).endswith((".txt", ".csv", ".toml")) else word for word in words]
+    given = given if "gone.csv" not in words else [*given, *PERSON]
+    assert says in bad(dddas("calibrate", *given))

@@ -1,0 +1,180 @@
+"""`dddas locate ground`: what it writes, and one line for each mistake."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from tests.upright import boxes, camera
+from torchvision_dddas.sources.positions import read_positions
+
+CAMERA = "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheight_m = 1.2\n"
+PEOPLE = np.array([[-1.0, 10.0], [2.0, 14.0]])
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(name, text):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def walked(frame):
+    """Where people who go north are."""
+    return PEOPLE + np.array([0, 0.1 * frame])
+
+
+def tracks(cam, place=(0.0, 0.0), frames=(1, 2, 3), identities=(4, 8)):
+    lines = ["frame,identity,x_px,y_px,width_px,height_px,score"]
+    for frame in frames:
+        for identity, box in zip(identities, boxes(walked(frame), 1.75, cam, place), strict=True):
+            lines.append(",".join([f"{frame},{identity}", *(f"{v:.6f}" for v in box), "0.9"]))
+    return "\n".join(lines) + "\n"
+
+
+def rows(path):
+    with path.open(newline="") as text:
+        return list(csv.DictReader(text))
+
+
+def test_tracks_become_positions_with_covariances(dddas, file, tmp_path):
+    out = tmp_path / "out"
+    result = dddas(
+        "locate", "ground", file("t.csv", tracks(camera())), "--camera", file("c.toml", CAMERA), "--out", out
+    )
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == [
+        "3 frames, 6 sightings (6 by height and feet, 0 by height, 0 by feet alone), 6 positions",
+        f"{out}: positions.csv, sightings.csv, run.json",
+    ]
+    found = read_positions(out / "positions.csv")
+    assert found.frame.tolist() == [1, 1, 2, 2, 3, 3] and found.target.tolist() == [4, 8] * 3
+    assert np.allclose(found.east_north_m[2:4], walked(2), atol=1e-3)
+    assert (np.linalg.eigvalsh(found.covariance_m2) > 0).all()
+    assert (out / "positions.csv").read_text().splitlines()[0] == (
+        "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,score,cameras"
+    )
+    (first, *_) = rows(out / "sightings.csv")
+    assert (first["camera"], first["target"], first["by"], first["cut"]) == ("c", "4", "both", "0")
+    assert float(first["distance_m"]) == pytest.approx(np.hypot(1, 10.1), abs=1e-3)
+    assert float(first["bearing_deg"]) == pytest.approx(360 - np.degrees(np.arctan(1 / 10.1)), abs=1e-3)
+    record = json.loads((out / "run.json").read_text())
+    assert (record["state"], record["people"], record["sightings"]["both"]) == ("complete", 6, 6)
+
+
+def test_a_place_in_degrees_gives_a_map(dddas, file, tmp_path):
+    text = CAMERA + "longitude_deg = -110.95\nlatitude_deg = 32.23\n"
+    out = tmp_path / "out"
+    result = dddas("locate", "ground", file("t.csv", tracks(camera())), "--camera", file("c.toml", text), "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "tracks.geojson" in result.stdout
+    found = json.loads((out / "tracks.geojson").read_text())
+    assert found["type"] == "FeatureCollection" and len(found["features"]) == 2
+    (feature, _) = found["features"]
+    assert feature["type"] == "Feature" and feature["geometry"]["type"] == "LineString"
+    assert feature["properties"]["target"] == 4 and feature["properties"]["frames"] == [1, 2, 3]
+    degrees = read_positions(out / "positions.csv").lonlat_deg
+    assert degrees is not None
+    assert np.allclose(feature["geometry"]["coordinates"], degrees[::2], atol=1e-8)
+    assert abs(degrees[0, 0] + 110.95) < 1e-4 and 0 < degrees[0, 1] - 32.23 < 2e-4
+
+
+def test_a_target_seen_once_is_a_point_of_the_map(dddas, file, tmp_path):
+    text = CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n"
+    table = file("t.csv", tracks(camera(), frames=(7,)))
+    dddas("locate", "ground", table, "--camera", file("c.toml", text), "--out", tmp_path / "out")
+    found = json.loads((tmp_path / "out/tracks.geojson").read_text())
+    assert [feature["geometry"]["type"] for feature in found["features"]] == ["Point", "Point"]
+
+
+def test_two_cameras_give_the_fused_places_and_what_each_alone_says(dddas, file, tmp_path):
+    near = "position_sigma_m = 0.1\nheading_sigma_deg = 0.3\n"
+    west = camera(heading_rad=np.pi / 2)
+    words = [file("a.csv", tracks(camera())), file("b.csv", tracks(west, (-15.0, 12.0), identities=(1, 2)))]
+    cameras = [
+        file("south.toml", CAMERA + near),
+        file("west.toml", CAMERA + near + "heading_deg = 90\neast_m = -15\nnorth_m = 12\n"),
+    ]
+    out = tmp_path / "out"
+    result = dddas("locate", "ground", *words, "--camera", cameras[0], "--camera", cameras[1], "--out", out)
+    assert result.exit_code == 0, result.output
+    fused = rows(out / "positions.csv")
+    assert [row["cameras"] for row in fused] == ["2"] * 6
+    assert [row["target"] for row in fused] == ["1", "2"] * 3
+    found = read_positions(out / "positions.csv")
+    assert np.allclose(found.east_north_m[:2], walked(1), atol=1e-3)
+    assert [row["camera"] for row in rows(out / "sightings.csv")][:4] == ["south", "south", "west", "west"]
+
+
+def test_poses_move_the_camera(dddas, file, tmp_path):
+    poses = file("p.csv", "frame,east_m,north_m\n1,100,0\n3,102,0\n")
+    words = ("--camera", file("c.toml", CAMERA), "--poses", poses, "--out", tmp_path / "out")
+    result = dddas("locate", "ground", file("t.csv", tracks(camera())), *words)
+    assert result.exit_code == 0, result.output
+    found = read_positions(tmp_path / "out/positions.csv")
+    assert np.allclose(found.east_north_m[::2, 0], [99, 100, 101], atol=1e-3)
+
+
+def test_whoever_has_no_distance_is_told_of(dddas, file, tmp_path):
+    table = file("t.csv", "frame,x_px,y_px,width_px,height_px,cut\n1,600,700,150,260,1\n1,600,400,40,160,0\n")
+    result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: 1 sightings have a bearing but no distance (see sightings.csv)" in result.stdout
+    (first, _) = rows(tmp_path / "out/sightings.csv")
+    assert (first["by"], first["east_m"]) == ("bearing", "")
+    assert len(read_positions(tmp_path / "out/positions.csv")) == 1
+
+
+def test_paper_mode_has_no_covariances(dddas, file, tmp_path):
+    words = ("--camera", file("c.toml", CAMERA), "--set", "ground.mode=paper", "--out", tmp_path / "out")
+    result = dddas("locate", "ground", file("t.csv", tracks(camera())), *words)
+    assert result.exit_code == 0, result.output
+    assert np.isnan(read_positions(tmp_path / "out/positions.csv").covariance_m2).all()
+
+
+def test_a_table_without_rows_gives_empty_tables(dddas, file, tmp_path):
+    text = CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n"
+    words = ("--camera", file("c.toml", text), "--out", tmp_path / "out")
+    result = dddas("locate", "ground", file("t.csv", "frame,x_px,y_px,width_px,height_px\n"), *words)
+    assert result.exit_code == 0, result.output
+    assert "note: the tables have no rows: nobody to locate" in result.stdout
+    assert len(read_positions(tmp_path / "out/positions.csv")) == 0
+    assert json.loads((tmp_path / "out/tracks.geojson").read_text())["features"] == []
+    record = json.loads((tmp_path / "out/run.json").read_text())
+    assert (record["state"], record["people"]) == ("complete", 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "says"),
+    [
+        ("width_px = 1280\nheight_px = 960\n", [], "no focal length (focal_px). `dddas calibrate` finds it"),
+        (CAMERA.replace("height_m = 1.2\n", ""), ["--set", "ground.use=feet"], "has no height_m"),
+        (CAMERA, ["--camera", "again"], "1 tables and 2 cameras; wanted one --camera for each table"),
+        (CAMERA, ["--poses", "poses"], "cover frames 1 to 2; 2 of 6 rows of the table lie outside"),
+        (CAMERA, ["--poses", "poses", "--poses", "poses"], "1 tables and 2 files of poses"),
+        (CAMERA, ["--poses", "timed"], "are by time_s; say with --rate"),
+        (CAMERA, ["--set", "ground.body_height_m=9"], "ground.body_height_m"),
+    ],
+)
+def test_a_mistake_leaves_one_line_and_no_folder(dddas, file, tmp_path, text, words, says):
+    names = {
+        "again": file("again.toml", CAMERA),
+        "poses": file("poses.csv", "frame,heading_deg\n1,0\n2,0\n"),
+        "timed": file("timed.csv", "time_s,heading_deg\n0,0\n2,0\n"),
+    }
+    given = [names.get(word, word) for word in words]
+    table, out = file("t.csv", tracks(camera())), tmp_path / "out"
+    result = dddas("locate", "ground", table, "--camera", file("c.toml", text), *given, "--out", out)
+    assert says in bad(result)
+    assert not out.exists()
+
+
+def test_a_run_does_not_read_what_it_writes(dddas, file, tmp_path):
+    table = file("positions.csv", tracks(camera()))
+    result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", tmp_path)
+    assert "is a file that this run writes" in bad(result)
