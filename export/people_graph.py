@@ -10,13 +10,13 @@ It needs the extras `torch` and `export`. Three graphs, in the folder of the pac
     people_scores.onnx      `histograms` -> `scores`
 
 and manifest.json, which names their inputs and outputs, the versions that made them, and the layout that is baked in.
-The first is the whole score map for any ONNX runtime. The onboard back end runs the others, between which it puts
-tiles together, and has OpenCV take the gradient; that is several times quicker (eval/people_speed.py). Any SVM of the same
-cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
+The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
+tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
+of the same cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
 
-The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 280 ns a pixel
-where these take 110 whole and 15 from polar to blocks, as ONNX Runtime has quick convolutions and slow copies. A file
-is written once its scores are torch's to 5e-5; the same versions write the same bytes.
+The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 280 ns a pixel on
+one core where people.onnx takes 110 and people_histograms.onnx 15, as ONNX Runtime has quick convolutions and slow
+copies. They are written once their scores are torch's to 5e-5; the same versions write the same bytes.
 Name a folder of your own to the onboard back end by `--set people.graphs=FOLDER`.
 """
 
@@ -54,6 +54,7 @@ class Graph:
         self.constants: dict[bytes, onnx.TensorProto] = {}
 
     def __call__(self, operation: str, *inputs: str, out: str = "", **attributes: object) -> str:
+        """A node of one output; out: its name, if it matters."""
         out = out or f"{operation.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operation, list(inputs), [out], name=out, **attributes))
         return out
@@ -67,11 +68,13 @@ class Graph:
         return self.constant(np.array(values, np.int64))
 
     def constant(self, array: np.ndarray) -> str:
+        """An array, once however often it is asked for."""
         key = str(array.dtype).encode() + str(array.shape).encode() + array.tobytes()
         name = f"constant_{len(self.constants)}"
         return self.constants.setdefault(key, numpy_helper.from_array(array, name)).name
 
     def cut(self, name: str, axis: int, begin: int, end: int) -> str:
+        """A stretch of one axis."""
         return self("Slice", name, self.whole(begin), self.whole(end), self.whole(axis))
 
     def model(self, inputs: dict, outputs: dict, properties: dict[str, str]) -> bytes:
@@ -315,7 +318,7 @@ def main() -> None:
     files = graphs(wanted)
     difference = largest_difference(files, wanted)
     if not difference <= TOLERANCE:
-        raise SystemExit(f"the graphs are up to {difference:.1e} off torch; nothing was written")
+        raise SystemExit(f"the graphs' scores are up to {difference:.1e} off torch's; nothing was written")
     options.out.mkdir(parents=True, exist_ok=True)
     for name, content in {**files, "manifest.json": manifest(files, wanted)}.items():
         write_whole(options.out / name, content)

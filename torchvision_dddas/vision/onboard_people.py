@@ -4,6 +4,7 @@ The graphs are made from `ops.hog` by export/people_graph.py. A part goes throug
 cache; parts are shared among threads, each of which runs the graphs on itself alone.
 """
 
+import json
 import math
 import threading
 from collections import defaultdict
@@ -21,13 +22,17 @@ from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm
 from torchvision_dddas.vision.onboard_gradient import Gradient
 from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.vision.scratch import spans
 
 SHIPPED = Path(__file__).parents[1] / "graphs"
-# What a graph has baked in; it names them in its metadata.
+# What the graphs have baked in; their manifest names it.
 BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 
-# Side of a tile: its 16 maps take 1.2 MB, which should stay in a core's cache, and its neighbours' blocks overlap it.
-_TILE_PX = 136
+# Side of a tile: its 16 maps take 0.7 MB, which should stay in a core's cache, and its neighbours' blocks overlap it.
+_TILE_PX = 104
+# Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
+_GRADIENT_PX = 200_000
+_BLOCKS = 5_000
 
 
 class OnboardRecognizer:
@@ -36,8 +41,8 @@ class OnboardRecognizer:
     name = "onboard"
 
     def __init__(self, knobs: PeopleKnobs, svm: LinearSvm) -> None:
-        """Raises InputError where the SVM has another length than the descriptor."""
-        self.knobs, self.svm = knobs, svm
+        """Raises InputError where the SVM has another length than the descriptor, or the graphs another layout."""
+        self.knobs, self.svm, self.graphs = knobs, svm, graphs(knobs)
         self.svm_feed = {
             "weights": arranged(svm, knobs),
             "bias": np.array(svm.bias, np.float32),
@@ -48,12 +53,11 @@ class OnboardRecognizer:
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
         """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
-        folder = SHIPPED if self.knobs.graphs == "shipped" else Path(self.knobs.graphs)
-        return opened(folder / "people_histograms.onnx", self.knobs), opened(folder / "people_scores.onnx", self.knobs)
+        return opened(self.graphs / "people_histograms.onnx"), opened(self.graphs / "people_scores.onnx")
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
-        """As many threads as OpenCV takes."""
+        """As many threads as OpenCV takes; each holds some 15 MB at 640x480."""
         return ThreadPoolExecutor(max(1, cv2.getNumThreads()))
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
@@ -105,26 +109,35 @@ class OnboardRecognizer:
 
     def _scored(self, planes: np.ndarray) -> np.ndarray:
         """Scores of the windows at every block stride. planes: uint8 (C, H + 2, W + 2)."""
-        feed = {"histograms": self._histograms(planes), **self.svm_feed}
-        (found,) = self.sessions[1].run(None, feed)
+        histograms = self._histograms(planes)
+        _, ny, nx = histograms.shape
+        down, across, _ = self.svm_feed["weights"].shape
+        found = np.empty((ny - down + 1, nx - across + 1), np.float32)
+        # Each block takes as many numbers as a window has blocks: some rows at a time bound the memory.
+        for top, bottom in spans(len(found), max(down, _BLOCKS // nx)):
+            rows = np.ascontiguousarray(histograms[:, top : bottom + down - 1])
+            (found[top:bottom],) = self.sessions[1].run(None, {"histograms": rows, **self.svm_feed})
         return found
 
     def _histograms(self, planes: np.ndarray) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
         gradient = self._gradient
-        polar = gradient(planes)
         block, stride = self.knobs.block_px, self.knobs.block_stride_px
-        down, across = ((length - block) // stride + 1 for length in polar.shape[1:])
-        some = max(1, (_TILE_PX - block) // stride + 1)
+        down, across = ((length - 2 - block) // stride + 1 for length in planes.shape[1:])
+        side = max(1, (_TILE_PX - block) // stride + 1)
         size = self.knobs.bins * (block // self.knobs.cell_px) ** 2
         found = gradient.scratch("histograms", (size, down, across))
-        for top, bottom in spans(down, some):
-            begin, end = top * stride, (bottom - 1) * stride + block
-            for left, right in spans(across, some):
-                here = polar[:, begin:end, left * stride : (right - 1) * stride + block]
-                tile = gradient.scratch("tile", here.shape)
-                np.copyto(tile, here)
-                (found[:, top:bottom, left:right],) = self.sessions[0].run(None, {"polar": tile[None]})
+        for first, last in spans(down, max(side, _GRADIENT_PX // planes.shape[2] // stride)):
+            polar = gradient(planes[:, first * stride : (last - 1) * stride + block + 2])
+            for top, bottom in spans(last - first, side):
+                for left, right in spans(across, side):
+                    rows = slice(top * stride, (bottom - 1) * stride + block)
+                    here = polar[:, rows, left * stride : (right - 1) * stride + block]
+                    tile = gradient.scratch("tile", here.shape)
+                    np.copyto(tile, here)
+                    (found[:, first + top : first + bottom, left:right],) = self.sessions[0].run(
+                        None, {"polar": tile[None]}
+                    )
         return found
 
     @property
@@ -136,36 +149,33 @@ class OnboardRecognizer:
         return held
 
 
-def spans(length: int, most: int) -> list[tuple[int, int]]:
-    """(begin, end) of stretches of about equal length that make up the whole."""
-    count = -(-length // most)
-    return [(length * i // count, length * (i + 1) // count) for i in range(count)]
+def graphs(knobs: PeopleKnobs) -> Path:
+    """The folder of the graphs. Raises InputError where there are none, or ones made for another layout."""
+    folder = SHIPPED if knobs.graphs == "shipped" else Path(knobs.graphs)
+    wanted = {name: int(getattr(knobs, name)) for name in BAKED}
+    settings = " ".join(f"people.{name}={value}" for name, value in wanted.items())
+    make = f"make such graphs with python export/people_graph.py --out FOLDER --set {settings}"
+    make = f"{make}, and give people.graphs=FOLDER; or take --backend torch"
+    try:
+        made_for = dict(json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["layout"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"people.graphs: {folder} holds no graphs with their manifest.json; {make}") from None
+    if missing := [name for name in ("people_histograms.onnx", "people_scores.onnx") if not (folder / name).exists()]:
+        raise InputError(f"people.graphs: {folder} lacks {' and '.join(missing)}; {make}")
+    if wrong := [name for name in BAKED if made_for.get(name) != wanted[name]]:
+        differences = ", ".join(f"people.{name} = {made_for.get(name)}, not {wanted[name]}" for name in wrong)
+        raise InputError(f"the graphs in {folder} are made for {differences}; {make}")
+    return folder
 
 
-def opened(path: Path, knobs: PeopleKnobs) -> Any:
-    """An ONNX Runtime session of a graph, on one thread.
-
-    Raises InputError where the graph is not there, or has another layout baked in than the knobs.
-    """
+def opened(path: Path) -> Any:
+    """An ONNX Runtime session of a graph, on one thread."""
     import onnxruntime
 
-    make = "python export/people_graph.py --set people.cell_px=... --out FOLDER, then people.graphs=FOLDER"
-    if not path.exists():
-        raise InputError(f"no graph {path}; make it with {make}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    made_for = session.get_modelmeta().custom_metadata_map
-    wrong = [name for name in BAKED if made_for.get(name) != str(int(getattr(knobs, name)))]
-    if wrong:
-        raise InputError(
-            f"the graph {path.name} is made for "
-            + ", ".join(f"people.{name} = {made_for.get(name)}" for name in wrong)
-            + ", not "
-            + ", ".join(f"{int(getattr(knobs, name))}" for name in wrong)
-            + f"; take --backend torch, or make one: {make}"
-        )
-    return session
+    options.enable_mem_pattern = False  # it keeps a plan for every size of a level, which is no quicker and takes 9 MB
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def bordered(level: np.ndarray, part: Part) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Arrays that are used again: fresh ones of this size cost page faults, which took a fifth of the time onboard."""
+"""Large arrays in small memory: pieces of them, and arrays that are used again, as fresh ones cost page faults."""
 
 import math
 
@@ -18,3 +18,9 @@ class Scratch:
         if held is None or held.size < size or held.dtype != dtype:
             held = self.held[name] = np.empty(size, dtype)
         return held[:size].reshape(shape)
+
+
+def spans(length: int, most: int) -> list[tuple[int, int]]:
+    """(begin, end) of the fewest stretches, of about equal length, that make up the whole."""
+    count = -(-length // most)
+    return [(length * i // count, length * (i + 1) // count) for i in range(count)]

@@ -1,0 +1,127 @@
+"""The graphs of people's scores: the shipped ones are what the script makes, and compute what `ops.hog` does."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("torch")
+
+import onnx
+import onnxruntime
+import torch
+
+from export import people_graph as script
+from torchvision_dddas.ops import hog
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.sources.classifiers import read_classifier
+from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.vision import Part, load_recognizer
+from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
+
+NAMES = "people.onnx", "people_histograms.onnx", "people_scores.onnx"
+LAYOUTS = {
+    "default": hog.Layout(),
+    "small": hog.Layout((32, 64), 4, 8, 4, 8),
+    "signed, no gamma": hog.Layout((64, 64), 8, 16, 8, 18, signed=True, gamma=False),
+    "blocks of nine cells, apart": hog.Layout((60, 90), 5, 15, 15),
+    "one cell a block": hog.Layout((48, 48), block=8),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_graphs_of_any_layout_score_as_torch_does(layout):
+    assert script.largest_difference(script.graphs(layout), layout) < 3e-5
+
+
+def test_the_same_layout_gives_the_same_bytes():
+    first, again = (script.graphs(hog.Layout()) for _ in range(2))
+    assert first == again and tuple(first) == NAMES
+    assert all(first[name] != content for name, content in script.graphs(hog.Layout(bins=8)).items())
+
+
+def test_the_shipped_graphs_are_those_that_the_script_makes():
+    """Node by node: the bytes may differ with the versions of onnx."""
+    for name, content in script.graphs(hog.Layout()).items():
+        shipped, made = onnx.load(SHIPPED / name), onnx.load_from_string(content)
+        assert list(shipped.graph.node) == list(made.graph.node)
+        for one, other in zip(shipped.graph.initializer, made.graph.initializer, strict=True):
+            # Windows and arcs come from functions whose last bit is the machine's.
+            wanted = onnx.numpy_helper.to_array(other)
+            np.testing.assert_allclose(onnx.numpy_helper.to_array(one), wanted, rtol=1e-6, atol=1e-12)
+
+
+def test_the_whole_graph_scores_a_picture_as_opencv_does():
+    random = np.random.default_rng(0)
+    image = cv2.resize(
+        random.integers(0, 256, (12, 10, 3)).astype(np.float32), (150, 190), interpolation=cv2.INTER_CUBIC
+    )
+    image = image.clip(0, 255).astype(np.uint8)
+    svm = read_classifier("opencv", 3780)
+    opencv = cv2.HOGDescriptor()
+    opencv.setSVMDetector(np.append(svm.weights, svm.bias).astype(np.float32))
+    places, wanted = (np.asarray(hit) for hit in opencv.detect(image, -1e9, (8, 8), (0, 0)))
+    found = whole_scores(image, svm.weights, svm.bias)
+    assert found.size == len(wanted)
+    np.testing.assert_allclose(found[places[:, 1] // 8, places[:, 0] // 8], wanted.ravel(), atol=2e-5, rtol=0)
+    grey = image[..., :1]
+    np.testing.assert_allclose(
+        whole_scores(grey, svm.weights, svm.bias),
+        whole_scores(np.repeat(grey, 3, axis=2), svm.weights, svm.bias),
+        atol=1e-6,
+    )
+
+
+def whole_scores(image: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:
+    bordered = np.atleast_3d(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101))
+    session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
+    arranged = hog.arranged(torch.from_numpy(weights), hog.Layout()).numpy()
+    feed = {"image": bordered, "weights": arranged, "bias": np.array(bias, np.float32)}
+    (found,) = session.run(None, {**feed, "clip": np.array(0.2, np.float32)})
+    return found
+
+
+def test_a_clip_of_one_lets_all_numbers_pass():
+    given = script.example(hog.Layout(), (8, 8), 3, 0)
+    session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
+    clipped, free = (session.run(None, {**given, "clip": np.array(clip, np.float32)})[0] for clip in (0.05, 1.0))
+    bordered = torch.from_numpy(given["image"]).permute(2, 0, 1)[None].float()
+    svm = torch.from_numpy(given["weights"]), torch.from_numpy(given["bias"])
+    wanted = hog.scores(hog.blocks(bordered, hog.Layout(clip=1.0)), *svm)[0].numpy()
+    np.testing.assert_allclose(free, wanted, atol=2e-5)
+    assert np.abs(clipped - free).max() > 0.01
+
+
+def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path, monkeypatch, capsys):
+    changed: dict[str, Any] = {"cell_px": 4, "block_px": 8, "block_stride_px": 4, "window_width_px": 32, "window_height_px": 64}
+    chosen = [f"people.{name}={value}" for name, value in changed.items()]
+    monkeypatch.setattr("sys.argv", ["people_graph.py", "--out", str(tmp_path / "own"), "--set", *chosen])
+    script.main()
+    assert "people_scores.onnx" in capsys.readouterr().out
+    manifest = json.loads((tmp_path / "own" / "manifest.json").read_text())
+    assert manifest["layout"]["cell_px"] == 4 and set(manifest["graphs"]) == set(NAMES)
+    knobs = PeopleKnobs(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
+    image = np.random.default_rng(1).integers(0, 256, (80, 70, 3), np.uint8)
+    weights = np.random.default_rng(2).normal(0, 0.05, math.prod((7, 15, 4, 9))).astype(np.float32)
+    svm = LinearSvm(weights, 0.1, "made up")
+    part = Part((70, 80), 0, 0, 70, 80)
+    ((onboard,),) = OnboardRecognizer(knobs, svm).scores([image], [[part]])
+    ((torch_scores,),) = load_recognizer("torch", knobs, svm).scores([image], [[part]])
+    assert onboard.shape == (3, 7)
+    np.testing.assert_allclose(onboard, torch_scores, atol=3e-5)
+
+
+def test_graphs_that_are_off_are_not_written(tmp_path: Path, monkeypatch):
+    with monkeypatch.context() as other:
+        other.setattr(hog, "SOFT_FIRST", 0.2)
+        made = script.graphs(hog.Layout())
+    monkeypatch.setattr("sys.argv", ["people_graph.py", "--out", str(tmp_path / "own")])
+    monkeypatch.setattr(script, "graphs", lambda _: made)
+    with pytest.raises(SystemExit, match="off torch's; nothing was written"):
+        script.main()
+    assert not (tmp_path / "own").exists()
