@@ -103,7 +103,7 @@ def opencv(clip: Clip, knobs: PeopleKnobs, every: int) -> dict[str, Curve]:
     print(f"{clip.name}: best of {len(tried)} on {len(clip.every(every).frames)} frames: {best}", file=sys.stderr)
 
     def all_frames(setting: Setting) -> tuple[dict[int, Found], Curve]:
-        scored = people_opencv.scored(clip, setting.enlarge, setting.scale)
+        scored = people_opencv.scored(clip, setting.enlarge, setting.scale, setting.stride)
         raw = {n: people_opencv.rectangles(rows, clip.size, setting) for n, rows in scored.items()}
         suited = people_opencv.fitted(raw, clip, body)
         return raw, curve({n: people_opencv.shrunk(here, suited) for n, here in raw.items()}, clip)

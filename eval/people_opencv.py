@@ -41,7 +41,7 @@ def detector() -> "cv2.HOGDescriptor":
     return hog
 
 
-def windows(image: np.ndarray, enlarge: float, scale: float) -> np.ndarray:
+def windows(image: np.ndarray, enlarge: float, scale: float, stride: int = STRIDE) -> np.ndarray:
     """(N, 6) levelScale, width and height of the level, x, y and score of each window that scores -0.5 or more."""
     hog, rows, level_scale = detector(), [], 1.0
     picture = _enlarged(image, enlarge)
@@ -51,7 +51,7 @@ def windows(image: np.ndarray, enlarge: float, scale: float) -> np.ndarray:
         if size[0] < 64 or size[1] < 128:
             break
         level = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR_EXACT)
-        place, score = hog.detect(level, LEAST, (STRIDE, STRIDE), (PADDING, PADDING))
+        place, score = hog.detect(level, LEAST, (stride, stride), (PADDING, PADDING))
         if len(place):
             rows.append(np.column_stack([np.tile((level_scale, *size), (len(place), 1)), place, np.ravel(score)]))
         level_scale *= scale
@@ -86,12 +86,11 @@ def check(image: np.ndarray, setting: Setting) -> bool:
     return ours == sorted(tuple(row) for row in np.reshape(theirs, (-1, 4)).tolist())
 
 
-def scored(clip: Clip, enlarge: float, scale: float) -> dict[int, np.ndarray]:
+def scored(clip: Clip, enlarge: float, scale: float, stride: int = STRIDE) -> dict[int, np.ndarray]:
     """The windows of every frame."""
     with ThreadPoolExecutor(2) as pool:
-        return dict(
-            zip(clip.frames, pool.map(lambda image: windows(image, enlarge, scale), clip.frames.values()), strict=True)
-        )
+        each = pool.map(lambda image: windows(image, enlarge, scale, stride), clip.frames.values())
+        return dict(zip(clip.frames, each, strict=True))
 
 
 def shrunk(found: Found, shares: np.ndarray) -> Found:

@@ -359,11 +359,11 @@ class PeopleKnobs(Group):
     )
     group: int = knob(2, "windows", 0, 100, meaning="opencv: a group of no more windows than this is dropped")
     group_distance: float = knob(0.2, "-", 0, 1, meaning="opencv: edges this close, in box sizes, make a group")
-    height_share: float = knob(0.737, "-", 0.1, 1, meaning="body height over window height")
+    height_share: float = knob(0.738, "-", 0.1, 1, meaning="body height over window height")
     width_share: float = knob(0.5, "-", 0.1, 1, meaning="width of the body's box over window width")
     feet_share: float = knob(0.845, "-", 0.1, 1.2, meaning="from the window's top to the feet, over window height")
-    probability_slope: float = knob(2.0, "-", 0.01, 100, meaning="probability = 1 / (1 + exp(-slope (score - even)))")
-    probability_even: float = knob(0.5, "-", -10, 10, meaning="score at which a person is as likely as not")
+    probability_slope: float = knob(2.6, "-", 0.01, 100, meaning="probability = 1 / (1 + exp(-slope (score - even)))")
+    probability_even: float = knob(0.8, "-", -10, 10, meaning="score at which a person is as likely as not")
     search: Literal["everywhere", "regions"] = knob(
         "everywhere",
         "-",
