@@ -103,7 +103,9 @@ def main() -> None:
     wanted = trials()
     svms = classifiers(wanted, options, people)
     clips = [read(options.data / "association" / name, options.every) for name in CLIPS]
-    run(wanted, svms, clips, options)
+    clips = run(wanted, svms, clips, options)
+    if not clips:
+        sys.exit("no picture was seen by every setting; nothing was measured")
     print("\n".join(table(wanted, clips)))
     if options.plot:
         plot(wanted, clips, options.out / "people_study.png")
@@ -153,27 +155,44 @@ def run(
     svms: dict[tuple[str, tuple[int, int], int], LinearSvm],
     clips: list[Clip],
     options: argparse.Namespace,
-) -> None:
-    """Every setting on every picture, in turn."""
+) -> list[Clip]:
+    """Every setting on every picture, in turn; Ctrl-C ends it early. Returns the clips as far as they were seen."""
     recognizers = [
         TorchRecognizer(trial.knobs(options.step), svms[trial.classifier, trial.size, trial.block]) for trial in wanted
     ]
-    with progress("study", sum(len(clip.frames) for clip in clips), False) as tick:
-        for clip, number, image in [(each, *frame) for each in clips for frame in each.frames.items()]:
-            for trial, recognizer in zip(wanted, recognizers, strict=True):
-                knobs = recognizer.knobs
-                factor = knobs.height_share * knobs.window_height_px / options.body if trial.same else 1.0
-                begun = time.process_time()
-                shown = resized(image, factor)
-                size = shown.shape[1::-1]
-                parts = everywhere(size, knobs)
-                maps = recognizer.scores([shown], [parts])[0]
-                trial.seconds.append(time.process_time() - begun)
-                every = np.sort(np.concatenate([scores.ravel() for scores in maps]))
-                low = knobs.model_copy(update={"threshold": float(every[-MOST_WINDOWS:][0])})
-                found = people_of(*windows(parts, maps, size, low), size, low)
-                trial.found.setdefault(clip.name, {})[number] = (found.box_px / factor, found.margin)
-            tick()
+    try:
+        with progress("study", sum(len(clip.frames) for clip in clips), False) as tick:
+            for clip, number, image in [(each, *frame) for each in clips for frame in each.frames.items()]:
+                for trial, recognizer in zip(wanted, recognizers, strict=True):
+                    look(trial, recognizer, clip.name, number, image, options.body)
+                tick()
+    except KeyboardInterrupt:
+        print("stopped; what follows is of the pictures that every setting has seen", file=sys.stderr)
+    done = {clip.name: set(wanted[-1].found.get(clip.name, {})) for clip in clips}
+    for trial in wanted:
+        trial.found = {name: {n: trial.found[name][n] for n in sorted(seen)} for name, seen in done.items() if seen}
+        trial.seconds = trial.seconds[: sum(map(len, done.values()))]
+    return [
+        Clip(clip.name, {n: image for n, image in clip.frames.items() if n in done[clip.name]}, clip.truth)
+        for clip in clips
+        if done[clip.name]
+    ]
+
+
+def look(trial: Trial, recognizer: TorchRecognizer, clip: str, number: int, image: np.ndarray, smallest: float) -> None:
+    """One setting on one picture."""
+    knobs = recognizer.knobs
+    factor = knobs.height_share * knobs.window_height_px / smallest if trial.same else 1.0
+    begun = time.process_time()
+    shown = resized(image, factor)
+    size = shown.shape[1::-1]
+    parts = everywhere(size, knobs)
+    maps = recognizer.scores([shown], [parts])[0]
+    trial.seconds.append(time.process_time() - begun)
+    every = np.sort(np.concatenate([scores.ravel() for scores in maps]))
+    low = knobs.model_copy(update={"threshold": float(every[-MOST_WINDOWS:][0])})
+    found = people_of(*windows(parts, maps, size, low), size, low)
+    trial.found.setdefault(clip, {})[number] = (found.box_px / factor, found.margin)
 
 
 def resized(image: np.ndarray, factor: float) -> np.ndarray:
