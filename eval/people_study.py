@@ -162,7 +162,7 @@ def run(
     ]
     try:
         with progress("study", sum(len(clip.frames) for clip in clips), False) as tick:
-            for clip, number, image in [(each, *frame) for each in clips for frame in each.frames.items()]:
+            for clip, number, image in in_turn(clips):
                 for trial, recognizer in zip(wanted, recognizers, strict=True):
                     look(trial, recognizer, clip.name, number, image, options.body)
                 tick()
