@@ -208,7 +208,7 @@ def test_a_mistake_in_an_option_is_one_line_and_leaves_no_folder(dddas, stub, cl
 
 def test_a_picture_smaller_than_the_window_names_both_sizes_and_what_to_do(dddas, stub, clip, tmp_path):
     said = bad(dddas("people", clip, "--out", tmp_path / "out"))
-    assert "64 x 48 px" in said and "64 x 128 px" in said and "people.enlarge" in said
+    assert str(clip) in said and "64 x 48 px" in said and "64 x 128 px" in said and "people.enlarge" in said
     assert not (tmp_path / "out").exists()
     assert dddas("people", clip, "--set", "people.enlarge=3", "--out", tmp_path / "out", "--quiet").exit_code == 0
 

@@ -101,7 +101,10 @@ def people_into(
         source = open_source(clip, rate_hz=rate_hz, single=True)
         if table is not None:
             within_clip(table, source)
-        levels(source.size, settings.people)  # that one fits is better said before the engine is loaded
+        try:
+            levels(source.size, settings.people)  # whether one fits is better said before the engine is loaded
+        except InputError as error:
+            raise InputError(f"{source.name}: {error}") from None
         engine = recognizer()
         facts = {
             "input": clip,
