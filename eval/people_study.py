@@ -179,6 +179,12 @@ def run(
     ]
 
 
+def in_turn(clips: list[Clip]) -> list[tuple[Clip, int, np.ndarray]]:
+    """All pictures, those of the clips mixed, so that an early end leaves some of each."""
+    every = [(i / len(clip.frames), clip, *frame) for clip in clips for i, frame in enumerate(clip.frames.items())]
+    return [(clip, number, image) for _, clip, number, image in sorted(every, key=lambda row: row[0])]
+
+
 def look(trial: Trial, recognizer: TorchRecognizer, clip: str, number: int, image: np.ndarray, smallest: float) -> None:
     """One setting on one picture."""
     knobs = recognizer.knobs
