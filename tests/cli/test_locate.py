@@ -158,6 +158,7 @@ def test_a_table_without_rows_gives_empty_tables(dddas, file, tmp_path):
         (CAMERA, ["--poses", "poses"], "cover frames 1 to 2; 2 of 6 rows of the table lie outside"),
         (CAMERA, ["--poses", "poses", "--poses", "poses"], "1 tables and 2 files of poses"),
         (CAMERA, ["--poses", "timed"], "are by time_s; say with --rate"),
+        (CAMERA, ["--poses", "timed", "--rate", 0], "a frame rate of 0.0 per second will not do"),
         (CAMERA, ["--set", "ground.body_height_m=9"], "ground.body_height_m"),
     ],
 )

@@ -51,6 +51,14 @@ def test_the_distortion_of_opencv_is_undone():
     assert np.allclose(seen(boxes(PEOPLE, 1.75, cam), cam).east_north_m, PEOPLE, atol=5e-3)
 
 
+def test_a_pixel_that_the_lens_cannot_fill_has_no_ray():
+    cam = camera(focal_px=(500.0, 500.0), k1=-0.3)
+    box = np.array([[600.0, 400.0, 40.0, 160.0], [1200.0, 700.0, 60.0, 240.0]])
+    found = seen(box, cam)
+    assert found.by.tolist() == ["both", "bearing"]
+    assert np.isfinite(found.bearing_rad).tolist() == [True, False]
+
+
 def test_a_camera_turned_about_its_axis_is_levelled_by_the_foot_row():
     cam = camera(roll_rad=0.1, height_m=2.0, pitch_rad=0.15)
     box = boxes(PEOPLE, 1.75, cam)

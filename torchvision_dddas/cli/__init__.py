@@ -58,7 +58,7 @@ def main() -> None:
         # A word of the command line that will not do; Typer keeps the class of these errors to itself.
         if not hasattr(error, "format_message"):
             raise
-        if len(sys.argv) < 2:
+        if len(sys.argv) < 2 or not error.format_message():  # a group of commands, none of which was named
             error.show()  # type: ignore[attr-defined]
         else:
             typer.echo(f"dddas: {' '.join(error.format_message().split()).rstrip('.')}; see dddas --help", err=True)

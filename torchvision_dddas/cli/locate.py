@@ -66,6 +66,8 @@ def ground_into(
 
     if len(cameras) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
+    if rate_hz is not None and not 0 < rate_hz <= 1000:
+        raise InputError(f"a frame rate of {rate_hz} per second will not do; wanted more than 0, at most 1000")
     if poses and len(poses) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; wanted one --poses for each, or none")
     for table in tables:

@@ -134,15 +134,27 @@ def touches_border(box_px: Float[np.ndarray, "N 4"], size_px: tuple[int, int]) -
 
 
 def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels to (right, down) per metre of depth, without distortion and roll."""
+    """Pixels to (right, down) per metre of depth, without distortion and roll; NaN where the lens has no such pixel."""
     x, y = (u - camera.centre_px[0]) / camera.focal_px[0], (v - camera.centre_px[1]) / camera.focal_px[1]
     right, down = x, y
-    for _ in range(20 if camera.k1 or camera.k2 else 0):  # as OpenCV undoes it: each round gains a factor of k1 r²
-        r2 = right**2 + down**2
-        grown = 1 + camera.k1 * r2 + camera.k2 * r2**2
-        right, down = x / grown, y / grown
+    if camera.k1 or camera.k2:
+        right, down = _straight(x, y, camera)
     sine, cosine = np.sin(camera.roll_rad), np.cos(camera.roll_rad)
     return right * cosine - down * sine, right * sine + down * cosine
+
+
+def _straight(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Undo r -> r (1 + k1 r² + k2 r⁴) by Newton's steps on the radius."""
+    bent = np.hypot(x, y)
+    radius = bent.copy()
+    for _ in range(20):
+        slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
+        missing = bent - radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
+        # Beyond the radius where the lens folds the picture back nothing is seen twice.
+        radius = np.where(slope > 0.05, radius + missing / np.maximum(slope, 0.05), np.nan)
+    grown = 1 + camera.k1 * radius**2 + camera.k2 * radius**4
+    reached = np.abs(radius * grown - bent) < 1e-6
+    return np.where(reached, x / grown, np.nan), np.where(reached, y / grown, np.nan)
 
 
 def _inverse_distance(
