@@ -154,6 +154,13 @@ def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where
     assert all(look.share == 0 and look.parts == [] and len(look.regions_px) == 0 for n, look in made.items() if n > 1)
 
 
+def test_with_blobs_alone_nothing_else_is_searched_however_much_they_cover():
+    blobs = np.array([[x, y, 200, 150.0] for x in range(0, 640, 100) for y in range(0, 480, 100)])
+    look = Search(PeopleKnobs(), lambda n: blobs).look(1, SIZE)
+    assert len(look.regions_px) == len(blobs) and look.share > 0.3
+    assert set(look.parts) != set(scan.everywhere(SIZE, PeopleKnobs()))
+
+
 def test_with_blobs_and_regions_both_are_searched_and_the_whole_picture_at_first():
     blob = np.array([[400, 100, 50, 120.0]])
     made = looks(Search(KNOBS, lambda n: blob), lambda n: people(walker(n)), 12)

@@ -168,10 +168,10 @@ class Search:
         region_px, heights_px = self._regions(frame)
         parts, all_windows = scan.within(region_px, heights_px, size, self.knobs), scan.cost(everywhere, self.knobs)
         around = scan.cost(parts, self.knobs) / all_windows
-        if around > _DEAR:
-            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
         if not self.steered:
             return Look(parts, region_px, around)
+        if around > _DEAR:
+            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
         due = everywhere[self._turn() :: self.knobs.rescan_frames]
         levels = {part.level for part in due}
         parts = due + [part for part in parts if part.level not in levels]
