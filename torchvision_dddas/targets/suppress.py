@@ -5,6 +5,9 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+# A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.
+_WHOLE = 1 - 1e-9
+
 
 def nms(
     box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], overlap: float, contained: float = 1.0
@@ -26,7 +29,7 @@ def nms(
         rest = slice(i + 1, None)
         across = np.minimum(right[i], right[rest]) - np.maximum(x[i], x[rest])
         down = np.minimum(bottom[i], bottom[rest]) - np.maximum(y[i], y[rest])
-        shared = np.maximum(across, 0) * np.maximum(down, 0)
+        shared = np.maximum(across, 0) * np.maximum(down, 0) * _WHOLE
         left[rest] &= shared <= overlap * (area[i] + area[rest] - shared)
         left[rest] &= shared <= contained * np.minimum(area[i], area[rest])
     return order[np.array(kept, np.int64)]
