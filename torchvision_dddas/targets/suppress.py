@@ -94,20 +94,27 @@ def group(
     return mean[stays], best[stays]
 
 
-def _alike(box_px: np.ndarray, distance: float, rows: int = 512) -> np.ndarray:
+def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
     """(N,) the group of each box, numbered as they first appear."""
-    low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
+    order = np.argsort(box_px[:, 3], kind="stable")
+    box = box_px[order]
+    low, high, height, around = box[:, :2], box[:, :2] + box[:, 2:], box[:, 3], box[:, 2:].sum(axis=1)
+    # Top and bottom both near: no box is alike that is taller by more than twice what an edge may be off.
+    ends = np.searchsorted(height, height + distance * around, side="right")
     one, two = [], []
-    for start in range(0, len(box_px), rows):  # strips of the table of pairs, which may be large
+    for start in range(0, len(box), rows):  # strips of the table of pairs, which may be large
         here = slice(start, start + rows)
-        reach = distance * np.minimum(box_px[here, None, 2:], box_px[None, :, 2:]).sum(-1) * 0.5
-        near = (np.abs(low[here, None] - low[None]) <= reach[..., None]).all(-1)
-        near &= (np.abs(high[here, None] - high[None]) <= reach[..., None]).all(-1)
+        others = slice(start, int(ends[here].max()))
+        size = np.minimum(box[here, None, 2:], box[None, others, 2:])
+        reach = distance * (size[..., 0] + size[..., 1]) * 0.5
+        near = np.ones(reach.shape, bool)
+        for edge in (low[:, 0], low[:, 1], high[:, 0], high[:, 1]):
+            near &= np.abs(edge[here, None] - edge[None, others]) <= reach
         i, j = np.nonzero(near)
-        one.append(i + start)
-        two.append(j)
+        one.append(order[i + start])
+        two.append(order[j + start])
     i, j = np.concatenate(one), np.concatenate(two)
-    table = coo_array((np.ones(len(i), bool), (i, j)), shape=(len(box_px), len(box_px)))
+    table = coo_array((np.ones(len(i), bool), (i, j)), shape=(len(box), len(box)))
     label = connected_components(table, directed=False)[1]
     _, first, of_label = np.unique(label, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
