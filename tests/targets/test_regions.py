@@ -157,7 +157,8 @@ def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where
 def test_with_blobs_alone_nothing_else_is_searched_however_much_they_cover():
     blobs = np.array([[x, y, 200, 150.0] for x in range(0, 640, 100) for y in range(0, 480, 100)])
     look = Search(PeopleKnobs(), lambda n: blobs).look(1, SIZE)
-    assert len(look.regions_px) == len(blobs) and look.share > 0.3
+    assert look.regions_px is not None and len(look.regions_px) == len(blobs)
+    assert look.share > 0.3
     assert set(look.parts) != set(scan.everywhere(SIZE, PeopleKnobs()))
 
 
