@@ -111,6 +111,14 @@ def test_two_cameras_give_the_fused_places_and_what_each_alone_says(dddas, file,
     assert [row["camera"] for row in rows(out / "sightings.csv")][:4] == ["south", "south", "west", "west"]
 
 
+def test_cameras_of_one_name_are_told_apart(dddas, file, tmp_path):
+    table, toml = file("t.csv", tracks(camera(), frames=(1,))), file("c.toml", CAMERA + 'name = "left, low"\n')
+    words = ("--camera", toml, "--camera", toml, "--out", tmp_path / "out")
+    assert dddas("locate", "ground", table, table, *words).exit_code == 0
+    found = [row["camera"] for row in rows(tmp_path / "out/sightings.csv")]
+    assert found == ["left, low-1"] * 2 + ["left, low-2"] * 2
+
+
 def test_poses_move_the_camera(dddas, file, tmp_path):
     poses = file("p.csv", "frame,east_m,north_m\n1,100,0\n3,102,0\n")
     words = ("--camera", file("c.toml", CAMERA), "--poses", poses, "--out", tmp_path / "out")

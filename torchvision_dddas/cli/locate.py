@@ -85,7 +85,7 @@ def ground_into(
             "rows": [len(table) for table in read],
             "settings": settings.model_dump(),
         }
-        journal = output.begin(facts, tuple(kind.name for kind in kinds), found.origin_deg is not None)
+        journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), found.origin_deg is not None)
         with progress("locate", None, quiet) as tick:
             for frame in located(found, settings):
                 output.write(frame)
@@ -94,6 +94,11 @@ def ground_into(
             journal.notes.append("the tables have no rows: nobody to locate")
             journal.counts = {"people": 0, "sightings": journal.by, "notes": journal.notes}
     return journal
+
+
+def _told_apart(names: list[str]) -> tuple[str, ...]:
+    """The cameras' names, those that are alike numbered."""
+    return tuple(f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1))
 
 
 def summary(journal: "PositionJournal", folder: Path) -> list[str]:

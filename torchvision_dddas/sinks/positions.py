@@ -42,7 +42,7 @@ def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
         place = [*seen.east_north_m[i], covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]]
         rest = ",".join(_cell(v) for v in (seen.distance_m[i], math.degrees(seen.bearing_rad[i]), *place))
         lines.append(
-            f"{located.frame},{names[located.vehicle[i]]},{located.target[i]},{box},{located.score[i]:.6g},"
+            f"{located.frame},{_text(names[located.vehicle[i]])},{located.target[i]},{box},{located.score[i]:.6g},"
             f"{located.cut[i]:d},{seen.by[i]},{rest}\n"
         )
     return "".join(lines)
@@ -85,6 +85,11 @@ def _place(positions: Positions, row: int) -> list[str]:
     covariance = positions.covariance_m2[row]
     values = [*positions.east_north_m[row], covariance[0, 0], covariance[0, 1], covariance[1, 1]]
     return [_cell(v) for v in values]
+
+
+def _text(name: str) -> str:
+    """A name as a cell of a CSV."""
+    return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
 
 
 def _cell(value: float) -> str:
