@@ -129,6 +129,18 @@ def test_graphs_of_another_layout_are_refused_with_what_makes_them():
         OnboardRecognizer(PeopleKnobs(cell_px=4), read_classifier("opencv", 3780))
 
 
+@pytest.mark.parametrize(("x", "y"), [(-40, 8), (-200, -160), (136, 0), (176, 200), (-16, -300)])
+def test_a_part_that_reaches_out_of_the_picture_sees_it_reflected(x: int, y: int):
+    """Even one that lies beyond it altogether."""
+    image = picture(5, 180, 150)
+    border = 400
+    wide = cv2.copyMakeBorder(image, border, border, border, border, cv2.BORDER_REFLECT_101)
+    found = scored(image, Part((150, 180), x, y, 72, 144))
+    wanted = scored(wide, Part(wide.shape[1::-1], border + x, border + y, 72, 144))
+    assert found.shape == (3, 2)
+    np.testing.assert_allclose(found, wanted, atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize("manifest", [None, "", "[]", '{"graphs": {}}', '{"layout": null}'])
 def test_a_folder_without_graphs_is_refused(tmp_path: Path, manifest: str | None):
     if manifest is not None:
