@@ -26,7 +26,7 @@ def knobs(**changed) -> PeopleKnobs:
 @pytest.fixture(scope="module")
 def hog():
     detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
     return detector
 
 

@@ -98,7 +98,7 @@ def scored():
         cv2.ellipse(image, (x, 130), (16, 50), 0, 0, 360, (240, 240, 240), -1)
         cv2.circle(image, (x, 70), 10, (240, 240, 240), -1)
     detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
     return image, detector
 
 
