@@ -31,7 +31,7 @@ BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 # Side of a tile: its 16 maps take 0.7 MB, which should stay in a core's cache, and its neighbours' blocks overlap it.
 _TILE_PX = 104
 # Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
-_GRADIENT_PX = 200_000
+_GRADIENT_PX = 160_000
 _BLOCKS = 5_000
 
 
@@ -93,9 +93,9 @@ class OnboardRecognizer:
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
-        channels = np.atleast_3d(bordered(level, part))[..., :3].transpose(2, 0, 1)
-        planes = self._gradient.scratch("planes", channels.shape, np.uint8)
-        np.copyto(planes, channels)
+        channels = 1 if level.ndim == 2 else 3
+        planes = self._gradient.scratch("planes", (channels, part.height + 2, part.width + 2), np.uint8)
+        fill(planes, level, part)
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
         common = math.gcd(stride, knobs.block_stride_px)
         phases, every = knobs.block_stride_px // common, stride // common
@@ -177,21 +177,25 @@ def opened(path: Path) -> Any:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def bordered(level: np.ndarray, part: Part) -> np.ndarray:
-    """A part with one pixel more on each side: its neighbours in the level, which is reflected beyond its own edge."""
+def fill(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
+    """Channels (C, H + 2, W + 2) of a part with one pixel more on each side.
+
+    That is its neighbour in the level, which is reflected beyond its own edge.
+    """
     width, height = part.level
     left, top = max(0, 1 - part.x), max(0, 1 - part.y)
     right = max(0, part.x + part.width + 1 - width)
     bottom = max(0, part.y + part.height + 1 - height)
+    _, rows, columns = planes.shape
     x, y = part.x - 1 + left, part.y - 1 + top
-    inside = level[y : max(y, y + part.height + 2 - top - bottom), x : max(x, x + part.width + 2 - left - right)]
-    if not (left or top or right or bottom):
-        return inside
-    if max(left, right) < inside.shape[1] and max(top, bottom) < inside.shape[0]:
-        return cv2.copyMakeBorder(inside, top, bottom, left, right, cv2.BORDER_REFLECT_101)
-    # More border than there is of the part to reflect.
-    whole = cv2.copyMakeBorder(level, top, bottom, left, right, cv2.BORDER_REFLECT_101)
-    return whole[y : y + part.height + 2, x : x + part.width + 2]
+    if max(left, right) >= columns - left - right or max(top, bottom) >= rows - top - bottom:
+        # More border than there is of the part to reflect.
+        level = cv2.copyMakeBorder(level, top, bottom, left, right, cv2.BORDER_REFLECT_101)
+        left = top = right = bottom = 0
+    inside = level[y : y + rows - top - bottom, x : x + columns - left - right]
+    for channel, plane in enumerate(planes):
+        held = inside if level.ndim == 2 else cv2.extractChannel(inside, channel)
+        cv2.copyMakeBorder(held, top, bottom, left, right, cv2.BORDER_REFLECT_101, dst=plane)
 
 
 def arranged(svm: LinearSvm, knobs: PeopleKnobs) -> np.ndarray:
