@@ -8,7 +8,7 @@ them all. A ratio is the median over the turns of a chain's time through the ref
 processor's time, over all threads, is told as well. Regions are three of 192x256 px, as a pass for moving targets
 might give: `rectangles` has windows inside them at every level, `regions` windows whose body lies inside, `regions
 blobs` these for bodies of a third to 1.3 times a blob of 150 px, `regions tracked` for bodies of 150 px up to a factor
-of 1.3. `whole graph` is people.onnx, a level at a time on all threads, without what the onboard back end does besides.
+of 1.3. `whole graph` is people.onnx on levels that threads share, without what the onboard back end does besides.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from torchvision_dddas.sources import open_source
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan
 from torchvision_dddas.vision import Part, load_recognizer
-from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
+from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer, opened
 
 KNOBS = PeopleKnobs(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
 SVM = read_classifier("opencv", 3780)
@@ -98,16 +99,16 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
 
 
 def whole_graph(parts: list[Part]) -> Callable[[np.ndarray], object]:
-    """people.onnx on every level."""
-    session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
-    svm = OnboardRecognizer(KNOBS, SVM).svm_feed
+    """people.onnx on every level, shared among as many threads as OpenCV takes."""
+    session, svm = opened(SHIPPED / "people.onnx"), OnboardRecognizer(KNOBS, SVM).svm_feed
+    threads = ThreadPoolExecutor(cv2.getNumThreads())
 
-    def scored(image: np.ndarray) -> list[np.ndarray]:
-        levels = (cv2.resize(image, part.level, interpolation=cv2.INTER_LINEAR_EXACT) for part in parts)
-        edged = (cv2.copyMakeBorder(level, 1, 1, 1, 1, cv2.BORDER_REFLECT_101) for level in levels)
-        return [session.run(None, {"image": level, **svm})[0] for level in edged]
+    def scored(image: np.ndarray, part: Part) -> np.ndarray:
+        level = cv2.resize(image, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
+        edged = cv2.copyMakeBorder(level, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
+        return session.run(None, {"image": edged, **svm})[0]
 
-    return scored
+    return lambda image: list(threads.map(lambda part: scored(image, part), parts))
 
 
 def main() -> None:

@@ -14,9 +14,10 @@ The first is the whole score map for any ONNX runtime. The onboard back end runs
 tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
 of the same cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
 
-The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 280 ns a pixel on
-one core where people.onnx takes 110 and people_histograms.onnx 15, as ONNX Runtime has quick convolutions and slow
-copies. They are written once their scores are torch's to 5e-5; the same versions write the same bytes.
+The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 160 ns a pixel on
+one core at 640x480 where people.onnx takes 110 and people_histograms.onnx 14 (cv2.HOGDescriptor all in all 54), as ONNX
+Runtime has quick convolutions and slow copies. They are written once their scores are torch's to 5e-5; the same versions
+write the same bytes.
 Name a folder of your own to the onboard back end by `--set people.graphs=FOLDER`.
 """
 
