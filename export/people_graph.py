@@ -16,8 +16,8 @@ of the same cells, blocks and bins runs on them, with windows of any size: `weig
 
 The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 160 ns a pixel on
 one core at 640x480 where people.onnx takes 110 and people_histograms.onnx 14 (cv2.HOGDescriptor all in all 54), as ONNX
-Runtime has quick convolutions and slow copies. They are written once their scores are torch's to 5e-5; the same versions
-write the same bytes.
+Runtime has quick convolutions and slow copies. They are written once their scores are torch's to 5e-5; the same
+versions write the same bytes.
 Name a folder of your own to the onboard back end by `--set people.graphs=FOLDER`.
 """
 
