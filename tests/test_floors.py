@@ -25,7 +25,7 @@ FLOORS: dict[str, set[str]] = {
     # Labelling stays in OpenCV for every runtime: hence cv2 here.
     "targets": {"numpy", "scipy", "cv2", "pymap3d", "types", "settings", "errors"},
     "targets.scan": {"numpy", "vision.protocol", "types", "settings", "errors"},
-    "targets.regions": {"numpy", "scipy", "targets.scan", "vision.protocol", "types", "settings"},
+    "targets.regions": {"numpy", "targets.scan", "vision.protocol", "types", "settings"},
     "vision": {"numpy", "targets.projective", "types", "settings", "errors"},
     "vision.torch_vision": {"torch", "numpy", "cv2", "ops", "types", "settings", "errors"},
     "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},

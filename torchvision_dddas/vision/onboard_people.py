@@ -32,7 +32,7 @@ BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 _TILE_PX = 104
 # Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
 _GRADIENT_PX = 160_000
-_BLOCKS = 5_000
+_BLOCKS = 2_500
 
 
 class OnboardRecognizer:
