@@ -112,11 +112,12 @@ def plot(curves: dict[str, dict[str, Curve]], path: Path) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, len(curves), figsize=(6 * len(curves), 4.5), squeeze=False)
+    figure, axes = plt.subplots(1, len(curves), figsize=(6 * len(curves), 6), squeeze=False)
     ticks = [0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1]
     for axis, (name, lines) in zip(axes[0], curves.items(), strict=True):
         for label, line in lines.items():
-            text = f"{label}: recall {line.recall_at(1):.3f} at 1"
+            who, _, how = label.partition(": ")
+            text = f"{who}: recall {line.recall_at(1):.3f} at 1" + (f"\n({how})" if how else "")
             axis.plot(np.maximum(line.false, 5e-3), 1 - line.recall, label=text, drawstyle="steps-post")
         axis.axvline(1, color="k", ls=":", lw=1)
         axis.set(title=name, xlabel="false positives an image", ylabel="miss rate", xscale="log", yscale="log")
@@ -124,6 +125,6 @@ def plot(curves: dict[str, dict[str, Curve]], path: Path) -> None:
         axis.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
