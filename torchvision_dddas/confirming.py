@@ -11,6 +11,7 @@ from torchvision_dddas.sources.cameras import PoseTable, poses_at
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets.collaboration import Beliefs, Look, View, confirm_boxes, look, view_of
 from torchvision_dddas.targets.geodesy import east_north
+from torchvision_dddas.targets.scan import smallest_body_px
 from torchvision_dddas.types import Camera, Confirmed, Positions
 
 
@@ -69,7 +70,7 @@ def confirm_pictures(
 ) -> Iterator[Confirmed]:
     """Blobs and people of the same pictures, as `dddas people` found them at frames 1, 1 + interval, ..."""
     knobs = settings.people
-    least_px = knobs.height_share * knobs.window_height_px / knobs.enlarge
+    least_px = smallest_body_px(knobs)
     aspect = knobs.width_share * knobs.window_width_px / (knobs.height_share * knobs.window_height_px)
 
     def looks(frame: int, rows: slice) -> Iterator[tuple[str, Look]]:

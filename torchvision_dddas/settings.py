@@ -330,12 +330,12 @@ class PeopleKnobs(Group):
         "-",
         1,
         4,
-        meaning="the pyramid begins with the picture so many times larger: bodies are found from height_share x "
-        "window_height_px / enlarge, 63 px; the cost grows with its square",
+        meaning="the pyramid begins with the picture so many times larger, in whole scale steps: bodies are found from "
+        "height_share x window_height_px / enlarge, 64 px; the cost grows with its square",
     )
     max_levels: int = knob(64, "levels", 1, 200, meaning="levels of the pyramid at most")
     padding_px: int = knob(24, "px", 0, 256, meaning="border that each level is given by reflection, for people at it")
-    threshold: float = knob(0.1, "-", -10, 10, meaning="a window whose score is above it may be a person")
+    threshold: float = knob(0.0, "-", -10, 10, meaning="a window whose score is above it may be a person")
     suppression: Literal["nms", "opencv", "none"] = knob(
         "nms",
         "-",

@@ -121,8 +121,8 @@ class People:
 class Recognized:
     """All that is known of one frame after it was searched for people.
 
-    frame: the picture. people: whom it shows. regions_px: (R, 4) where it was searched, beside the levels of the pyramid
-    whose turn it was; None: everywhere.
+    frame: the picture. people: whom it shows. regions_px: (R, 4) where it was searched, beside the levels of the
+    pyramid whose turn it was; None: everywhere.
     share: windows scored, as a share of all that a search everywhere scores.
     cause: why nothing could be concluded; empty where all is well. adjustments, seconds: as in Scene.
     """

@@ -69,11 +69,23 @@ def test_levels_and_windows_are_those_of_opencv(hog, picture, changed):
 
 def test_enlarged_pyramids_begin_with_a_larger_picture_and_end_at_the_window():
     found = scan.levels(SIZE, knobs(enlarge=2.0))
-    assert found[0] == scan.Level((360, 440), 0.5)
+    assert found[0].scale == pytest.approx(1.05**-14) and 1.05**14 <= 2 < 1.05**15
     assert all(a.scale * 1.05 == pytest.approx(b.scale) for a, b in pairwise(found))
     last = found[-1].size
     assert last[0] >= 64 and last[1] >= 128
     assert min(last[0] / 64, last[1] / 128) < 1.05
+
+
+def test_the_levels_that_opencv_has_are_among_those_of_an_enlarged_pyramid():
+    plain = [level.size for level in scan.levels(SIZE, knobs())]
+    for enlarge in (1.0, 1.04, 1.5, 2.0, 3.7):
+        found = [level.size for level in scan.levels(SIZE, knobs(enlarge=enlarge))]
+        assert found[-len(plain) :] == plain
+
+
+def test_padding_is_raised_to_where_windows_and_blocks_lie():
+    assert [scan.everywhere(SIZE, knobs(padding_px=pad))[0].x for pad in (0, 1, 8, 20)] == [0, -8, -8, -24]
+    assert scan.everywhere(SIZE, knobs(padding_px=3, window_stride_px=6))[0].x == -4
 
 
 def test_levels_end_after_as_many_as_asked_for():

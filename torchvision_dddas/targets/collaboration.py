@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchvision_dddas.settings import ConfirmKnobs, GroundKnobs, PeopleKnobs
+from torchvision_dddas.targets.scan import smallest_body_px
 from torchvision_dddas.types import Camera
 
 HUMAN, NOT_HUMAN, UNSEEN = "human", "not_human", "unseen"
@@ -44,7 +45,7 @@ def view_of(
 ) -> View:
     """The view of a camera that stands at a place, by the body heights in pixels that the people settings can find."""
     height_m, (width_px, height_px) = ground.body_height_m, camera.size_px
-    least_px = people.height_share * people.window_height_px / people.enlarge
+    least_px = smallest_body_px(people)
     aside_px = min(camera.centre_px[0] + 0.5, width_px - 0.5 - camera.centre_px[0])
     return View(
         np.asarray(east_north_m, float),
@@ -93,7 +94,8 @@ def look(
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
     blob_m2, person_m2 = (_known(covariance, knobs) for covariance in (blob_m2, person_m2))
     apart = person_m[None] - blob_m[:, None]
-    both = blob_m2[:, None] + person_m2[None] + knobs.spread_m**2 * np.eye(2)
+    # A millimetre at least: where nothing is unsure, no distance could be told in standard deviations.
+    both = blob_m2[:, None] + person_m2[None] + max(knobs.spread_m, 1e-3) ** 2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
     inside = sigmas <= math.sqrt(-2 * math.log(1 - knobs.gate_probability))  # chi-square of two degrees of freedom
     people, best = _assigned(sigmas, inside, score, knobs)
@@ -217,7 +219,9 @@ def _well_within(blob_m: np.ndarray, blob_m2: np.ndarray, view: View, knobs: Con
     along = apart / distance[:, None]
     across = np.stack([along[:, 1], -along[:, 0]], axis=1)
     spread = blob_m2 + view.position_sigma_m**2 * np.eye(2)
-    radial, lateral = (np.sqrt(np.einsum("ni,nij,nj->n", axis, spread, axis)) for axis in (along, across))
+    # Rounded covariances may be a little below 0 along an axis.
+    variances = (np.einsum("ni,nij,nj->n", axis, spread, axis) for axis in (along, across))
+    radial, lateral = (np.sqrt(np.maximum(variance, 0)) for variance in variances)
     bearing = np.arctan2(along[:, 0], along[:, 1]) - view.heading_rad
     off = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
     angle = np.hypot(np.arctan2(lateral, distance), view.heading_sigma_rad)

@@ -4,6 +4,7 @@ Levels and windows are those of OpenCV's `HOGDescriptor::detectMultiScale`, so t
 around what is expected, have the scores of a search everywhere.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,12 +27,13 @@ class Level:
 def levels(size: tuple[int, int], knobs: PeopleKnobs) -> list[Level]:
     """The levels of a picture of (width, height) px, largest first; they end where the window no longer fits.
 
-    A level of the same rounded size as the one before is left out: it shows nothing new.
+    The picture itself is one of them, so that all that OpenCV's levels show is seen; those before it are the enlarged
+    ones. A level of the same rounded size as the one before is left out: it shows nothing new.
     Raises InputError if not even the first holds a window.
     """
     width, height = knobs.window_width_px, knobs.window_height_px
     found: list[Level] = []
-    scale = 1 / knobs.enlarge
+    scale = first = 1 / enlarged(knobs)
     for _ in range(knobs.max_levels):
         level = round(size[0] / scale), round(size[1] / scale)
         if level[0] < width or level[1] < height:
@@ -41,15 +43,31 @@ def levels(size: tuple[int, int], knobs: PeopleKnobs) -> list[Level]:
         scale *= knobs.scale_step
     if not found:
         raise InputError(
-            f"a picture of {size[0]} x {size[1]} px, enlarged {knobs.enlarge:g} times, is smaller than the window of "
+            f"a picture of {size[0]} x {size[1]} px, enlarged {1 / first:.3g} times, is smaller than the window of "
             f"{width} x {height} px; give a larger picture, or raise people.enlarge"
         )
     return found
 
 
+def enlarged(knobs: PeopleKnobs) -> float:
+    """How many times larger than the picture the first level is: whole scale steps, `people.enlarge` at most."""
+    return float(knobs.scale_step ** np.floor(np.log(knobs.enlarge) / np.log(knobs.scale_step) + 1e-9))
+
+
+def smallest_body_px(knobs: PeopleKnobs) -> float:
+    """Height of the smallest body that a pyramid shows, in the picture's pixels."""
+    return knobs.height_share * knobs.window_height_px / enlarged(knobs)
+
+
+def _padding(knobs: PeopleKnobs) -> int:
+    """Of each level, in px: raised to a multiple of what windows and blocks lie on, as OpenCV does."""
+    grid = math.gcd(knobs.window_stride_px, knobs.block_stride_px)
+    return -(-knobs.padding_px // grid) * grid
+
+
 def everywhere(size: tuple[int, int], knobs: PeopleKnobs) -> list[Part]:
     """Every level as one part, with its padding."""
-    pad = knobs.padding_px
+    pad = _padding(knobs)
     return [
         Part(level.size, -pad, -pad, level.size[0] + 2 * pad, level.size[1] + 2 * pad) for level in levels(size, knobs)
     ]
@@ -131,9 +149,10 @@ def _span(region: np.ndarray, level: Level, knobs: PeopleKnobs) -> _Span | None:
     low = region[:2] / level.scale - (side, above)
     high = (region[:2] + region[2:]) / level.scale + (side, below) - (width, height)
     high = np.maximum(low, high)  # a region smaller than the body still has the window that begins with it
-    last = (np.array(level.size) + 2 * knobs.padding_px - (width, height)) // stride
-    begin = np.floor((low + knobs.padding_px) / stride).astype(int)
-    end = np.ceil((high + knobs.padding_px) / stride).astype(int)
+    pad = _padding(knobs)
+    last = (np.array(level.size) + 2 * pad - (width, height)) // stride
+    begin = np.floor((low + pad) / stride).astype(int)
+    end = np.ceil((high + pad) / stride).astype(int)
     if (end < 0).any() or (begin > last).any():
         return None
     begin, end = np.maximum(begin, 0), np.minimum(end, last)
@@ -168,7 +187,7 @@ def _merged(spans: list[_Span], knobs: PeopleKnobs) -> list[_Span]:
 
 
 def _part(span: _Span, level: Level, knobs: PeopleKnobs) -> Part:
-    stride, pad = knobs.window_stride_px, knobs.padding_px
+    stride, pad = knobs.window_stride_px, _padding(knobs)
     return Part(
         level.size,
         span[0] * stride - pad,
