@@ -98,7 +98,13 @@ def test_a_clip_of_one_lets_all_numbers_pass():
 
 
 def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path, monkeypatch, capsys):
-    changed: dict[str, Any] = {"cell_px": 4, "block_px": 8, "block_stride_px": 4, "window_width_px": 32, "window_height_px": 64}
+    changed: dict[str, Any] = {
+        "cell_px": 4,
+        "block_px": 8,
+        "block_stride_px": 4,
+        "window_width_px": 32,
+        "window_height_px": 64,
+    }
     chosen = [f"people.{name}={value}" for name, value in changed.items()]
     monkeypatch.setattr("sys.argv", ["people_graph.py", "--out", str(tmp_path / "own"), "--set", *chosen])
     script.main()
