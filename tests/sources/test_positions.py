@@ -7,6 +7,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.positions import read_positions
 
 HEADER = "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,score"
+PLACES = "frame,target,east_m,north_m,longitude_deg,latitude_deg"
 
 
 @pytest.fixture
@@ -29,9 +30,18 @@ def test_rows_are_sorted_by_frame_and_unknown_covariances_are_nan(table):
 
 
 def test_the_places_alone_are_enough(table):
-    found = read_positions(table("frame,target,east_m,north_m,longitude_deg,latitude_deg\n1,1,0,0,10,50\n"))
+    found = read_positions(table(PLACES + "\n1,1,0,0,10,50\n"))
     assert np.isnan(found.covariance_m2).all() and found.score.tolist() == [1]
     assert found.lonlat_deg is not None and found.lonlat_deg.tolist() == [[10, 50]]
+
+
+def test_degrees_that_no_row_has_are_none(table):
+    assert read_positions(table(PLACES + "\n1,1,0,0,,\n")).lonlat_deg is None
+
+
+def test_a_covariance_of_a_line_survives_its_rounding(table):
+    # Written with four decimals, as `dddas locate` does, 9.9999 * 0.0001 is a little less than 0.0317 squared.
+    assert len(read_positions(table(HEADER + "\n1,1,0,0,9.9999,0.0317,0.0001,1\n"))) == 1
 
 
 def test_a_table_without_rows_is_valid(table):
@@ -45,8 +55,15 @@ def test_a_table_without_rows_is_valid(table):
         ("", "its columns are none"),
         (HEADER + "\n1,1,x,0,1,0,1,1\n", "line 2: east_m is 'x'; wanted a finite number"),
         (HEADER + "\n1,1,0,inf,1,0,1,1\n", "line 2: north_m is 'inf'"),
-        (HEADER + "\n0,1,0,0,1,0,1,1\n", "line 2: frame is '0'; wanted a whole number, 1 or more"),
+        (HEADER + "\n0,1,0,0,1,0,1,1\n", "line 2: frame is '0'; wanted a whole number, 1 to 10000000"),
         (HEADER + "\n1,1.5,0,0,1,0,1,1\n", "line 2: target is '1.5'"),
+        (HEADER + "\n1e300,1,0,0,1,0,1,1\n", "line 2: frame is '1e300'"),
+        (HEADER + "\n1,1,1e300,0,1,0,1,1\n", "line 2: east_m is '1e300'; wanted -1e.09 to 1e.09"),
+        (HEADER + "\n2,1,0,0,1,0,1,1\n1,1,0,0,-1,0,1,1\n", "line 3: -1, 0, 1 are no variances"),
+        (HEADER + "\n1,1,0,0,1,5,1,1\n", "line 2: 1, 5, 1 are no variances"),
+        (HEADER + ",frame\n1,1,0,0,1,0,1,1,1\n", "column frame is named twice"),
+        (PLACES + "\n1,1,0,0,10,95\n", "line 2: latitude_deg is '95'; wanted -90 to 90"),
+        (PLACES + "\n2,1,0,0,10,50\n1,1,0,0,,\n", "line 3: no longitude_deg or latitude_deg, which other rows"),
         (HEADER + "\n1,1,0,0\n", "line 2: 4 columns; the first line names 8"),
     ],
 )

@@ -7,19 +7,27 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.detections import LAST_FRAME
 from torchvision_dddas.types import Positions
 
 COLUMNS = ("frame", "target", "east_m", "north_m")
 COVARIANCE = ("var_east_m2", "cov_east_north_m2", "var_north_m2")
 DEGREES = ("longitude_deg", "latitude_deg")
 
+LIMITS = {"longitude_deg": 180.0, "latitude_deg": 90.0}
+"""How far from 0 they may be; any other number FARTHEST."""
+
+FARTHEST = 1e9
+"""No place, variance or score is larger."""
+
 
 def read_positions(path: str | Path) -> Positions:
     """Read COLUMNS, and where they are there COVARIANCE, DEGREES and `score`; others are ignored.
 
-    Rows may come in any order. An empty cell of a covariance is not known. A table without rows is valid.
-    Raises InputError with file and line: unreadable, a column missing, not a finite number, a frame or target that is
-    not whole and 1 or more.
+    Rows may come in any order. An empty cell of a covariance or score is not known. A table without rows is valid.
+    Raises InputError with file and line: unreadable, a column missing or named twice, not a finite number or out of
+    range (see LIMITS), a frame or target that is not whole and 1 or more, variances that are none, a longitude and
+    latitude that only some rows have.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -38,9 +46,12 @@ def _parse(lines: Iterable[str], path: str) -> Positions:
             f"positions {path} lacks {', '.join(missing)}; its columns are {', '.join(header) or 'none'}, "
             f"wanted {','.join(COLUMNS)}"
         )
+    if twice := [name for name in header if name and header.count(name) > 1]:
+        raise InputError(f"positions {path}: column {twice[0]} is named twice; wanted each name once")
     given = [name for name in (*COLUMNS, *COVARIANCE, *DEGREES, "score") if name in header]
     optional = {*COVARIANCE, *DEGREES, "score"}
     rows: list[list[float]] = []
+    lines_of: list[int] = []
     for cells in reader:
         if not any(cell.strip() for cell in cells):
             continue
@@ -50,18 +61,34 @@ def _parse(lines: Iterable[str], path: str) -> Positions:
             )
         row = [cells[header.index(name)].strip() for name in given]
         rows.append([_number(c, n, n in optional, path, reader.line_num) for c, n in zip(row, given, strict=True)])
+        lines_of.append(reader.line_num)
     table = np.array(rows, float).reshape(-1, len(given))
-    table = table[np.argsort(table[:, 0], kind="stable")]
+    order = np.argsort(table[:, 0], kind="stable")
+    table, at = table[order], np.array(lines_of, int)[order]
     column = dict(zip(given, table.T, strict=True))
     n, unknown = len(table), np.full(len(table), np.nan)
     east, both, north = (column.get(name, unknown) for name in COVARIANCE)
+    # Compared so that what is not known passes; a share more than 1 is left to rounding.
+    if (wrong := (east < 0) | (north < 0) | (both**2 > east * north * 1.01 + 1e-8)).any():
+        k = int(wrong.argmax())
+        raise InputError(
+            f"positions {path}, line {at[k]}: {east[k]:g}, {both[k]:g}, {north[k]:g} are no variances of one place; "
+            "wanted var_east_m2 and var_north_m2 of 0 or more, and cov_east_north_m2 squared below their product"
+        )
+    degrees = np.stack([column.get(name, unknown) for name in DEGREES], axis=1)
+    known = np.isfinite(degrees).all(axis=1)
+    if known.any() and not known.all():
+        raise InputError(
+            f"positions {path}, line {at[known.argmin()]}: no longitude_deg or latitude_deg, which other rows have; "
+            "wanted both in all rows, or leave the columns out"
+        )
     return Positions(
         column["frame"].astype(np.int64),
         column["target"].astype(np.int64),
         np.stack([column["east_m"], column["north_m"]], axis=1),
         np.stack([east, both, both, north], axis=1).reshape(n, 2, 2),
         column.get("score", np.ones(n)),
-        lonlat_deg=np.stack([column[name] for name in DEGREES], axis=1) if set(DEGREES) <= column.keys() else None,
+        lonlat_deg=degrees if set(DEGREES) <= column.keys() and known.all() else None,
     )
 
 
@@ -74,6 +101,10 @@ def _number(text: str, name: str, may_lack: bool, path: str, line: int) -> float
         value = np.nan
     if not np.isfinite(value):
         raise InputError(f"positions {path}, line {line}: {name} is '{text}'; wanted a finite number")
-    if name in ("frame", "target") and not (value >= 1 and value == int(value)):
-        raise InputError(f"positions {path}, line {line}: {name} is '{text}'; wanted a whole number, 1 or more")
+    if name in ("frame", "target"):
+        most = LAST_FRAME if name == "frame" else 2**53
+        if not (1 <= value <= most and value == int(value)):
+            raise InputError(f"positions {path}, line {line}: {name} is '{text}'; wanted a whole number, 1 to {most}")
+    elif abs(value) > (limit := LIMITS.get(name, FARTHEST)):
+        raise InputError(f"positions {path}, line {line}: {name} is '{text}'; wanted {-limit:g} to {limit:g}")
     return value
