@@ -84,6 +84,12 @@ def test_every_key_reaches_the_camera(toml):
         (LEAST + "latitude_deg = 3", "latitude_deg alone; wanted longitude_deg and latitude_deg"),
         (LEAST + "latitude_deg = 3\nlongitude_deg = 4\neast_m = 1\nnorth_m = 1", "in degrees or in metres"),
         (LEAST + "centre_px = [1, 2, 3]", r"centre_px is \[1, 2, 3\]; wanted \[u, v\]"),
+        (LEAST + "centre_px = [true, 3]", "centre_px is .*; wanted"),
+        (LEAST + "name = 3", "name is 3; wanted a text in quotes"),
+        (LEAST.replace("640", "640.5"), "width_px is 640.5; wanted a whole number"),
+        (LEAST + "k1 = 0x" + "f" * 9999, "k1 is far too large; wanted a number from -10 to 10"),
+        (LEAST + "k1 = " + "9" * 9999, "is no TOML: Exceeds the limit"),
+        (LEAST + "name = " + "[" * 5000, "its brackets go too deep"),
         ("focal_px == 3", "is no TOML"),
     ],
 )
@@ -100,6 +106,8 @@ def test_a_camera_that_is_not_there_is_named(tmp_path):
 
 def test_the_keys_of_a_camera_without_a_focal_length_can_be_read(toml):
     assert camera_keys(toml("width_px = 640")) == {"width_px": 640}
+    with pytest.raises(InputError, match="heading_deg is 500; wanted a number"):
+        camera_keys(toml("width_px = 640\nheading_deg = 500"))
 
 
 def test_a_camera_without_poses_stands_still(toml):
@@ -117,6 +125,12 @@ def test_poses_go_straight_on_between_samples_and_turn_the_shorter_way(toml, pos
     assert np.allclose(found.place, [[0, 0], [2, -1], [4, -2], [8, -4]])
     assert np.allclose(np.degrees(found.heading_rad) % 360, [350, 355, 0, 10])
     assert np.allclose(found.pitch_rad, np.radians(5))
+
+
+def test_poses_go_on_over_180_degrees_of_longitude(toml, poses):
+    table = read_poses(poses("frame,longitude_deg,latitude_deg\n1,179.9999,-17\n3,-179.9997,-17\n"))
+    _, found = poses_at(read_camera(toml(LEAST)), table, np.array([1, 2, 3]))
+    assert np.allclose(found.place[:, 0], [179.9999, -179.9999, -179.9997])
 
 
 def test_poses_by_time_need_a_rate(toml, poses):

@@ -27,6 +27,16 @@ def test_east_is_along_longitude_and_north_along_latitude():
     assert north[1] > 8e-5 > abs(north[0]) * 1e3
 
 
+@pytest.mark.parametrize("there_and_back", [(lonlat, east_north), (plain_lonlat, plain_east_north)])
+@pytest.mark.parametrize("origin", [(179.9999, -17.0), (-179.9999, 89.0)])
+def test_places_on_both_sides_of_180_degrees_are_neighbours(there_and_back, origin):
+    to_degrees, to_metres = there_and_back
+    metres = np.array([[-50.0, 3.0], [50.0, -3.0]])
+    degrees = to_degrees(metres, origin)
+    assert (np.abs(degrees[:, 0]) <= 180).all() and np.sign(degrees[:, 0]).sum() == 0
+    assert np.allclose(to_metres(degrees, origin), metres, atol=1e-3)
+
+
 def test_the_plain_conversion_is_as_printed_and_some_decimetres_off_in_150_m():
     there = plain_lonlat(np.array([[0.0, 150.0]]), np.array(TUCSON))
     assert np.allclose(there, [[-110.95, 32.23 + 150 / 111_320]], atol=1e-12)

@@ -67,13 +67,18 @@ PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
 
 
 def camera_keys(path: str | Path) -> dict[str, Any]:
-    """The keys of a camera's file, complete or not. Raises InputError: unreadable, no TOML, a key that none has."""
+    """The keys of a camera's file, complete or not, each checked.
+
+    Raises InputError with the file and the key: unreadable, no TOML, a key that no camera has, a value out of range.
+    """
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"camera {path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"camera {path} is no TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"camera {path} is no camera's TOML: its brackets go too deep") from None
+    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
+        raise InputError(f"camera {path} is no TOML: {str(error).split(';')[0]}") from None
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)
@@ -81,13 +86,19 @@ def camera_keys(path: str | Path) -> dict[str, Any]:
                 f"camera {path} has the key {key}, which no camera has; "
                 + (f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}")
             )
+    for key in LIMITS.keys() & content.keys():
+        _number(content[key], key, path)
+    if "centre_px" in content:
+        _pair(content["centre_px"], path)
+    if not isinstance(content.get("name", ""), str):
+        raise InputError(f"camera {path}: name is {content['name']!r}; wanted a text in quotes")
     return content
 
 
 def read_camera(path: str | Path) -> Camera:
     """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
     content = camera_keys(path)
-    numbers = {key: _number(content[key], key, path) for key in LIMITS if key in content}
+    numbers = {key: float(content[key]) for key in LIMITS if key in content}
     if missing := [key for key in ("width_px", "height_px") if key not in numbers]:
         raise InputError(f"camera {path} lacks {', '.join(missing)}: the size of its pictures")
     size = int(numbers["width_px"]), int(numbers["height_px"])
@@ -104,10 +115,10 @@ def read_camera(path: str | Path) -> Camera:
         if key in numbers
     }
     return Camera(
-        name=str(content.get("name", Path(path).stem)),
+        name=content.get("name", Path(path).stem),
         size_px=size,
         focal_px=focal,
-        centre_px=_centre(content, size, path),
+        centre_px=_pair(content.get("centre_px", [(size[0] - 1) / 2, (size[1] - 1) / 2]), path),
         place=place,
         geographic=geographic,
         height_m=numbers.get("height_m", math.nan),
@@ -118,11 +129,17 @@ def read_camera(path: str | Path) -> Camera:
     )
 
 
-def _number(value: Any, key: str, path: str | Path) -> float:
+def _number(value: Any, key: str, path: str | Path) -> None:
     low, high = LIMITS[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise InputError(f"camera {path}: {key} is {value!r}; wanted a number from {low:g} to {high:g}")
-    return float(value)
+    whole = key in ("width_px", "height_px")
+    if not (_is_number(value) and low <= value <= high) or (whole and value != int(value)):
+        kind = "whole number" if whole else "number"
+        shown = "far too large" if isinstance(value, int) and abs(value) > 10**40 else repr(value)[:40]
+        raise InputError(f"camera {path}: {key} is {shown}; wanted a {kind} from {low:g} to {high:g}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _focal(numbers: dict[str, float], size: tuple[int, int], path: str | Path) -> tuple[float, float]:
@@ -138,13 +155,8 @@ def _focal(numbers: dict[str, float], size: tuple[int, int], path: str | Path) -
     return along, numbers.get("focal_v_px", along)
 
 
-def _centre(content: dict[str, Any], size: tuple[int, int], path: str | Path) -> tuple[float, float]:
-    centre = content.get("centre_px", [(size[0] - 1) / 2, (size[1] - 1) / 2])
-    if not (
-        isinstance(centre, list)
-        and len(centre) == 2
-        and all(isinstance(v, (int, float)) and math.isfinite(v) and abs(v) <= 1e5 for v in centre)
-    ):
+def _pair(centre: Any, path: str | Path) -> tuple[float, float]:
+    if not (isinstance(centre, list) and len(centre) == 2 and all(_is_number(v) and abs(v) <= 1e5 for v in centre)):
         raise InputError(f"camera {path}: centre_px is {centre!r}; wanted [u, v] of the optical axis, in pixels")
     return float(centre[0]), float(centre[1])
 
@@ -199,7 +211,7 @@ def poses_at(
 ) -> tuple[Camera, Poses]:
     """The camera, with the kind of place that its poses have, and where it stood in each frame.
 
-    Between samples place and pitch go straight on, the heading by the shorter way round.
+    Between samples place and pitch go straight on, heading and longitude by the shorter way round.
     Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
     """
     n = len(frame)
@@ -224,7 +236,13 @@ def poses_at(
     for kind, geographic in zip(PLACES, (True, False), strict=True):
         if kind[0] in values:
             camera = replace(camera, geographic=geographic)
-            place = np.stack([np.interp(when, table.at, values[key]) for key in kind], axis=1)
+            # A longitude goes on over 180 degrees, not back through 0; a place of metres is not turned.
+            samples = [values[key] for key in kind]
+            if geographic:
+                samples[0] = np.unwrap(samples[0], period=360)
+            place = np.stack([np.interp(when, table.at, sample) for sample in samples], axis=1)
+            if geographic:
+                place[:, 0] = (place[:, 0] + 180) % 360 - 180
             break
     else:
         place = np.tile(camera.place, (n, 1)).astype(float)
