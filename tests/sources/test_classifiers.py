@@ -110,6 +110,7 @@ def test_a_linear_svm_of_cv2_ml_scores_people_above_the_rest_as_opencv_does(tmp_
 
 BROKEN_ZIP = b"PK\x03\x04" + b"\0" * 40
 KERNEL = "%YAML:1.0\n---\nsvm:\n   svmType: C_SVC\n   kernel:\n      type: RBF\n   support_vectors:\n      - [ 1. ]\n"
+SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n         sv_count: 1\n"
 
 
 @pytest.mark.parametrize(
@@ -142,6 +143,11 @@ KERNEL = "%YAML:1.0\n---\nsvm:\n   svmType: C_SVC\n   kernel:\n      type: RBF\n
         ("w.yml", "%YAML:1.0\n---\nother: 3\n", ["neither an SVMDetector"]),
         ("w.yml", "%YAML:1.0\n---\n", ["neither an SVMDetector"]),
         ("w.yml", KERNEL, ["kernel RBF", "linear"]),
+        ("w.yml", SVM, ["lacks alpha"]),
+        ("w.yml", SVM + "         alpha: [ 1., 2. ]\n         rho: 0.5\n", ["broken", "do not fit"]),
+        ("w.yml", SVM + "         alpha: [ 1. ]\n         rho: 0.5\n         index: [ 7 ]\n", ["does not hold"]),
+        ("w.yml", SVM.partition("   decision")[0] + "   decision_functions: 3\n", ["broken", "do not fit"]),
+        ("w.txt", "1_0 2 3 4 5 6", ["line 1", "'1_0' is no number"]),
         ("w.xml", "<html></html>", ["OpenCV"]),
         ("w.xml", b"\xff\xfe", ["OpenCV"]),
     ],
@@ -158,5 +164,7 @@ def test_a_mistake_gets_one_line_that_says_what_to_do(tmp_path, name, content, w
 def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no classifier is named 'absent', nor is it a file; give opencv"):
         read_classifier("absent", 6)
+    with pytest.raises(InputError, match="cannot be read: File name too long"):
+        read_classifier("x" * 300, 6)
     with pytest.raises(InputError, match="cannot be read: Is a directory"):
         read_classifier(tmp_path, 6)

@@ -67,7 +67,11 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
     Raises InputError: no such file, not readable, another length (with both), another descriptor, not finite numbers.
     """
     path = SHIPPED.get(str(name), Path(name))
-    if not path.exists():
+    try:
+        there = path.exists()
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"classifier {str(name)[:200]} cannot be read: {error.strerror or error}") from None
+    if not there:
         raise InputError(f"no classifier is named '{name}', nor is it a file; give {', '.join(SHIPPED)}, or a file")
     reader = _READERS.get(path.suffix.lower(), _text)
     try:
@@ -127,7 +131,7 @@ def _text(path: Path) -> tuple[np.ndarray, Layout]:
     for place, line in enumerate(lines, 1):
         for cell in line.partition("#")[0].replace(",", " ").replace(";", " ").split():
             try:
-                numbers.append(float(cell))
+                numbers.append(float(cell.replace("_", "?")))  # 1_0 is a number to Python alone
             except ValueError:
                 raise InputError(f"classifier {path}, line {place}: '{cell[:40]}' is no number") from None
             if not math.isfinite(numbers[-1]):
@@ -168,10 +172,15 @@ def _opencv(path: Path) -> tuple[np.ndarray, Layout]:
         inside = set() if top.empty() else set(top.keys()) if top.isMap() else set()
     except (UnicodeDecodeError, cv2.error, SystemError):
         raise InputError(f"classifier {path} is no file that OpenCV saved (YAML, XML or JSON)") from None
-    if "SVMDetector" in inside:
-        return _hog(top)
-    if "support_vectors" in inside:
-        return _support(top, path), {}
+    try:
+        if "SVMDetector" in inside:
+            return _hog(top)
+        if "support_vectors" in inside:
+            return _support(top, path), {}
+    except InputError:
+        raise
+    except (ValueError, IndexError, cv2.error, SystemError):
+        raise InputError(f"classifier {path} is a broken file: its parts do not fit; save it again") from None
     raise InputError(
         f"classifier {path} has neither an SVMDetector (cv2.HOGDescriptor.save) nor the support vectors of cv2.ml"
     )
@@ -217,9 +226,14 @@ def _support(node: "cv2.FileNode", path: Path) -> np.ndarray:
         raise InputError(f"classifier {path} tells {functions.size()} pairs of classes apart; wanted two classes")
     rows = np.array([_numbers(vectors.at(i)) for i in range(vectors.size())])
     function = functions.at(0)
+    if lacking := [name for name in ("alpha", "rho") if function.getNode(name).empty()]:
+        raise InputError(f"classifier {path} lacks {lacking[0]}, a part of its decision function; save it again")
     alpha = _numbers(function.getNode("alpha"))
     index = function.getNode("index")
-    used = rows if index.empty() else rows[_numbers(index).astype(int)]
+    place = np.arange(len(rows)) if index.empty() else _numbers(index)
+    if not ((place >= 0) & (place < len(rows))).all():
+        raise InputError(f"classifier {path} names support vectors that it does not hold; save it again")
+    used = rows[place.astype(int)]
     return sign * np.append(alpha @ used, -function.getNode("rho").real())
 
 
