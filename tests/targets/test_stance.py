@@ -1,5 +1,7 @@
 """The camera's height and pitch from people all over its picture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,18 @@ def test_people_in_one_row_do_not_tell():
     box[:, 1] = rng.normal(500, 3, 100) - box[:, 3]
     with pytest.raises(InputError, match="which does not tell how the camera stands"):
         stance(box, camera(), 1.75, 0.05)
+
+
+def test_boxes_that_no_pose_fits_are_said():
+    box = np.array([[600.0, 100 + 20 * k, 40, 20 + 700 * (k % 2)] for k in range(40)])
+    with pytest.raises(InputError, match=r"no height and pitch fit|do not tell how"):
+        stance(box, camera(), 1.75, 0.05)
+
+
+def test_boxes_where_the_lens_shows_nothing_are_left_out_and_said():
+    box = crowd(camera(height_m=3.0, pitch_rad=0.1), np.random.default_rng(0), n=40)
+    with pytest.raises(InputError, match="where the lens shows nothing: check k1 and k2"):
+        stance(box, replace(camera(), k1=-10.0), 1.75, 0.05)
 
 
 def test_few_people_do_not_tell():

@@ -14,6 +14,9 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.settings import Settings
 
+LEAST_M, MOST_M = 0.1, 10.0
+"""Heights of a person, or of what stands in for one."""
+
 Found = tuple[dict[str, float], list[str]]
 """Keys of a camera's TOML, and what to tell the user."""
 
@@ -53,6 +56,10 @@ def calibrate(
 
     settings = load(config, set_ or [])
     tall = settings.ground.body_height_m if body_height is None else body_height
+    if not LEAST_M <= tall <= MOST_M:
+        raise InputError(f"--body-height is {tall:g}; wanted metres, {LEAST_M:g} to {MOST_M:g}")
+    if out is not None:
+        _check_out(out, table)
     known = _known(camera, size)
     if pixels and table is not None:
         raise InputError("--pixels and a table were given; give the person's heights in one way")
@@ -112,6 +119,7 @@ def _focal(distance_m: list[float], height_px: list[float], body_height_m: float
     from torchvision_dddas.targets.focal import focal_length
 
     found = focal_length(np.array(distance_m), np.array(height_px), body_height_m)
+    _check("focal_px", found.focal_px, "px")
     n = len(height_px)
     spread = "" if math.isnan(found.spread_px) else f", one measurement ± {found.spread_px:.1f} px"
     lines = [
@@ -140,6 +148,7 @@ def _from_people(table: Path, camera: Path | None, body_height_m: float, setting
     kind, read = read_camera(camera), read_detections(table)
     cut = touches_border(read.box_px, kind.size_px) if read.cut is None else read.cut
     found = stance(read.box_px[~cut], kind, body_height_m, settings.ground.height_sigma)
+    _check("height_m", found.height_m, "m")
     keys = {
         "height_m": found.height_m,
         "pitch_deg": math.degrees(found.pitch_rad),
@@ -163,7 +172,7 @@ def _known(camera: Path | None, size: str | None) -> dict[str, object]:
         known = camera_keys(camera)
     if size is not None:
         width, _, height = size.lower().partition("x")
-        if not (width.isdigit() and height.isdigit() and 0 < int(width) <= 100_000 and 0 < int(height) <= 100_000):
+        if not all(side.isdecimal() and 0 < int(side[:7]) <= 100_000 for side in (width, height)):
             raise InputError(f"--size is {size!r}; wanted WIDTHxHEIGHT in pixels, such as 768x576")
         known |= {"width_px": int(width), "height_px": int(height)}
     return known
@@ -176,14 +185,37 @@ def _without_focal(known: dict[str, object], found: dict[str, float]) -> dict[st
 
 
 def _toml(keys: dict[str, object]) -> str:
-    # JSON's texts and lists of numbers are TOML's.
-    return "".join(
-        f"{key} = {float(f'{value:.6g}') if isinstance(value, float) and key not in PLACES else json.dumps(value)}\n"
-        for key, value in keys.items()
-    )
+    # JSON's texts and lists of numbers are TOML's, but for characters that JSON writes in two halves.
+    return "".join(f"{key} = {_value(key, value)}\n" for key, value in keys.items())
+
+
+def _value(key: str, value: object) -> str:
+    if isinstance(value, float) and key not in PLACES:
+        return str(float(f"{value:.6g}"))
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _check(key: str, value: float, unit: str) -> None:
+    """Raises InputError for what no camera's file may hold."""
+    from torchvision_dddas.sources.cameras import LIMITS
+
+    low, high = LIMITS[key]
+    if not low <= value <= high:
+        raise InputError(
+            f"{key} would be {value:g} {unit}, which no camera has ({low:g} to {high:g}); check the distances in "
+            "metres, the heights in pixels and the body height in metres"
+        )
 
 
 PLACES = ("longitude_deg", "latitude_deg", "east_m", "north_m")
+
+
+def _check_out(path: Path, table: Path | None) -> None:
+    """Raises InputError where the TOML would replace the table, or a folder is in its place."""
+    from torchvision_dddas.sinks.whole import refuse_folder, refuse_own_input
+
+    refuse_own_input([] if table is None else [table], [path], "--out")
+    refuse_folder(path)
 
 
 def _write(path: Path, text: str) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,6 +31,24 @@ def remove(path: Path) -> None:
     """Remove a file if it is there and can be removed: used while another error is on its way to the user."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
+
+
+def refuse_own_input(given: Iterable[Path], written: Iterable[Path], option: str) -> None:
+    """Raises InputError where a file that is read is one of those to be written; option: what names another place."""
+    places = {os.path.realpath(path) for path in written}  # unlike Path.resolve it takes links that go in circles
+    for path in given:
+        if os.path.realpath(path) in places:
+            raise InputError(f"{path} is a file that this run writes; choose another {option}")
+
+
+def refuse_folder(path: Path) -> None:
+    """Raises InputError where a folder is in the place of a file to be written, or no file can have that name."""
+    try:
+        folder = path.is_dir()
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    if folder:
+        raise InputError(f"--out {path} is a folder; wanted the name of a file")
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:

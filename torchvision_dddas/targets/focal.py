@@ -32,7 +32,7 @@ def focal_length(distance_m: Float[np.ndarray, "N"], height_px: Float[np.ndarray
     """F = D h / H of each measurement, and of all: least squares of relative errors, which are alike at every distance.
 
     distance_m: along the optical axis of a level camera. height_px: the body's, in the picture.
-    Raises InputError where there is no measurement, or one is not positive.
+    Raises InputError where there is no measurement, or one is not positive and finite.
     """
     distance, height = np.asarray(distance_m, float), np.asarray(height_px, float)
     if len(height) == 0:
@@ -41,7 +41,10 @@ def focal_length(distance_m: Float[np.ndarray, "N"], height_px: Float[np.ndarray
         if not all(np.isfinite(v) and v > 0 for v in values):
             wrong = next(v for v in values if not (np.isfinite(v) and v > 0))
             raise InputError(f"a {name} of {wrong:g} will not do to calibrate by; wanted a number above 0")
-    each = distance * height / body_height_m
+    with np.errstate(over="ignore"):
+        each = distance * height / body_height_m
+    if not np.isfinite(each).all():
+        raise InputError("a distance times a height in pixels is beyond all numbers; wanted metres and pixels")
     middle = float(np.median(each))
     spread = 1.4826 * float(np.median(np.abs(each - middle)))
     outlier: Bool[np.ndarray, N] = np.abs(each - middle) > OUTLIER * max(spread, SURE * middle)

@@ -30,6 +30,9 @@ PITCHES = np.radians([0.0, 5.0, 15.0, 30.0, 50.0])
 HEIGHTS = (0.5, 1.2, 2.5, 8.0)
 """In typical people's heights."""
 
+POOR = 0.5
+"""Where the typical body misses by so many of its heights, nothing was found."""
+
 UNSURE = 0.2
 """A standard deviation of the height that is a larger share of it is no answer."""
 
@@ -50,19 +53,25 @@ def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: floa
 
     box_px: in the order of time. height_sigma: standard deviation of a box's height, in heights; boxes that miss by
     much more hardly count. miss: the median residual, in box heights.
-    Raises InputError where there are fewer than FEWEST boxes, or they do not tell, as when all feet are in one row.
+    Raises InputError where there are fewer than FEWEST boxes that the lens can show, or they do not tell, as when all
+    feet are in one row, or no pose fits them.
     """
     box = np.asarray(box_px, float).reshape(-1, 4)
+    u = box[:, 0] + box[:, 2] / 2 - 0.5
+    feet, head = (level(u, v - 0.5, camera)[1] for v in (box[:, 1] + box[:, 3], box[:, 1]))
+    seen = np.isfinite(feet) & np.isfinite(head) & (feet > head)
+    box, feet, head = box[seen], feet[seen], head[seen]
     if len(box) < FEWEST:
-        raise InputError(f"{len(box)} whole boxes of people; wanted {FEWEST} at least to tell how the camera stands")
+        lost = f" (and {(~seen).sum()} where the lens shows nothing: check k1 and k2)" if not seen.all() else ""
+        raise InputError(
+            f"{len(box)} whole boxes of people{lost}; wanted {FEWEST} at least to tell how the camera stands"
+        )
     low, high = np.percentile(box[:, 1] + box[:, 3], [10, 90])
     if high - low < NARROW * np.median(box[:, 3]):
         raise InputError(
             f"most feet lie within {high - low:.0f} rows of the picture, which does not tell how the camera stands; "
             "give people near and far"
         )
-    u = box[:, 0] + box[:, 2] / 2 - 0.5
-    feet, head = (level(u, v - 0.5, camera)[1] for v in (box[:, 1] + box[:, 3], box[:, 1]))
 
     def residual(guess: np.ndarray, here: np.ndarray) -> np.ndarray:
         pitch, height = guess[0], np.exp(guess[1])
@@ -94,6 +103,11 @@ def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: floa
             f"{min(sigma[1], 99):.0%}. Give more of them, near and far"
         )
     miss = float(np.median(np.abs(residual(best, everyone))))
+    if not miss < POOR:
+        raise InputError(
+            f"no height and pitch fit these boxes: half of them miss by more than {min(miss, 99):.0%} of their height; "
+            "check that they are upright people, and the camera's focal length and size"
+        )
     return Stance(height, float(best[0]), float(sigma[1]) * height, float(sigma[0]), miss)
 
 
