@@ -138,6 +138,15 @@ def test_boxes_of_one_clip_are_confirmed_by_boxes(dddas, tmp_path):
     ]
 
 
+def test_tables_with_an_index_or_quoted_names_are_read_as_others(dddas, tmp_path):
+    header = "," + ",".join(f'"{name}"' for name in BOXES.split(","))
+    blobs = write(tmp_path / "detections.csv", header, "0,2,1,100,100,60,130,1,moving", "1,1,1,9,9,60,130,1,moving")
+    people = write(tmp_path / "people.csv", header, '0,1,1,10,10,40,120,0.9,"person"')
+    done = dddas("confirm", blobs, people, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert [row["kind"] for row in rows(tmp_path / "out") if row["frame"] == "1"] == ["human"]
+
+
 def test_looks_add_up_over_the_identities_of_tracks(dddas, tmp_path):
     track = write(tmp_path / "tracks.txt", *(f"{t},4,{100 + t},100,60,130,1,-1,-1,-1" for t in (2, 1, 3)))
     people = write(tmp_path / "people.txt", "1,-1,105,105,40,120,0.9,-1,-1,-1", "2,-1,105,105,40,120,0.9,-1,-1,-1")
@@ -183,6 +192,10 @@ def test_a_table_without_rows_is_confirmed_to_one_without_rows(dddas, scene, tmp
         (["{odd}", "{people}"], "line 2: east_m is 'x'"),
         (["{blobs}", "{people}", "--camera", "{degrees}"], "no longitude_deg and latitude_deg"),
         (["{bytes}", "{people}"], "is no CSV text"),
+        (["{blobs}", "{empty}"], "empty.csv is empty; wanted a first line"),
+        (["{quoted}", "{boxes}"], "has cells that go over several lines"),
+        (["{blobs}", "{people}", "--interval", str(10**30)], "--interval is 1000"),
+        (["{blobs}", "{people}", "--rate", "nan"], "a frame rate of nan"),
     ],
 )
 def test_a_mistake_gets_one_line_and_leaves_nothing(dddas, scene, tmp_path, words, wanted):
@@ -195,6 +208,8 @@ def test_a_mistake_gets_one_line_and_leaves_nothing(dddas, scene, tmp_path, word
         "boxes": write(tmp_path / "boxes.csv", BOXES, "1,1,1,1,9,9,1,moving"),
         "twice": write(tmp_path / "twice.csv", HEADER, place(1, 3, 0, 0), place(1, 3, 1, 1), place(1, 4, 1, 1)),
         "odd": write(tmp_path / "odd.csv", HEADER, "1,1,x,0,1,0,1"),
+        "empty": write(tmp_path / "empty.csv", ""),
+        "quoted": write(tmp_path / "quoted.csv", BOXES, '1,1,1,1,9,9,1,"moving', '1,2,1,1,9,9,1,moving"'),
         "degrees": write(tmp_path / "degrees.toml", degrees),
         "bytes": tmp_path / "bytes.csv",
     }

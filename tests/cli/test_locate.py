@@ -92,6 +92,37 @@ def test_a_target_seen_once_is_a_point_of_the_map(dddas, file, tmp_path):
     assert [feature["geometry"]["type"] for feature in found["features"]] == ["Point", "Point"]
 
 
+def test_a_line_of_the_map_is_cut_at_180_degrees(dddas, file, tmp_path):
+    text = CAMERA + "longitude_deg = 180\nlatitude_deg = -17\nheading_deg = 90\n"
+    table = file("t.csv", tracks(camera(), frames=(1,)) + "2,4,640,400,40,120,0.9\n")
+    poses = file("p.csv", "frame,longitude_deg,latitude_deg\n1,179.9995,-17\n2,-179.9995,-17\n")
+    words = ("--camera", file("c.toml", text), "--poses", poses, "--out", tmp_path / "out")
+    assert dddas("locate", "ground", table, *words).exit_code == 0
+    (line, _) = (f["geometry"] for f in json.loads((tmp_path / "out/tracks.geojson").read_text())["features"])
+    assert line["type"] == "MultiLineString"
+    (west, east) = line["coordinates"]
+    assert west[-1][0] == 180 and east[0][0] == -180 and west[-1][1] == east[0][1]
+    assert 179 < west[0][0] < 180 and -180 < east[-1][0] < -179
+    assert min(west[0][1], east[-1][1]) <= east[0][1] <= max(west[0][1], east[-1][1])
+
+
+def test_the_map_of_an_earlier_run_does_not_stay_beside_a_run_without_one(dddas, file, tmp_path):
+    table, out = file("t.csv", tracks(camera())), tmp_path / "out"
+    degrees = file("d.toml", CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n")
+    dddas("locate", "ground", table, "--camera", degrees, "--out", out)
+    assert (out / "tracks.geojson").exists()
+    result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", out)
+    assert not (out / "tracks.geojson").exists() and "geojson" not in result.stdout
+
+
+@pytest.mark.parametrize("name", ["circle", "x" * 300])
+def test_a_name_that_cannot_be_is_said_in_one_line(dddas, file, tmp_path, name):
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    table, toml = file("t.csv", tracks(camera())), file("c.toml", CAMERA)
+    assert "cannot be read" in bad(dddas("locate", "ground", tmp_path / name, "--camera", toml))
+    assert "cannot write" in bad(dddas("locate", "ground", table, "--camera", toml, "--out", tmp_path / name))
+
+
 def test_two_cameras_give_the_fused_places_and_what_each_alone_says(dddas, file, tmp_path):
     near = "position_sigma_m = 0.1\nheading_sigma_deg = 0.3\n"
     west = camera(heading_rad=np.pi / 2)
@@ -187,3 +218,6 @@ def test_a_run_does_not_read_what_it_writes(dddas, file, tmp_path):
     table = file("positions.csv", tracks(camera()))
     result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", tmp_path)
     assert "is a file that this run writes" in bad(result)
+    words = ("--camera", file("c.toml", CAMERA), "--poses", file("sightings.csv", "frame,heading_deg\n1,0\n"))
+    result = dddas("locate", "ground", file("t.csv", tracks(camera())), *words, "--out", tmp_path)
+    assert "sightings.csv is a file that this run writes" in bad(result)

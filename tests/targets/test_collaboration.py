@@ -89,6 +89,12 @@ def test_what_one_camera_does_not_see_another_may():
     assert seen([[0, 5], [0, 10]], views=[NORTH, east]).looked[1]
 
 
+def test_places_known_exactly_can_be_compared():
+    found = seen([[0, 10], [3, 10]], [[0, 10]], blob_sigma=0.0, person_sigma=0.0)
+    assert found.people.tolist() == [1, 0]
+    assert found.nearest_sigmas[0] == 0 and np.isfinite(found.nearest_sigmas).all()
+
+
 def test_a_crowd_is_counted():
     people = [[0.2, 10], [-0.3, 10.1], [0.1, 9.8], [5, 12]]
     found = seen([[0, 10], [5, 12]], people, score=[0.6, 0.9, 0.7, 0.8])
@@ -130,9 +136,8 @@ def test_a_cameras_view_reaches_as_far_as_bodies_are_large_enough():
     assert view.far_m == pytest.approx(1000 * 1.8 / 96)
     assert view.near_m == pytest.approx(3.0)
     assert view.half_rad == pytest.approx(math.atan(0.4))
-    closer = view_of(
-        camera, np.zeros(2), 0.0, PeopleKnobs(enlarge=2.0, height_share=0.75), GroundKnobs(body_height_m=1.8)
-    )
+    twice = PeopleKnobs(enlarge=2.0, scale_step=2**0.25, height_share=0.75)  # whole steps to twice the size
+    closer = view_of(camera, np.zeros(2), 0.0, twice, GroundKnobs(body_height_m=1.8))
     assert closer.far_m == pytest.approx(2 * view.far_m)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate, check_rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
@@ -57,10 +57,11 @@ def confirm(
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
     from torchvision_dddas.settings import load
+    from torchvision_dddas.sources.detections import LAST_FRAME
 
     settings = load(config, set_ or [])
-    if interval < 1:
-        raise InputError(f"--interval is {interval}; wanted 1 or more frames")
+    if not 1 <= interval <= LAST_FRAME:
+        raise InputError(f"--interval is {interval}; wanted 1 to {LAST_FRAME} frames")
     journal = confirm_into(out, blobs, people, camera or [], poses or [], settings, interval, identities, rate, quiet)
     if not quiet:
         for line in summary(journal, out):
@@ -81,15 +82,18 @@ def confirm_into(
 ) -> "ConfirmJournal":
     """Confirm and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.sinks.confirmed import ConfirmOutput
-
-    for table in (blobs, *people):
-        if table.resolve() in [(folder / name).resolve() for name in ConfirmOutput.files]:
-            raise InputError(f"{table} is a file that this run writes; choose another folder with --out")
+    from torchvision_dddas.sinks.whole import refuse_own_input
     from torchvision_dddas.sources.rows import header_of
 
-    places = {path: "east_m" in header_of(path) for path in (blobs, *people)}
+    check_rate(rate_hz)
+    written = [folder / name for name in ConfirmOutput.files]
+    refuse_own_input([blobs, *people, *cameras, *poses], written, "folder with --out")
+    headers = {path: header_of(path) for path in (blobs, *people)}
+    places = {path: "east_m" in header for path, header in headers.items()}
     for path, of_places in places.items():
         if of_places != places[blobs]:
+            if empty := [name for name in (blobs, path) if not headers[name]]:
+                raise InputError(f"{empty[0]} is empty; wanted a first line that names frame,target,east_m,north_m")
             raise InputError(
                 f"{blobs} has {_KIND[places[blobs]]}, {path} has {_KIND[of_places]}; give positions.csv for all "
                 "(dddas locate), or boxes of the same pictures for all"
@@ -151,7 +155,8 @@ def _on_the_ground(
     lasting = lasts(given) if identities is None else identities
     if identities is None and not lasting:
         notes.append("each frame counts its targets from 1: every row is judged alone (--identities adds looks up)")
-    return *read_rows(blobs, COLUMNS), confirm_positions(given, vehicles, settings, interval, lasting, rate_hz)
+    rows = read_rows(blobs, len(given), COLUMNS)
+    return *rows, confirm_positions(given, vehicles, settings, interval, lasting, rate_hz)
 
 
 def _vehicles(people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path]) -> "list[Vehicle]":
@@ -196,7 +201,7 @@ def _in_pictures(
     if identities is False:
         given = replace(given, identity=None)
     tables = [read_detections(path) for path in people]
-    return *read_rows(blobs, COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
+    return *read_rows(blobs, len(given), COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
 
 
 def _names(people: Sequence[Path]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate, check_rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
@@ -61,18 +61,17 @@ def ground_into(
     from torchvision_dddas.locating import locate as located
     from torchvision_dddas.locating import survey
     from torchvision_dddas.sinks.positions import PositionOutput
+    from torchvision_dddas.sinks.whole import refuse_own_input
     from torchvision_dddas.sources.cameras import read_camera, read_poses
     from torchvision_dddas.sources.detections import read_detections
 
     if len(cameras) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
-    if rate_hz is not None and not 0 < rate_hz <= 1000:
-        raise InputError(f"a frame rate of {rate_hz} per second will not do; wanted more than 0, at most 1000")
+    check_rate(rate_hz)
     if poses and len(poses) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; wanted one --poses for each, or none")
-    for table in tables:
-        if table.resolve() in [(folder / name).resolve() for name in PositionOutput.files]:
-            raise InputError(f"{table} is a file that this run writes; choose another folder with --out")
+    written = [folder / name for name in PositionOutput.files]
+    refuse_own_input([*tables, *cameras, *poses], written, "folder with --out")
     with PositionOutput(folder) as output:
         read = [read_detections(table) for table in tables]
         kinds = [read_camera(camera) for camera in cameras]

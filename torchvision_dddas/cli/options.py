@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from torchvision_dddas.errors import InputError
+
 
 class Backend(StrEnum):
     """The engines that --backend names."""
@@ -21,3 +23,9 @@ Overrides = Annotated[
 Engine = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
+
+
+def check_rate(rate_hz: float | None) -> None:
+    """Raises InputError for a --rate that is none."""
+    if rate_hz is not None and not 0 < rate_hz <= 1000:
+        raise InputError(f"a frame rate of {rate_hz} per second will not do; wanted more than 0, at most 1000")

@@ -136,13 +136,13 @@ class Output(RunFolder[Scene]):
 
 def _claim(folder: Path, ours: Sequence[str]) -> list[Path]:
     """Make the folder and try to write there. Returns the folders made, innermost first."""
-    made = []
-    for place in (folder, *folder.parents):
-        if place.exists():
-            break
-        made.append(place)
+    made: list[Path] = []
     probe = temporary(folder / "probe")
     try:
+        for place in (folder, *folder.parents):
+            if place.exists():
+                break
+            made.append(place)
         folder.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"")
         probe.unlink()

@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,9 @@ def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
 def geojson(positions: Positions) -> dict[str, Any]:
     """A FeatureCollection (RFC 7946), a feature a target: a line, or a point where it was located once.
 
-    `frames` has the frame of each of the line's points, `sigma_m` how well it is known: the root of the covariance's
-    trace, null where it is not. Raises ValueError where there is no geographic origin.
+    `frames` has the frame of each place, `sigma_m` how well it is known: the root of the covariance's trace, null where
+    it is not. A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
+    Raises ValueError where there is no geographic origin.
     """
     if positions.lonlat_deg is None:
         raise ValueError("these positions have no longitude and latitude")
@@ -62,7 +64,7 @@ def geojson(positions: Positions) -> dict[str, Any]:
         # 1e-8 of a degree is a millimetre.
         places = [[round(float(v), 8) for v in positions.lonlat_deg[row]] for row in rows]
         sigma = np.sqrt(np.trace(positions.covariance_m2[rows], axis1=1, axis2=2))
-        shape = {"type": "LineString", "coordinates": places} if len(rows) > 1 else _point(places[0])
+        shape = _line(places) if len(rows) > 1 else {"type": "Point", "coordinates": places[0]}
         features.append(
             {
                 "type": "Feature",
@@ -77,8 +79,21 @@ def geojson(positions: Positions) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": features}
 
 
-def _point(place: list[float]) -> dict[str, Any]:
-    return {"type": "Point", "coordinates": place}
+def _line(places: list[list[float]]) -> dict[str, Any]:
+    lines = [places[:1]]
+    for before, after in pairwise(places):
+        if abs(after[0] - before[0]) > 180:
+            edge = math.copysign(180.0, before[0])
+            # Degrees to the edge, and from it on the other side.
+            here, there = abs(edge - before[0]), abs(-edge - after[0])
+            share = here / (here + there) if here + there > 0 else 0.0
+            latitude = round(before[1] + share * (after[1] - before[1]), 8)
+            lines[-1].append([edge, latitude])
+            lines.append([[-edge, latitude]])
+        lines[-1].append(after)
+    if len(lines) == 1:
+        return {"type": "LineString", "coordinates": lines[0]}
+    return {"type": "MultiLineString", "coordinates": lines}
 
 
 def _place(positions: Positions, row: int) -> list[str]:
@@ -179,7 +194,14 @@ class PositionOutput(RunFolder[Located]):
     def begin(self, facts: dict[str, Any], cameras: tuple[str, ...], geographic: bool) -> PositionJournal:
         """Say what the run is, for run.json, the cameras' names, and whether longitudes and latitudes are known."""
         self.journal = kept = PositionJournal(self.folder, facts)
+        self._geographic = geographic
         self._sinks = [kept, PositionTables(self.folder, cameras, geographic)]
         if geographic:
             self._sinks.append(Map(self.folder))
         return kept
+
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, as in RunFolder; a map of an earlier run here goes if this one makes none."""
+        super().close(complete)
+        if not self._geographic:
+            remove(self.folder / "tracks.geojson")

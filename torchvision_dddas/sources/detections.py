@@ -122,7 +122,7 @@ def read_detections(path: str | Path) -> DetectionTable:
         number, header = content.pop(0)
         rows = list(_by_name(content, header, f"detections {path}", number))
         own = _all_moving(content, header)
-        cuts = "cut" in [cell.strip() for cell in header.split(",")]
+        cuts = "cut" in _cells(header)
     else:
         rows = list(_by_place(content, f"detections {path}"))
     table = np.array(rows, np.float64).reshape(-1, 9)
@@ -142,7 +142,7 @@ def read_detections(path: str | Path) -> DetectionTable:
 
 def _named(line: str) -> bool:
     """Whether a line names columns: its first cell begins with a letter and is no number such as nan."""
-    first = line.replace(",", " ").split()[:1]
+    first = line.replace(",", " ").replace('"', " ").split()[:1]
     return bool(first) and first[0][0].isalpha() and _number(first[0]) is None
 
 
@@ -158,7 +158,7 @@ def _by_place(content: Sequence[tuple[int, str]], name: str) -> Iterator[list[fl
 
 
 def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: int) -> Iterator[list[float]]:
-    names = [cell.strip() for cell in header.split(",")]
+    names = _cells(header)
     if missing := [column for column in COLUMNS if column not in names]:
         raise InputError(
             f"{name}, line {line}: its columns are {', '.join(names)}; {', '.join(missing)} missing. Wanted numbers as "
@@ -170,14 +170,19 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
     # A column that is not there is read as an empty cell after the last.
     score, identity, cut = (names.index(n) if n in names else len(names) for n in ("score", "identity", "cut"))
     for number, text in content:
-        cells = text.split(",")
+        cells = _cells(text)
         if len(cells) != len(names):
             raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
-        cells = [*(cell.strip() for cell in cells), ""]
+        cells = [*cells, ""]
         row = _row([cells[place] for place in places], cells[score], number, name)
         if cells[cut] not in ("", "0", "1"):
             raise InputError(f"{name}, line {number}: cut is '{cells[cut]}'; wanted 1 where the border cuts it, else 0")
         yield [*row, _identity(cells[identity]), float(cells[cut] == "1")]
+
+
+def _cells(line: str) -> list[str]:
+    """The cells of a line, without the quotes that some tools put around names."""
+    return [cell.strip().strip('"').strip() for cell in line.split(",")]
 
 
 def _identity(text: str) -> float:
@@ -188,11 +193,11 @@ def _identity(text: str) -> float:
 
 def _all_moving(content: Sequence[tuple[int, str]], header: str) -> bool:
     """Whether the column `kind` says so of each row, as `dddas detect` does."""
-    names = [cell.strip() for cell in header.split(",")]
+    names = _cells(header)
     if not content or "kind" not in names:
         return False
     place = names.index("kind")
-    return all(line.split(",")[place].strip() == "moving" for _, line in content)
+    return all(_cells(line)[place] == "moving" for _, line in content)
 
 
 def _refuse_few_outside(score: np.ndarray, line: np.ndarray, name: str) -> None:

@@ -11,16 +11,23 @@ MOT = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
 
 
 def header_of(path: str | Path) -> list[str]:
-    """The column names of a table, or MOT where its first line holds numbers. Raises InputError as `read_rows`."""
-    return _read(path)[0]
+    """The column names of a table, MOT where its first line holds numbers, none where it is empty.
 
-
-def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """The column names and the cells of a table that its reader found valid, sorted by frame, as readers sort it.
-
-    without: columns to leave out. Raises InputError where it cannot be read.
+    Raises InputError where it cannot be read.
     """
     header, rows = _read(path)
+    return header if rows or header != [*MOT] else []
+
+
+def read_rows(path: str | Path, count: int, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """The column names and the cells of a table that its reader found valid, sorted by frame, as readers sort it.
+
+    count: the rows that the reader found. without: columns to leave out. Raises InputError where it cannot be read, or
+    its rows are not those of the reader, as when a quoted cell goes over several lines.
+    """
+    header, rows = _read(path)
+    if len(rows) != count:
+        raise InputError(f"{path} has cells that go over several lines; wanted a line a row, without quotes")
     frame = header.index("frame")
     rows.sort(key=lambda row: float(row[frame]))  # a stable sort
     kept = [place for place, name in enumerate(header) if name not in without]
@@ -36,7 +43,8 @@ def _read(path: str | Path) -> tuple[list[str], list[list[str]]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} is no CSV text: {error}") from None
     rows = [row for row in rows if any(row)]
-    if rows and rows[0][0][:1].isalpha():
+    # The first name may be empty: so a table with an index begins.
+    if rows and next(cell for cell in rows[0] if cell)[0].isalpha():
         return rows[0], [[*row, *[""] * (len(rows[0]) - len(row))] for row in rows[1:]]
     rows = [row if len(row) > 1 else row[0].split() for row in rows]
     widest = max((len(row) for row in rows), default=len(MOT))

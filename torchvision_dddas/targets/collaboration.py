@@ -94,8 +94,8 @@ def look(
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
     blob_m2, person_m2 = (_known(covariance, knobs) for covariance in (blob_m2, person_m2))
     apart = person_m[None] - blob_m[:, None]
-    # A millimetre at least: where nothing is unsure, no distance could be told in standard deviations.
-    both = blob_m2[:, None] + person_m2[None] + max(knobs.spread_m, 1e-3) ** 2 * np.eye(2)
+    # A micrometre at least: where nothing is unsure, no distance could be told in standard deviations.
+    both = blob_m2[:, None] + person_m2[None] + max(knobs.spread_m, 1e-6) ** 2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
     inside = sigmas <= math.sqrt(-2 * math.log(1 - knobs.gate_probability))  # chi-square of two degrees of freedom
     people, best = _assigned(sigmas, inside, score, knobs)
