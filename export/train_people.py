@@ -34,7 +34,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.ops import hog
 from torchvision_dddas.settings import PeopleKnobs, load
-from torchvision_dddas.sinks.whole import cannot_write, write_whole
+from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, remove, temporary, write_whole
 from torchvision_dddas.sources.classifiers import layout_of
 from torchvision_dddas.sources.images import IMAGE_SUFFIXES
 from torchvision_dddas.targets.scan import everywhere, levels
@@ -48,6 +48,7 @@ BATCH = 256
 # Mining and measuring go through the pyramid in steps of at least this: windows of closer levels are much the same.
 STEP = 1.2
 FALSE_PER_WINDOW = (1e-3, 1e-4, 1e-5)
+MOST_WINDOWS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,7 @@ def main(words: Sequence[str] | None = None) -> int:
         knobs = load(options.config, options.overrides).people
         plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
         check(plan)
+        check_out(options.out, (options.positives, options.negatives))
         _sklearn("svm")  # better missed before the work than after it
         people = crops(options.positives, knobs, size_of(options.crop) if options.crop else None)
         rest = pictures(options.negatives, knobs)
@@ -115,13 +117,28 @@ def main(words: Sequence[str] | None = None) -> int:
 def check(plan: Plan) -> None:
     """Raises InputError where a number makes no sense."""
     for name, value, fine, wanted in (
-        ("--windows", plan.negatives, plan.negatives >= 1, "1 or more"),
+        ("--windows", plan.negatives, 1 <= plan.negatives <= MOST_WINDOWS, f"1 to {MOST_WINDOWS}"),
+        ("--seed", plan.seed, 0 <= plan.seed < 2**32, "0 or more, below 2 to the 32nd"),
         ("--rounds", plan.rounds, plan.rounds >= 0, "0 or more"),
         ("--c", plan.c, plan.c is None or 0 < plan.c < float("inf"), "a number above 0"),
         ("--held-out", plan.held_out, 0 <= plan.held_out <= 0.9, "a share from 0 to 0.9"),
     ):
         if not fine:
             raise InputError(f"{name} is {value}; wanted {wanted}")
+
+
+def check_out(path: Path, folders: Sequence[Path]) -> None:
+    """Raises InputError where the file cannot be written or would lie among the pictures: before hours of work."""
+    refuse_folder(path)
+    place = Path(os.path.realpath(path)).parent
+    if among := [folder for folder in folders if place.is_relative_to(os.path.realpath(folder))]:
+        raise InputError(f"--out {path} lies in {among[0]}, among the pictures; choose another place")
+    part = temporary(path)
+    try:
+        part.touch()
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    remove(part)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -332,14 +349,21 @@ def mirrored(windows: np.ndarray) -> np.ndarray:
 
 
 def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[str]) -> float:
-    """C by cross-validation in which a person and its mirror image stay together; the smallest that is as good."""
+    """C by cross-validation in which a person and its mirror image stay together; the smallest that is as good.
+
+    Raises InputError where there are too few to part.
+    """
     model_selection, metrics = _sklearn("model_selection"), _sklearn("metrics")
     x = np.concatenate([positive, negative])
     y = np.arange(len(x)) < len(positive)
     half = len(positive) // 2
     groups = np.concatenate([np.tile(np.arange(half), 2), half + np.arange(len(negative))])
     folds = min(4, half)
-    parts = list(model_selection.GroupKFold(folds, shuffle=True, random_state=seed).split(x, y, groups))
+    every = model_selection.GroupKFold(folds, shuffle=True, random_state=seed).split(x, y, groups)
+    # Of few pictures a fold may hold people alone, or none.
+    parts = [one for one in every if all(len(np.unique(y[rows])) == 2 for rows in one)]
+    if not parts:
+        raise InputError(f"{half} people and {len(negative)} windows are too few to choose C by; give more, or --c")
     found = []
     for c in CHOICES:
         values = []
@@ -349,7 +373,7 @@ def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[st
         found.append(float(np.mean(values)))
     best = CHOICES[int(np.argmax(np.round(found, 3)))]
     shown = ", ".join(f"{c:g}: {value:.3f}" for c, value in zip(CHOICES, found, strict=True))
-    lines.append(f"C = {best:g} by average precision in {folds} folds ({shown})")
+    lines.append(f"C = {best:g} by average precision in {len(parts)} folds ({shown})")
     return best
 
 

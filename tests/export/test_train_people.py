@@ -192,7 +192,20 @@ def test_a_mistake_gets_one_line(folders, tmp_path, capsys):
     assert "--held-out is 2" in bad(capsys, people, rest, *out, "--held-out", 2)
     assert "--c is -1" in bad(capsys, people, rest, *out, "--c", -1)
     assert "unknown knob" in bad(capsys, people, rest, *out, "--set", "people.windows=3")
+    assert "--seed is -1; wanted 0 or more" in bad(capsys, people, rest, *out, "--seed", -1)
+    assert "--windows is 1000000000" in bad(capsys, people, rest, *out, "--windows", 10**9)
+    assert "is a folder; wanted the name of a file" in bad(capsys, people, rest, "--out", tmp_path)
+    assert "cannot write" in bad(capsys, people, rest, "--out", tmp_path / "none" / "svm.npz")
+    assert "among the pictures" in bad(capsys, people, rest, "--out", people / "0.png")
     assert not (tmp_path / "svm.npz").exists()
+
+
+def test_too_few_to_choose_c_by_are_said(folders, tmp_path, capsys):
+    (tmp_path / "two").mkdir()
+    for path in sorted((folders / "people").glob("*.png"))[:2]:
+        (tmp_path / "two" / path.name).write_bytes(path.read_bytes())
+    words = [tmp_path / "two", folders / "rest", "--crop", "32x64", "--out", tmp_path / "svm.npz", *SET]
+    assert "too few to choose C by" in bad(capsys, *words, "--windows", 1)
 
 
 def test_without_scikit_learn_the_extra_is_named(folders, tmp_path, capsys, monkeypatch):
