@@ -305,3 +305,36 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
     assert len(rows(tmp_path / "out")) == 3
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
     assert not list((tmp_path / "out").rglob("*.part*"))
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")
+@pytest.mark.parametrize("search", ["everywhere", "regions"])
+def test_the_whole_command_holds_less_than_150_mb_and_loads_neither_scipy_nor_torch(search, tmp_path):
+    """A film besides takes 35 MB more: PyAV and its encoder."""
+    for name in ("1.png", "2.png"):
+        image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / name), image)
+    program = """
+        import json, sys
+        from pathlib import Path
+        import cv2
+        import torchvision_dddas.cli
+
+        cv2.setNumThreads(2)
+        try:
+            torchvision_dddas.cli.main()
+        except SystemExit as stop:
+            lines = Path("/proc/self/status").read_text().splitlines()
+            peak_mb = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+            print(json.dumps([stop.code, peak_mb, [name for name in ("scipy", "torch") if name in sys.modules]]))
+    """
+    chosen = ["--set", f"people.search={search}", "--set", "people.scale_step=1.2", "--save", "none", "--quiet"]
+    words = [sys.executable, "-c", textwrap.dedent(program), "people", str(tmp_path), *chosen]
+    done = subprocess.run(
+        [*words, "--out", str(tmp_path / "out")],
+        capture_output=True, text=True, timeout=120, cwd=ROOT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    code, peak_mb, loaded = json.loads(done.stdout)
+    assert not code and loaded == []
+    assert peak_mb < 150

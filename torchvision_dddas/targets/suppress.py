@@ -2,8 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 # A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.
 _WHOLE = 1 - 1e-9
@@ -96,6 +94,9 @@ def group(
 
 def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
     """(N,) the group of each box, numbered as they first appear."""
+    from scipy.sparse import coo_array  # here, as it takes 40 MB, and only OpenCV's grouping needs it
+    from scipy.sparse.csgraph import connected_components
+
     order = np.argsort(box_px[:, 3], kind="stable")
     box = box_px[order]
     low, high, height, around = box[:, :2], box[:, :2] + box[:, 2:], box[:, 3], box[:, 2:].sum(axis=1)
