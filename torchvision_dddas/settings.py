@@ -375,6 +375,19 @@ class PeopleKnobs(Group):
     region_margin: float = knob(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
     region_scales: float = knob(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
 
+    @model_validator(mode="after")
+    def _cells_fill_blocks_and_blocks_the_window(self) -> "PeopleKnobs":
+        if self.block_px % self.cell_px:
+            raise ValueError(f"block_px = {self.block_px} is no multiple of cell_px = {self.cell_px}")
+        for name in ("window_width_px", "window_height_px"):
+            more = getattr(self, name) - self.block_px
+            if more < 0 or more % self.block_stride_px:
+                raise ValueError(
+                    f"blocks of block_px = {self.block_px} every block_stride_px = {self.block_stride_px} do not fill "
+                    f"{name} = {getattr(self, name)}; wanted {self.block_px} + a multiple of {self.block_stride_px}"
+                )
+        return self
+
 
 class GroundKnobs(Group):
     """Where people stand, seen from the ground (appendix A, IV-C), and which of several sightings are one person."""
