@@ -151,7 +151,8 @@ BAD_PICTURES = [
     (np.zeros((1, 3, 200, 100), np.uint8), "1 x 3 x 200 x 100"),
     (np.zeros(0, np.uint8), "an array of 0"),
     (np.zeros((0, 100), np.uint8), "0 x 100"),
-    (np.uint8(3), "a number"),
+    (np.uint8(3), "a single uint8; wanted height x width"),
+    (None, "is None; could its file be read?"),
 ]
 
 
@@ -160,6 +161,12 @@ def test_what_is_no_picture_is_one_line(image, says):
     with pytest.raises(InputError) as error:
         list(recognize(Clip(numbers=(1,), images={1: image}), Brightest(), settings()))
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
+    images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
+    with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
+        people_in(images, Brightest(), PeopleKnobs())
 
 
 def test_one_channel_is_grey():

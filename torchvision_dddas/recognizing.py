@@ -59,7 +59,7 @@ def recognize(
 def people_in(images: Sequence[np.ndarray], recognizer: Recognizer, knobs: PeopleKnobs) -> list[People]:
     """The people of pictures at hand, searched everywhere. Raises InputError as `recognize`."""
     images = [checked(image, f"picture {i}") for i, image in enumerate(images, start=1)]
-    parts = [scan.everywhere((image.shape[1], image.shape[0]), knobs) for image in images]
+    parts = [_everywhere(image, f"picture {i}", knobs) for i, image in enumerate(images, start=1)]
     return [
         _people(maps, wanted, image, knobs)
         for maps, wanted, image in zip(recognizer.scores(images, parts), parts, images, strict=True)
@@ -68,16 +68,30 @@ def people_in(images: Sequence[np.ndarray], recognizer: Recognizer, knobs: Peopl
 
 def checked(image: np.ndarray, name: str) -> np.ndarray:
     """A picture as the back ends want it: (H, W) or (H, W, 3) uint8. Raises InputError for anything else."""
+    if image is None:  # what OpenCV gives for a file that it cannot read
+        raise InputError(f"{name} is None; could its file be read? Wanted an array of height x width pixels")
     image = np.asarray(image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or 0 in image.shape:
-        shape = " x ".join(str(length) for length in image.shape) or "a number"
-        raise InputError(f"{name} is an array of {shape}; wanted height x width, or these x 1 or 3 channels (BGR)")
+        what = (
+            "an array of " + " x ".join(map(str, image.shape))
+            if image.ndim
+            else f"a single {image.dtype.type.__name__}"
+        )
+        raise InputError(f"{name} is {what}; wanted height x width, or these x 1 or 3 channels (BGR)")
     if image.dtype != np.uint8:
         nan = image.dtype.kind == "f" and bool(np.isnan(image).any())
         raise InputError(
             f"{name} holds {image.dtype} pixels{', NaN among them' if nan else ''}; wanted 8 bits (uint8), 0 to 255"
         )
     return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def _everywhere(image: np.ndarray, name: str, knobs: PeopleKnobs) -> list[Part]:
+    """All parts of a picture. Raises InputError, which names it, where no window fits."""
+    try:
+        return scan.everywhere((image.shape[1], image.shape[0]), knobs)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def _searched(

@@ -300,3 +300,15 @@ def test_gradients_reach_the_levels_of_the_picture_and_the_weights():
 def test_a_classifier_of_another_length_is_refused_with_both_lengths(backend):
     with pytest.raises(InputError, match=r"file\.txt has 3000 weights.* has 3780"):
         load_recognizer(backend, PeopleKnobs(), LinearSvm(np.zeros(3000, np.float32), 0.0, "file.txt"))
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+def test_pictures_that_must_not_be_written_to_or_lie_otherwise_in_memory_score_the_same(backend, recwarn):
+    picture, parts = scene(12, 150, 90), [Part((90, 150), 0, 0, 90, 150)]
+    locked = picture.copy()
+    locked.flags.writeable = False
+    others = [locked, np.asfortranarray(picture), np.ascontiguousarray(picture[:, ::-1])[:, ::-1]]
+    wanted, *found = load_recognizer(backend, PeopleKnobs(), SVM).scores([picture, *others], [parts] * 4)
+    for scored in found:
+        np.testing.assert_array_equal(scored[0], wanted[0])
+    assert not recwarn.list

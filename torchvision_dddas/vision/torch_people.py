@@ -81,8 +81,9 @@ class TorchRecognizer:
         return max(0, (part.width - width) // stride + 1), max(0, (part.height - height) // stride + 1)
 
     def _tensor(self, image: np.ndarray) -> Tensor:
-        channels = np.atleast_3d(image)
-        return torch.from_numpy(np.ascontiguousarray(channels)).to(self.device).permute(2, 0, 1).float().contiguous()
+        # A copy: torch warns of memory that must not be written to.
+        channels = torch.tensor(np.ascontiguousarray(np.atleast_3d(image)))
+        return channels.to(self.device).permute(2, 0, 1).float().contiguous()
 
 
 def layout(knobs: PeopleKnobs) -> hog.Layout:
