@@ -5,6 +5,7 @@ import pytest
 
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.settings import GroundKnobs
+from torchvision_dddas.targets import fusion
 from torchvision_dddas.targets.fusion import associate, crowd, fuse, gate, together
 from torchvision_dddas.targets.ranging import sight
 from torchvision_dddas.types import Sightings
@@ -74,6 +75,16 @@ def test_a_vehicle_off_by_more_than_people_stand_apart_is_matched_as_a_whole():
     order = rng.permutation(5)
     found = associate([sightings(people, 0.01, 1.43), sightings(shifted[order], 0.01, 1.43)])
     assert sorted(found.tolist()) == sorted([k, int(np.flatnonzero(order == k)[0])] for k in range(5))
+
+
+def test_beliefs_worked_out_one_by_one_or_all_at_once_are_the_same(monkeypatch):
+    rng = np.random.default_rng(4)
+    people = rng.uniform(-4, 4, (7, 2))
+    team = [sightings(people + rng.normal(0, 1, 2) + rng.normal(0, 0.2, (7, 2)), 0.05, 1.4) for _ in range(3)]
+    together_at_once = associate(team)
+    monkeypatch.setattr(fusion, "MATRICES", 1)
+    assert np.array_equal(associate(team), together_at_once)
+    assert (together_at_once >= 0).all(axis=1).sum() >= 5
 
 
 def test_each_sighting_is_of_exactly_one_person_whatever_the_order_of_the_vehicles():

@@ -23,6 +23,9 @@ ROUNDS = 3
 BELIEFS = 60
 """So many pairs at most are tried as the one that tells how far a vehicle is off."""
 
+MATRICES = 20_000
+"""Beliefs times pairs that are worked out at once: a few megabytes."""
+
 
 @dataclass(frozen=True)
 class Fused:
@@ -148,25 +151,48 @@ def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) 
     common = np.einsum("nik,mjk->nimj", seen.camera_m, seen.camera_m)
     best, most = np.zeros((0, 2), np.int64), 0.0
     likely = np.argsort(distance, axis=None)[:BELIEFS]
-    for person, row in zip(*np.unravel_index(likely, distance.shape), strict=True):
-        if distance[person, row] >= limit:
-            break
-        # Covariance of what any other pair is apart with what this one is: (P, N, 2, 2).
-        cross = joint[:, :, person][:, None] + common[:, :, row][None]
-        gain = cross @ np.linalg.inv(spread[person, row])
-        left = apart - gain @ apart[person, row]
-        rest = _squared(left, spread - gain @ cross.swapaxes(-1, -2))
-        rest[person, :] = rest[:, row] = np.inf
-        rest[person, row] = distance[person, row]
-        found = pairs(np.where(rest < limit, limit - rest, -np.inf))
-        agreed = (limit - rest[found[:, 0], found[:, 1]]).sum()
-        if agreed > most:
-            best, most = found, agreed
+    likely = likely[distance.ravel()[likely] < limit]
+    persons, rows = np.unravel_index(likely, distance.shape)
+    at_once = max(1, MATRICES // max(distance.size, 1))
+    for begin in range(0, len(likely), at_once):
+        person, row = persons[begin : begin + at_once], rows[begin : begin + at_once]
+        # Covariance of what any other pair is apart with what this one is in its own sigmas: (beliefs, P, N, 2, 2).
+        whiten = np.linalg.inv(np.linalg.cholesky(spread[person, row])).swapaxes(1, 2)
+        of_person, of_row = (
+            held.transpose(2, 0, 1, 3) @ whiten[:, None] for held in (joint[:, :, person], common[:, :, row])
+        )
+        cross = of_person[:, :, None] + of_row[:, None]
+        told = np.einsum("kij,ki->jk", whiten, apart[person, row])[:, :, None, None]
+        # By components: NumPy is slow with many small matrices.
+        (ee, en), (ne, nn) = np.moveaxis(cross, (-2, -1), (0, 1))
+        rest = _by_covariance(
+            apart[..., 0] - ee * told[0] - en * told[1],
+            apart[..., 1] - ne * told[0] - nn * told[1],
+            spread[..., 0, 0] - ee**2 - en**2,
+            spread[..., 0, 1] - ee * ne - en * nn,
+            spread[..., 1, 1] - ne**2 - nn**2,
+        )
+        belief = np.arange(len(person))
+        rest[belief, person, :] = rest[belief, :, row] = np.inf
+        rest[belief, person, row] = distance[person, row]
+        score = np.where(rest < limit, limit - rest, 0.0)
+        reach = np.minimum(score.max(axis=2).sum(axis=1), score.max(axis=1).sum(axis=1))
+        for k in np.flatnonzero(reach > most).tolist():
+            if reach[k] > most:  # which may have grown
+                found = pairs(score[k])
+                agreed = score[k][found[:, 0], found[:, 1]].sum()
+                if agreed > most:
+                    best, most = found, agreed
     return best
 
 
 def _squared(apart: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared distances by their covariances; (..., 2) and (..., 2, 2)."""
-    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    east, north = apart[..., 0], apart[..., 1]
+    return _by_covariance(
+        apart[..., 0], apart[..., 1], covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    )
+
+
+def _by_covariance(east: np.ndarray, north: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The same, with the variance a of east, the covariance b, and the variance c of north."""
     return (c * east**2 - 2 * b * east * north + a * north**2) / (a * c - b**2)
