@@ -40,7 +40,7 @@ def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, engine, clip
     (clip / "00002.png").write_bytes(b"no picture")
     result = dddas("detect", clip, "--out", tmp_path / "out", "--save", "none")
     assert result.exit_code == 0
-    assert "1 problems while reading, the first: " in result.stdout
+    assert "1 problem while reading, the first: " in result.stdout
     assert len(json.loads((tmp_path / "out/run.json").read_text())["problems"]) == 1
 
 

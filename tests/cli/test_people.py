@@ -184,7 +184,7 @@ def test_in_regions_the_share_of_windows_is_told_and_recorded_with_its_cause(ddd
 def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, stub, clip, tmp_path):
     (clip / "00002.png").write_bytes(b"no picture")
     result = dddas("people", clip, *SMALL, "--out", tmp_path / "out")
-    assert "1 problems while reading, the first: frame 3" in result.stdout
+    assert "1 problem while reading, the first: frame 3" in result.stdout
     assert [line.split(",")[0] for line in rows(tmp_path / "out")] == ["1", "2", "4", "5"]
     assert record(tmp_path / "out")["unreliable"] == [{"first": 3, "last": 3, "cause": "the frame could not be read"}]
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
@@ -229,6 +229,15 @@ def test_a_table_goes_with_one_clip(dddas, stub, clip, tmp_path):
 def test_a_table_that_the_run_would_write_over_is_refused(dddas, stub, clip, tmp_path, name):
     said = bad(dddas("people", clip, "--around", tmp_path / "out" / name, "--out", tmp_path / "out"))
     assert f"{name} is a file that this run writes; choose another folder with --out" in said
+
+
+def test_the_input_is_not_written_over(dddas, stub, photo, tmp_path):
+    assert dddas("people", photo, "--set", "people.padding_px=0", "--out", tmp_path / "out").exit_code == 0
+    drawn = tmp_path / "out/overlay.png"
+    before = drawn.read_bytes()
+    said = bad(dddas("people", drawn, "--set", "people.padding_px=0", "--out", tmp_path / "out"))
+    assert "overlay.png is a file that this run writes; choose another folder with --out" in said
+    assert drawn.read_bytes() == before
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", None])

@@ -221,7 +221,7 @@ def test_the_record_of_a_run_that_begins_late_names_its_first_and_last_frame(ddd
 def test_a_frame_that_cannot_be_decoded_keeps_its_rows_and_is_told(dddas, clip, table, tmp_path):
     (clip / "00002.png").write_bytes(b"no picture")
     result = dddas("track", clip, "--detections", table(), "--out", tmp_path / "out")
-    assert "1 problems while reading, the first: frame 3" in result.stdout
+    assert "1 problem while reading, the first: frame 3" in result.stdout
     assert tracks(tmp_path / "out")[:, 0].tolist() == [1, 2, 3, 4, 5]
     assert record(tmp_path / "out")["unreliable"][1] == {"first": 3, "last": 3, "cause": UNREAD}
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5

@@ -13,7 +13,7 @@ from torchvision_dddas.types import Adjustment, Frame, People, Recognized
 
 def recognized(number, share=1.0, cause="", adjustments=()):
     box_px = np.array([[10, 20, 30, 90.0], [60, 5, 30, 80]])
-    people = People(box_px, np.full(2, 0.9), np.ones(2), np.array([False, True]), box_px) if share else People()
+    people = People(box_px, np.array([0.9, 0.4]), np.ones(2), np.array([False, True]), box_px) if share else People()
     frame = Frame(number, 0.1 * number, np.zeros((120, 160, 3), np.uint8))
     return Recognized(
         frame, people, None if share == 1 else np.zeros((3, 4)), share, cause, adjustments, {"score": 0.02}
@@ -37,7 +37,12 @@ def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(
         ):
             output.write(one)
     kept = record(tmp_path / "out")
-    assert (kept["targets"], kept["cut"], kept["frames"]) == (6, 3, {"written": 5, "unreliable": 1})
+    assert (kept["targets"], kept["unlikely"], kept["cut"], kept["frames"]) == (
+        6,
+        3,
+        3,
+        {"written": 5, "unreliable": 1},
+    )
     assert kept["searched"] == {
         "share_of_windows": pytest.approx(0.4),
         "frames_everywhere": 1,

@@ -4,14 +4,20 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.sinks.people_overlay import CUT, PERSON, SEARCHED, Still, drawn_people
+from torchvision_dddas.sinks.people_overlay import CUT, PERSON, SEARCHED, UNLIKELY, Still, drawn_people
 from torchvision_dddas.types import Frame, People, Recognized
 
 
-def recognized(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause=""):
+def recognized(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause="", score=0.9):
     box_px = np.array(boxes, float).reshape(-1, 4)
     n = len(box_px)
-    people = People(box_px, np.full(n, 0.9), np.ones(n), np.array([i in cut for i in range(n)], bool), box_px)
+    people = People(
+        box_px,
+        np.broadcast_to(score, n).astype(float),
+        np.ones(n),
+        np.array([i in cut for i in range(n)], bool),
+        box_px,
+    )
     image = np.full((240, 320) if grey else (240, 320, 3), 90, np.uint8)
     return Recognized(Frame(3, 0.2, image), people, regions, 0.25, cause)
 
@@ -32,6 +38,24 @@ def test_one_whom_the_border_cuts_has_another_colour():
     made = drawn_people(recognized([(60, 60, 40, 100), (-20, 60, 60, 140)], cut=(1,)))
     assert shows(made, PERSON) and shows(made, CUT)
     assert not shows(drawn_people(recognized()), CUT)
+
+
+def test_one_who_is_less_likely_than_not_is_grey_without_a_number_and_below_the_others():
+    alone = drawn_people(recognized(score=0.4))
+    assert (alone[70:150, 60] == UNLIKELY).all() and not shows(alone, PERSON) and not shows(alone, CUT)
+    assert not shows(drawn_people(recognized(cut=(0,), score=0.4)), CUT)
+    both = drawn_people(recognized([(60, 60, 40, 100), (60, 60, 40, 100)], score=(0.6, 0.4)))
+    assert (both[70:150, 60] == PERSON).all()
+
+
+def test_of_labels_that_overlap_the_best_is_read():
+    pair = [(60, 60, 40, 100), (70, 60, 40, 100)]
+    best_first, best_last = (drawn_people(recognized(boxes, score=score)) for boxes, score in (
+        (pair, (0.99, 0.6)), (pair[::-1], (0.6, 0.99))
+    ))  # fmt: skip
+    np.testing.assert_array_equal(best_first, best_last)
+    alone = drawn_people(recognized(pair[:1], score=0.99))
+    np.testing.assert_array_equal(best_first[40:58, 62:85], alone[40:58, 62:85])
 
 
 def test_regions_are_drawn_where_there_are_some():

@@ -48,5 +48,7 @@ def last_lines(
     """What to tell the user at the end: the counts, what reading got over, notes, and what was made where."""
     lines = [first]
     if count := len(journal.problems):
-        lines.append(f"{count} problems while reading, the first: {journal.problems[0]} (all in run.json)")
+        lines.append(
+            f"{count} problem{'s' * (count != 1)} while reading, the first: {journal.problems[0]} (all in run.json)"
+        )
     return [*lines, *(f"note: {note}" for note in notes), f"{folder}: {', '.join(made)}"]

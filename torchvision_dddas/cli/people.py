@@ -88,8 +88,10 @@ def people_into(
     """
     from torchvision_dddas.sinks.people_output import PeopleOutput
 
-    if around is not None and around.resolve() in [(folder / name).resolve() for name in PeopleOutput.files]:
-        raise InputError(f"--around {around} is a file that this run writes; choose another folder with --out")
+    written = [(folder / name).resolve() for name in PeopleOutput.files]
+    for what, path in (("--around ", around), ("", Path(clip))):
+        if path is not None and path.resolve() in written:
+            raise InputError(f"{what}{path} is a file that this run writes; choose another folder with --out")
     with PeopleOutput(folder, save) as output:
         from torchvision_dddas.recognizing import recognize
         from torchvision_dddas.sources import open_source
@@ -141,6 +143,8 @@ def summary(journal: "PeopleJournal", folder: Path, save: Sequence[str]) -> list
     made = ["detections.csv", "detections.txt", *(journal.overlay for _ in save), "run.json"]
     found = f"{journal.targets} {'person' if journal.targets == 1 else 'people'}"
     first = f"{journal.frames} frame{'s' * (journal.frames != 1)}, {found}"
+    if journal.unlikely:
+        first += f", {journal.unlikely} of them unlikely"
     if journal.cut:
         first += f", {journal.cut} of them cut by the border"
     if journal.share < 1:

@@ -30,9 +30,10 @@ def rectangle(picture: np.ndarray, box: np.ndarray, colour: Colour, thick: int) 
 
 def label(picture: np.ndarray, box: np.ndarray, text: str, colour: Colour) -> None:
     """A text on a patch of its colour, above the box where there is room."""
-    scale = max(picture.shape[0] / 1200, 0.35)
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    scale, thick = max(picture.shape[0] / 1200, 0.35), line_width(picture)
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
     x, y = whole(box[:2]).tolist()
     top = y - height - 4 if y >= height + 4 else y
     cv2.rectangle(picture, (x, top), (x + width + 3, top + height + 3), colour, -1)
-    cv2.putText(picture, text, (x + 2, top + height + 1), cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 1, cv2.LINE_AA)
+    place = x + 2, top + height + 1
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick, cv2.LINE_AA)

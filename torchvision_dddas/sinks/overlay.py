@@ -55,15 +55,15 @@ def _pixel(point: np.ndarray) -> tuple[int, int]:
 def caption(picture: np.ndarray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
     """Write lines, each with its BGR colour, along the lower edge, made to fit the width."""
     height, width = picture.shape[:2]
-    scale, row = height / 1000, max(12, round(height / 28))
+    scale, row, thick = height / 1000, max(12, round(height / 28)), line_width(picture)
     top = max(height - row * len(lines) - row // 3, 0)
     picture[top:] = picture[top:] // 3
     for i, (line, colour) in enumerate(lines):
         plain = line.replace("×", "x").replace("−", "-").encode("ascii", "replace").decode()  # OpenCV's font is ASCII
         size = max(scale, 0.35)
-        while len(plain) > 8 and cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] > width - 8:
+        while len(plain) > 8 and cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, thick)[0][0] > width - 8:
             plain = plain.removesuffix("...")[:-1] + "..." if len(plain) > 12 else plain[:-1]
-        cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), 0, size, colour, 1, cv2.LINE_AA)
+        cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), 0, size, colour, thick, cv2.LINE_AA)
 
 
 class Overlay(Generic[Item]):

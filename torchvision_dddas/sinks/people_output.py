@@ -7,7 +7,7 @@ from typing import Any
 from torchvision_dddas.sinks.journal import Record
 from torchvision_dddas.sinks.output import RunFolder
 from torchvision_dddas.sinks.overlay import Overlay
-from torchvision_dddas.sinks.people_overlay import Still, drawn_people
+from torchvision_dddas.sinks.people_overlay import LIKELY, Still, drawn_people
 from torchvision_dddas.sinks.people_tables import PeopleTables
 from torchvision_dddas.types import Recognized
 
@@ -18,19 +18,20 @@ SAVED = ("overlay",)
 class PeopleJournal(Record):
     """The record of a run that recognizes people; notes say what the user should know of it.
 
-    cut: people whom the picture's border cuts. share: windows searched, as a share of all those of all frames.
-    overlay: name of the film, or of the picture where there is but one.
+    unlikely: people who are less likely than not ones. cut: people whom the picture's border cuts. share: windows
+    searched, as a share of all those of all frames. overlay: name of the film, or of the picture where there is one.
     """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         super().__init__(folder, facts)
-        self.cut = self.everywhere = self.nowhere = self.unread = 0
+        self.unlikely = self.cut = self.everywhere = self.nowhere = self.unread = 0
         self.share = 0.0
         self.overlay = "overlay.mp4"
         self.notes: list[str] = []
 
     def write(self, recognized: Recognized) -> None:
         """Take note of a frame."""
+        self.unlikely += int((recognized.people.score < LIKELY).sum())
         self.cut += int(recognized.people.cut.sum())
         if recognized.cause:
             self.unread += 1
@@ -40,6 +41,7 @@ class PeopleJournal(Record):
             looked = self.frames + 1 - self.unread
             self.share += (recognized.share - self.share) / looked
         self.counts = {
+            "unlikely": self.unlikely,
             "cut": self.cut,
             "searched": {
                 "share_of_windows": round(self.share, 4),
