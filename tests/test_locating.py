@@ -59,6 +59,14 @@ def test_rows_without_identity_are_numbered_after_those_that_have_one():
     assert [look.positions.target.tolist() for look in found([mixed], [cam])] == [[10, 9], [10, 9], [10, 11]]
 
 
+def test_scores_that_are_no_probabilities_make_sure_positions():
+    one = table(camera(), frames=(1,))
+    graded = replace(one, score=np.array([87.0, 3.5]))
+    (located,) = locate(survey([graded], [camera()], [None], SETTINGS), SETTINGS)
+    assert located.positions.score.tolist() == [1, 1]
+    assert located.score.tolist() == [87, 3.5]
+
+
 def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
     south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
     tables = [table(south), table(west, west.place, identity=(40, 30))]

@@ -17,12 +17,16 @@ from torchvision_dddas.types import Camera, Located, Poses, Positions, Sightings
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw: its table, where that puts everyone, as whom and whether cut, a row a box."""
+    """What one camera saw: its table, where that puts everyone, as whom, whether cut and how probable, a row a box.
+
+    score: (N,) in [0, 1]; 1 where the table's scores are on another scale.
+    """
 
     table: DetectionTable
     sightings: Sightings
     target: np.ndarray
     cut: np.ndarray
+    score: np.ndarray
     lonlat_deg: np.ndarray | None
 
 
@@ -80,7 +84,8 @@ def _view(
         degrees = geodesy.plain_lonlat(seen.east_north_m - metres, where.place)
     elif origin is not None:
         degrees = geodesy.lonlat(seen.east_north_m, origin)
-    return View(table, seen, _targets(table), cut, degrees)
+    score = table.score if table.probable else np.ones(len(table))
+    return View(table, seen, _targets(table), cut, score, degrees)
 
 
 def looks(views: Sequence[View], within_frames: int = 0) -> Iterator[tuple[int, list[np.ndarray]]]:
@@ -140,7 +145,7 @@ def _alone(
         view.target[rows],
         seen.east_north_m,
         seen.covariance_m2,
-        view.table.score[rows],
+        view.score[rows],
         origin,
         None if view.lonlat_deg is None else view.lonlat_deg[rows],
     )
@@ -159,7 +164,7 @@ def _together(
         np.array(named, np.int64),
         fused.east_north_m,
         fused.covariance_m2,
-        np.array([max(views[v].table.score[r] for v, r in person) for person in seen], float),
+        np.array([max(views[v].score[r] for v, r in person) for person in seen], float),
         found.origin_deg,
         None if found.origin_deg is None else geodesy.lonlat(fused.east_north_m, found.origin_deg),
     )
