@@ -192,7 +192,7 @@ def _toml(keys: dict[str, object]) -> str:
 def _value(key: str, value: object) -> str:
     if isinstance(value, float) and key not in PLACES:
         return str(float(f"{value:.6g}"))
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _check(key: str, value: float, unit: str) -> None:
