@@ -59,6 +59,12 @@ def test_rows_without_identity_are_numbered_after_those_that_have_one():
     assert [look.positions.target.tolist() for look in found([mixed], [cam])] == [[10, 9], [10, 9], [10, 11]]
 
 
+def test_an_identity_twice_in_a_frame_is_said_with_its_line():
+    twice = replace(table(camera()), identity=np.array([5, 9, 5, 5, 5, 9]))
+    with pytest.raises(InputError, match=r"line 4: identity 5 is there already in frame 2; wanted each once"):
+        survey([twice], [camera()], [None], SETTINGS)
+
+
 def test_scores_that_are_no_probabilities_make_sure_positions():
     one = table(camera(), frames=(1,))
     graded = replace(one, score=np.array([87.0, 3.5]))

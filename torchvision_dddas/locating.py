@@ -49,7 +49,7 @@ def survey(
 
     Local metres are those of the cameras, or east and north of where the first camera stood first.
     Raises InputError where the numbers of tables, cameras and poses differ, cameras mix degrees and metres, poses do
-    not cover the frames, or ground.mode = paper is to fuse.
+    not cover the frames, an identity is twice in a frame, or ground.mode = paper is to fuse.
     """
     if not len(tables) == len(cameras) == len(poses):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
@@ -172,8 +172,20 @@ def _together(
 
 
 def _targets(table: DetectionTable) -> np.ndarray:
-    """The identity of each row; where a row has none, its place in the frame, after the identities of the table."""
+    """The identity of each row; where a row has none, its place in the frame, after the identities of the table.
+
+    Raises InputError where a frame has one identity twice.
+    """
     identity = table.identity if table.identity is not None else np.full(len(table), -1)
+    order = np.lexsort((table.line, identity, table.frame))
+    before, after = order[:-1], order[1:]
+    twice = (table.frame[before] == table.frame[after]) & (identity[before] == identity[after]) & (identity[after] > 0)
+    if twice.any():
+        row = after[twice.argmax()]
+        raise InputError(
+            f"{table.path}, line {table.line[row]}: identity {identity[row]} is there already in frame "
+            f"{table.frame[row]}; wanted each once a frame, or -1 where there are none"
+        )
     place = np.arange(len(table)) - np.searchsorted(table.frame, table.frame) + 1
     return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
 
