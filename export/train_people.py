@@ -48,7 +48,7 @@ BATCH = 256
 # Mining and measuring go through the pyramid in steps of at least this: windows of closer levels are much the same.
 STEP = 1.2
 FALSE_PER_WINDOW = (1e-3, 1e-4, 1e-5)
-MOST_WINDOWS = 1_000_000
+MOST_WINDOWS = 100_000  # 1.5 GB of descriptors
 
 
 @dataclass(frozen=True)
