@@ -151,6 +151,14 @@ def test_progress_away_from_a_terminal_is_a_plain_line_now_and_then(capsys, monk
     ]
 
 
+def test_progress_of_large_pictures_is_told_in_seconds_a_frame(capsys, monkeypatch):
+    clock = iter(np.arange(0, 100, 40.0))
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    with progress_module.progress("walk", 3, quiet=False) as tick:
+        tick()
+    assert capsys.readouterr().err == "walk: 1 of 3 frames, 40 s a frame, 80 s left\n"
+
+
 def test_progress_on_a_terminal_shows_frames_a_second(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with progress_module.progress("a [b] clip", None, quiet=False) as tick:

@@ -30,16 +30,16 @@ def _bar(name: str, count: int | None) -> Iterator[Callable[[], None]]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.1f} frames/s"),
+        TextColumn("{task.fields[pace]}"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task, start, done = bar.add_task(escape(name), total=count, rate=0.0), time.monotonic(), 0
+        task, start, done = bar.add_task(escape(name), total=count, pace=""), time.monotonic(), 0
 
         def tick() -> None:
             nonlocal done
             done += 1
-            bar.update(task, advance=1, rate=done / max(time.monotonic() - start, 1e-3))
+            bar.update(task, advance=1, pace=_pace(done / max(time.monotonic() - start, 1e-3)))
 
         yield tick
 
@@ -57,6 +57,11 @@ def _lines(name: str, count: int | None) -> Callable[[], None]:
             rate = done / (now - start)
             total = "" if count is None else f" of {count}"
             left = "" if count is None else f", {max(count - done, 0) / rate:.0f} s left"
-            print(f"{name}: {done}{total} frames, {rate:.1f} frames/s{left}", file=sys.stderr, flush=True)
+            print(f"{name}: {done}{total} frames, {_pace(rate)}{left}", file=sys.stderr, flush=True)
 
     return tick
+
+
+def _pace(rate_hz: float) -> str:
+    """Frames a second, or where that is little seconds a frame."""
+    return f"{rate_hz:.1f} frames/s" if rate_hz >= 0.2 else f"{1 / rate_hz:.0f} s a frame"
