@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -33,12 +34,30 @@ def test_the_demo_finds_most_movers_and_leaves_the_parked_car_alone(tmp_path, mo
 
 
 def test_the_python_of_the_readme_runs_and_finds_targets(tmp_path, monkeypatch, capsys):
-    (code,) = blocks("python")
+    code, _ = blocks("python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
     film_into(tmp_path / "demo-out/clip", frames=8, size=(480, 360))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
     assert "px a frame over the ground" in capsys.readouterr().out
+
+
+def test_the_python_of_the_readme_gives_what_opencv_gives(tmp_path, monkeypatch, capsys):
+    _, code = blocks("python")
+    photo = np.full((240, 320, 3), 200, np.uint8)
+    cv2.ellipse(photo, (160, 110), (16, 40), 0, 0, 360, (40, 40, 40), -1)  # body, head, legs
+    cv2.circle(photo, (160, 62), 10, (40, 40, 40), -1)
+    for side in (-8, 8):
+        cv2.line(photo, (160 + side, 140), (160 + 2 * side, 195), (40, 40, 40), 10)
+    cv2.imwrite(str(tmp_path / "photo.jpg"), photo)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    detector = cv2.HOGDescriptor()
+    detector.setSVMDetector(np.asarray(cv2.HOGDescriptor.getDefaultPeopleDetector()))
+    theirs, _ = detector.detectMultiScale(cv2.imread("photo.jpg"), winStride=(8, 8), padding=(0, 0), scale=1.05)
+    assert len(theirs)
+    found = f"{len(theirs)} people; windows {theirs.astype(float).tolist()} scores "
+    assert capsys.readouterr().out.startswith(found)
 
 
 @pytest.mark.parametrize("line", COMMANDS)
