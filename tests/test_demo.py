@@ -50,13 +50,14 @@ def test_the_python_of_the_readme_gives_what_opencv_gives(tmp_path, monkeypatch,
     for side in (-8, 8):
         cv2.line(photo, (160 + side, 140), (160 + 2 * side, 195), (40, 40, 40), 10)
     cv2.imwrite(str(tmp_path / "photo.jpg"), photo)
+    photo = np.asarray(cv2.imread(str(tmp_path / "photo.jpg")))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
     detector = cv2.HOGDescriptor()
     detector.setSVMDetector(np.asarray(cv2.HOGDescriptor.getDefaultPeopleDetector()))
-    theirs, _ = detector.detectMultiScale(cv2.imread("photo.jpg"), winStride=(8, 8), padding=(0, 0), scale=1.05)
+    theirs, _ = detector.detectMultiScale(photo, winStride=(8, 8), padding=(0, 0), scale=1.05)
     assert len(theirs)
-    found = f"{len(theirs)} people; windows {theirs.astype(float).tolist()} scores "
+    found = f"{len(theirs)} people; windows {np.asarray(theirs, float).tolist()} scores "
     assert capsys.readouterr().out.startswith(found)
 
 
