@@ -84,17 +84,6 @@ def confirm_pictures(
     return _frames(blobs.frame, identity, looks, settings, interval)
 
 
-def lasts(blobs: Positions) -> bool:
-    """Whether target numbers look like identities: not if every frame counts its own from 1, in different numbers."""
-    counts = set()
-    for frame in np.unique(blobs.frame).tolist():
-        targets = np.sort(blobs.target[_rows(blobs.frame, frame)])
-        if (targets != np.arange(1, len(targets) + 1)).any():
-            return True
-        counts.add(len(targets))
-    return len(counts) <= 1
-
-
 def _frames(
     frame: np.ndarray,
     identity: np.ndarray,

@@ -48,7 +48,7 @@ def rows(folder):
 
 def test_blobs_become_human_not_human_and_unseen_with_the_evidence(dddas, scene, tmp_path):
     blobs, people, camera = scene
-    done = dddas("confirm", blobs, people, "--camera", camera, "--out", tmp_path / "out")
+    done = dddas("confirm", blobs, people, "--camera", camera, "--identities", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     assert "2 human, 2 not human, 2 unseen" in done.stdout
     found = rows(tmp_path / "out")
@@ -63,6 +63,18 @@ def test_blobs_become_human_not_human_and_unseen_with_the_evidence(dddas, scene,
     assert record["state"] == "complete"
     assert record["kinds"] == {"human": 2, "not_human": 2, "unseen": 2}
     assert record["rows_looked_at"] == 4
+
+
+def test_numbers_that_are_anew_in_each_frame_do_not_add_up(dddas, tmp_path):
+    near, far = (0, 10), (5, 10)
+    order = [(near, far), (far, near), (far, near)]  # 1 and 2 are not the same blobs in each frame
+    lines = [place(f, n, *where) for f, pair in enumerate(order, 1) for n, where in enumerate(pair, 1)]
+    blobs = write(tmp_path / "air.csv", HEADER, *lines)
+    people = write(tmp_path / "ugv.csv", HEADER, *(place(f, 1, 0, 10, 0.1) for f in (1, 2, 3)))
+    done = dddas("confirm", blobs, people, "--out", tmp_path / "out")
+    assert "note: every row is judged alone" in done.stdout
+    kinds = [row["kind"] for row in rows(tmp_path / "out")]
+    assert kinds == ["human", "unseen", "unseen", "human", "unseen", "human"]
 
 
 def test_without_a_camera_nothing_is_found_not_human_and_a_note_says_so(dddas, scene, tmp_path):
@@ -86,7 +98,7 @@ def test_several_vehicles_have_a_table_and_a_camera_each(dddas, scene, tmp_path)
 def test_frames_in_which_nobody_was_looked_for_say_nothing(dddas, scene, tmp_path):
     blobs, people, camera = scene
     words = ["--camera", camera, "--out", tmp_path / "out", "--quiet"]
-    assert dddas("confirm", blobs, people, *words, "--interval", 2).exit_code == 0
+    assert dddas("confirm", blobs, people, *words, "--identities", "--interval", 2).exit_code == 0
     found = rows(tmp_path / "out")
     assert [row["seen_by"] for row in found[3:]] == ["", "", ""]
     assert [row["probability"] for row in found[:3]] == [row["probability"] for row in found[3:]]
@@ -188,7 +200,7 @@ def test_a_table_without_rows_is_confirmed_to_one_without_rows(dddas, scene, tmp
         (["{blobs}", "{people}", "--poses", "{blobs}"], "0 cameras and 1 files of poses"),
         (["{blobs}", "{people}", "--interval", "0"], "--interval is 0"),
         (["{blobs}", "{people}", "--set", "confirm.prior=2"], "confirm.prior"),
-        (["{twice}", "{people}"], "target 3 is twice in frame 1"),
+        (["{twice}", "{people}", "--identities"], "target 3 is twice in frame 1"),
         (["{odd}", "{people}"], "line 2: east_m is 'x'"),
         (["{blobs}", "{people}", "--camera", "{degrees}"], "no longitude_deg and latitude_deg"),
         (["{bytes}", "{people}"], "is no CSV text"),

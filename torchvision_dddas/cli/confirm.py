@@ -143,26 +143,27 @@ def _on_the_ground(
     rate_hz: float | None,
     notes: list[str],
 ) -> _Found:
-    from torchvision_dddas.confirming import confirm_positions, lasts
+    from torchvision_dddas.confirming import confirm_positions
     from torchvision_dddas.sinks.confirmed import COLUMNS
     from torchvision_dddas.sources.positions import read_positions
     from torchvision_dddas.sources.rows import read_rows
 
     given = read_positions(blobs)
-    vehicles = _vehicles(people, cameras, poses)
+    vehicles = _vehicles(people, cameras, poses, notes)
     if not cameras:
         notes.append("without --camera nothing is known of what was seen: no blob can be found not human")
-    lasting = lasts(given) if identities is None else identities
-    if identities is None and not lasting:
-        notes.append("each frame counts its targets from 1: every row is judged alone (--identities adds looks up)")
+    if identities is None:  # a table of positions does not say it, and looks at different blobs must not add up
+        notes.append("every row is judged alone; where target numbers last, --identities adds up the looks at each")
     rows = read_rows(blobs, len(given), COLUMNS)
-    return *rows, confirm_positions(given, vehicles, settings, interval, lasting, rate_hz)
+    return *rows, confirm_positions(given, vehicles, settings, interval, bool(identities), rate_hz)
 
 
-def _vehicles(people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path]) -> "list[Vehicle]":
+def _vehicles(
+    people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
+) -> "list[Vehicle]":
     """The tables with their cameras: one each, or all of them to a single table. Raises InputError otherwise."""
     from torchvision_dddas.confirming import Vehicle
-    from torchvision_dddas.sources.cameras import read_camera, read_poses
+    from torchvision_dddas.sources.cameras import left_open, read_camera, read_poses
     from torchvision_dddas.sources.positions import read_positions
 
     if len(people) > 1 and cameras and len(cameras) != len(people):
@@ -175,6 +176,7 @@ def _vehicles(people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[P
         )
     kinds = [read_camera(path) for path in cameras]
     where = [read_poses(path) for path in poses] if poses else [None] * len(kinds)
+    notes += [note for path, pose in zip(cameras, where, strict=True) if (note := left_open(path, pose))]
     tables = [read_positions(path) for path in people]
     names = _names(people)
     if len(people) == 1:

@@ -62,7 +62,7 @@ def ground_into(
     from torchvision_dddas.locating import survey
     from torchvision_dddas.sinks.positions import PositionOutput
     from torchvision_dddas.sinks.whole import refuse_own_input
-    from torchvision_dddas.sources.cameras import read_camera, read_poses
+    from torchvision_dddas.sources.cameras import left_open, read_camera, read_poses
     from torchvision_dddas.sources.detections import read_detections
 
     if len(cameras) != len(tables):
@@ -85,6 +85,7 @@ def ground_into(
             "settings": settings.model_dump(),
         }
         journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), found.origin_deg is not None)
+        journal.notes += [note for file, pose in zip(cameras, where, strict=True) if (note := left_open(file, pose))]
         with progress("locate", None, quiet) as tick:
             for frame in located(found, settings):
                 output.write(frame)

@@ -30,7 +30,8 @@ def people(
     around: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Search only around these boxes in their frames: detections.csv, MOTChallenge text."
+            metavar="FILE",
+            help="Search around these boxes, and nowhere else unless people.search=regions; CSV or MOTChallenge text.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results; several inputs get a folder each in it.")] = Path(

@@ -95,6 +95,21 @@ def camera_keys(path: str | Path) -> dict[str, Any]:
     return content
 
 
+def left_open(camera: str | Path, poses: "PoseTable | None" = None) -> str:
+    """What a camera's file, and its poses, do not say, and what is taken for it, in words; empty where all is there."""
+    given = {*camera_keys(camera), *(poses.values if poses is not None else ())}
+    gaps = []
+    if "height_m" not in given:
+        gaps.append("no height_m: the foot row tells nothing")
+    if "pitch_deg" not in given:
+        gaps.append("no pitch_deg: it looks level")
+    if "heading_deg" not in given:
+        gaps.append("no heading_deg: it looks north")
+    if not given & {"east_m", "longitude_deg"}:
+        gaps.append("no place: it stands at 0, 0")
+    return f"{camera} has {'; '.join(gaps)}" if gaps else ""
+
+
 def read_camera(path: str | Path) -> Camera:
     """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
     content = camera_keys(path)
