@@ -81,11 +81,15 @@ def test_every_file_that_the_readme_names_is_there():
     assert [name for name in named if not ((package / name).exists() or (ROOT / name).exists())] == []
 
 
-def test_the_configuration_of_the_readme_is_taken(tmp_path):
+def test_the_camera_and_the_configuration_of_the_readme_are_taken(tmp_path):
     from torchvision_dddas.settings import load
+    from torchvision_dddas.sources.cameras import left_open, read_camera
 
-    (text,) = blocks("toml")
-    (tmp_path / "own.toml").write_text(text)
+    camera, own = blocks("toml")
+    (tmp_path / "ugv.toml").write_text(camera)
+    assert read_camera(tmp_path / "ugv.toml").geographic
+    assert left_open(tmp_path / "ugv.toml") == ""
+    (tmp_path / "own.toml").write_text(own)
     assert load(tmp_path / "own.toml").gates.min_area_px == 80
 
 

@@ -48,10 +48,10 @@ def test_tracks_become_positions_with_covariances(dddas, file, tmp_path):
         "locate", "ground", file("t.csv", tracks(camera())), "--camera", file("c.toml", CAMERA), "--out", out
     )
     assert result.exit_code == 0, result.output
+    left = "no pitch_deg: it looks level; no heading_deg: it looks north; no place: it stands at 0, 0"
     assert result.stdout.splitlines() == [
         "3 frames, 6 sightings (6 by height and feet, 0 by height, 0 by feet alone), 6 positions",
-        f"note: {tmp_path / 'c.toml'} has no pitch_deg: it looks level; no heading_deg: it looks north; "
-        "no place: it stands at 0, 0",
+        f"note: {tmp_path / 'c.toml'} has {left}",
         f"{out}: positions.csv, sightings.csv, run.json",
     ]
     found = read_positions(out / "positions.csv")
