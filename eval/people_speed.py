@@ -34,7 +34,8 @@ from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.sources import open_source
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan
-from torchvision_dddas.vision import Part, load_recognizer
+from torchvision_dddas.types import Part
+from torchvision_dddas.vision import load_recognizer
 from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer, opened
 
 KNOBS = PeopleKnobs(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)

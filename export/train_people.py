@@ -38,8 +38,7 @@ from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, remove, t
 from torchvision_dddas.sources.classifiers import layout_of
 from torchvision_dddas.sources.images import IMAGE_SUFFIXES
 from torchvision_dddas.targets.scan import everywhere, levels
-from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.types import LinearSvm, Part
 from torchvision_dddas.vision.torch_people import TorchRecognizer
 from torchvision_dddas.vision.torch_people import layout as descriptor
 

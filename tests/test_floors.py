@@ -24,8 +24,6 @@ FLOORS: dict[str, set[str]] = {
     "ops": {"torch", "kornia", "errors"},
     # Labelling stays in OpenCV for every runtime: hence cv2 here.
     "targets": {"numpy", "scipy", "cv2", "pymap3d", "types", "settings", "errors"},
-    "targets.scan": {"numpy", "vision.protocol", "types", "settings", "errors"},
-    "targets.regions": {"numpy", "targets.scan", "vision.protocol", "types", "settings"},
     "vision": {"numpy", "targets.projective", "types", "settings", "errors"},
     "vision.torch_vision": {"torch", "numpy", "cv2", "ops", "types", "settings", "errors"},
     "vision.torch_registration": {"torch", "numpy", "ops", "targets.projective", "types", "settings", "errors"},

@@ -12,8 +12,8 @@ from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets import scan
 from torchvision_dddas.targets.persons import people_of
 from torchvision_dddas.targets.regions import Look, Search
-from torchvision_dddas.types import Frame, People, Recognized
-from torchvision_dddas.vision.protocol import Part, Recognizer
+from torchvision_dddas.types import Frame, Part, People, Recognized
+from torchvision_dddas.vision.protocol import Recognizer
 
 UNREAD = "the frame could not be read"
 

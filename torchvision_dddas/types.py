@@ -94,6 +94,21 @@ class LinearSvm:
 
 
 @dataclass(frozen=True)
+class Part:
+    """A rectangle of a level of the pyramid, in pixels of that level: the windows that lie in it are scored.
+
+    level: (width, height) that the picture is resized to. x, y: of the top left pixel, multiples of the window stride
+    from -padding on. width, height: of the part.
+    """
+
+    level: tuple[int, int]
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
 class People:
     """The people recognized in one frame, one row a person.
 

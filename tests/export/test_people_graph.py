@@ -20,8 +20,8 @@ from export import people_graph as script
 from torchvision_dddas.ops import hog
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
-from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision import Part, load_recognizer
+from torchvision_dddas.types import LinearSvm, Part
+from torchvision_dddas.vision import load_recognizer
 from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
 
 NAMES = "people.onnx", "people_histograms.onnx", "people_scores.onnx"

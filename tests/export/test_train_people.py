@@ -15,9 +15,8 @@ from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import classifier_of, features_of, read_classifier
 from torchvision_dddas.targets.persons import people_of
 from torchvision_dddas.targets.scan import everywhere, windows
-from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.types import LinearSvm, Part
 from torchvision_dddas.vision import load_recognizer
-from torchvision_dddas.vision.protocol import Part
 
 SMALL = PeopleKnobs(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
 SET = [

@@ -10,7 +10,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs, load
 from torchvision_dddas.targets import scan
 from torchvision_dddas.targets.persons import body
-from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.types import Part
 
 SIZE = (180, 220)
 

@@ -15,10 +15,10 @@ import pytest
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
+from torchvision_dddas.types import Part
 from torchvision_dddas.vision import onboard_gradient, onboard_people
 from torchvision_dddas.vision.onboard_gradient import Gradient
 from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
-from torchvision_dddas.vision.protocol import Part
 from torchvision_dddas.vision.scratch import Scratch, spans
 
 SVM = read_classifier("opencv", 3780)

@@ -14,8 +14,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan, suppress
-from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision import Part, Recognizer, load_recognizer, torch_people
+from torchvision_dddas.types import LinearSvm, Part
+from torchvision_dddas.vision import Recognizer, load_recognizer, torch_people
 from torchvision_dddas.vision.torch_people import TorchRecognizer
 
 BACK_ENDS = "torch", "onboard"

@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.targets import scan
-from torchvision_dddas.types import Adjustment, People
-from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.types import Adjustment, Part, People
 
 Regions = tuple[np.ndarray, np.ndarray]
 """region_px (R, 4), which a body must lie in; heights_px (R, 2), its least and largest height."""

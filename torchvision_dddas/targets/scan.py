@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.types import Part
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from importlib.util import find_spec
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs, Settings
 from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.protocol import Foreground, Part, Recognizer, View, Vision, Window
+from torchvision_dddas.vision.protocol import Foreground, Recognizer, View, Vision, Window
 
-__all__ = ["Foreground", "Part", "Recognizer", "View", "Vision", "Window", "load", "load_recognizer"]
+__all__ = ["Foreground", "Recognizer", "View", "Vision", "Window", "load", "load_recognizer"]
 
 
 def load(backend: str, settings: Settings) -> Vision:

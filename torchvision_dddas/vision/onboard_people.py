@@ -19,9 +19,8 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.types import LinearSvm
+from torchvision_dddas.types import LinearSvm, Part
 from torchvision_dddas.vision.onboard_gradient import Gradient
-from torchvision_dddas.vision.protocol import Part
 from torchvision_dddas.vision.scratch import spans
 
 SHIPPED = Path(__file__).parents[1] / "graphs"

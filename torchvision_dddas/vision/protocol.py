@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from torchvision_dddas.types import Registration
+from torchvision_dddas.types import Part, Registration
 
 # Evidence crosses the seam as 8-bit maps: in sixteenths of the local noise, cut off at 15 noise units.
 EVIDENCE_SCALE = 16.0
@@ -87,21 +87,6 @@ class Vision(Protocol):
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """What moves in each window's reference frame."""
         ...
-
-
-@dataclass(frozen=True)
-class Part:
-    """A rectangle of a level of the pyramid, in pixels of that level: the windows that lie in it are scored.
-
-    level: (width, height) that the picture is resized to. x, y: of the top left pixel, multiples of the window stride
-    from -padding on. width, height: of the part.
-    """
-
-    level: tuple[int, int]
-    x: int
-    y: int
-    width: int
-    height: int
 
 
 class Recognizer(Protocol):

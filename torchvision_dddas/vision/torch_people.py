@@ -12,8 +12,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.ops import hog
 from torchvision_dddas.ops.resize import reflected, resize
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.protocol import Part
+from torchvision_dddas.types import LinearSvm, Part
 
 # So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
 _PIXELS = {"cpu": 1 << 18, "cuda": 1 << 24}
