@@ -17,9 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from torchvision_dddas.settings import load
-from torchvision_dddas.sources.classifiers import classifier_of
+from torchvision_dddas.recognizing import recognizer_of
 from torchvision_dddas.targets import scan
-from torchvision_dddas.vision import load_recognizer
 
 def held_mb():
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -29,7 +28,7 @@ width, height, frames, threads, *chosen = sys.argv[1:]
 size, knobs = (int(width), int(height)), load(None, chosen).people
 cv2.setNumThreads(int(threads))
 held = [held_mb()]
-recognizer = load_recognizer("onboard", knobs, classifier_of(knobs))
+recognizer = recognizer_of(knobs, "onboard")
 for frame in range(int(frames)):
     image = np.random.default_rng(frame).integers(0, 256, (size[1], size[0], 3), np.uint8)
     recognizer.scores([image], [scan.everywhere(size, knobs)])

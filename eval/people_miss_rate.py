@@ -14,7 +14,6 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -24,12 +23,10 @@ from people_curves import CLIPS, Clip, Curve, Found, curve, matched, plot, read
 from people_opencv import Setting
 from scipy.optimize import minimize
 
-from torchvision_dddas.recognizing import people_in
+from torchvision_dddas.recognizing import people_in, recognizer_of
 from torchvision_dddas.settings import PeopleKnobs, load
-from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets.persons import probability
 from torchvision_dddas.types import People
-from torchvision_dddas.vision import load_recognizer
 
 DEFAULTS = Setting(1.0, 1.05, 8, 0, 2, 0.0)
 
@@ -81,8 +78,7 @@ def main() -> None:
 
 def recognized(clip: Clip, knobs: PeopleKnobs) -> dict[int, People]:
     """The people of every frame, by the onboard back end."""
-    features = cv2.HOGDescriptor().getDescriptorSize()
-    recognizer = load_recognizer("onboard", knobs, read_classifier(knobs.classifier, features))
+    recognizer = recognizer_of(knobs, "onboard")
     found = {}
     for i, (number, image) in enumerate(clip.frames.items(), start=1):
         (found[number],) = people_in([image], recognizer, knobs)

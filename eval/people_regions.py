@@ -21,14 +21,13 @@ from people_curves import CLIPS, matched
 
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.recognizing import recognize
+from torchvision_dddas.recognizing import recognize, recognizer_of
 from torchvision_dddas.run import scenes
 from torchvision_dddas.settings import Settings, load, with_knobs
 from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.classifiers import classifier_of
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.types import Frame, Recognized
-from torchvision_dddas.vision import Recognizer, load_recognizer
+from torchvision_dddas.vision import Recognizer
 from torchvision_dddas.vision import load as load_vision
 
 LIKELY = 0.5
@@ -53,7 +52,7 @@ def main() -> None:
     if not places:
         sys.exit(f"{options.data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
     settings = load(overrides=options.set)
-    engine = load_recognizer(options.backend, settings.people, classifier_of(settings.people))
+    engine = recognizer_of(settings.people, options.backend)
     rows = [
         "| clip | searched | recall % | of everywhere % | false boxes a frame | windows % | time |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |",

@@ -28,8 +28,8 @@ from people_curves import CLIPS, Clip, Found, curve, read
 
 from export.train_people import Plan, crops, train, write
 from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.recognizing import classifier_of
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources.classifiers import classifier_of
 from torchvision_dddas.targets.persons import people_of
 from torchvision_dddas.targets.scan import everywhere, windows
 from torchvision_dddas.types import LinearSvm

@@ -35,7 +35,6 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.ops import hog
 from torchvision_dddas.settings import PeopleKnobs, load
 from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, remove, temporary, write_whole
-from torchvision_dddas.sources.classifiers import layout_of
 from torchvision_dddas.sources.images import IMAGE_SUFFIXES
 from torchvision_dddas.targets.scan import everywhere, levels
 from torchvision_dddas.types import LinearSvm, Part
@@ -425,7 +424,7 @@ def write(path: Path, svm: LinearSvm, knobs: PeopleKnobs) -> None:
     """As .npz with the layout, else as text that tells it in its comments. Raises InputError if the disk refuses."""
     import io
 
-    layout = layout_of(knobs)
+    layout = knobs.descriptor
     held = io.BytesIO()
     if path.suffix.lower() == ".npz":
         # The format keeps no names of its own in `layout`, so arrays of the same name do.

@@ -49,7 +49,6 @@ FLOORS: dict[str, set[str]] = {
     "locating": {"numpy", "sources", "targets", "types", "settings", "errors"},
     "following": {"numpy", "sources", "vision", "targets", "types", "settings", "errors"},
     "sources": {"numpy", "cv2", "av", "simulation", "types", "errors"},
-    "sources.classifiers": {"numpy", "cv2", "types", "settings", "errors"},
     "sinks": {"numpy", "cv2", "av", "types", "errors", "__init__"},
     "simulation": {"numpy", "cv2", "types", "targets.geodesy", "errors"},
     "metrics": {"numpy", "scipy", "cv2", "types", "errors"},

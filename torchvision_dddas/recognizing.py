@@ -8,14 +8,25 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs, Settings
+from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets import scan
 from torchvision_dddas.targets.persons import people_of
 from torchvision_dddas.targets.regions import Look, Search
-from torchvision_dddas.types import Frame, Part, People, Recognized
-from torchvision_dddas.vision.protocol import Recognizer
+from torchvision_dddas.types import Frame, LinearSvm, Part, People, Recognized
+from torchvision_dddas.vision import Recognizer, load_recognizer
 
 UNREAD = "the frame could not be read"
+
+
+def recognizer_of(knobs: PeopleKnobs, backend: str = "auto") -> Recognizer:
+    """The recognizer that the settings name, on a back end. Raises InputError as `vision.load` and `classifier_of`."""
+    return load_recognizer(backend, knobs, classifier_of(knobs))
+
+
+def classifier_of(knobs: PeopleKnobs) -> LinearSvm:
+    """The classifier that the settings name. Raises InputError as `read_classifier`, for one that does not fit them."""
+    return read_classifier(knobs.classifier, knobs.features, knobs.descriptor)
 
 
 def recognize(

@@ -388,6 +388,34 @@ class PeopleKnobs(Group):
                 )
         return self
 
+    @property
+    def blocks(self) -> tuple[int, int]:
+        """Blocks of a window, (across, down)."""
+        across, down = (
+            (side - self.block_px) // self.block_stride_px + 1 for side in (self.window_width_px, self.window_height_px)
+        )
+        return across, down
+
+    @property
+    def features(self) -> int:
+        """Numbers of the descriptor of one window."""
+        across, down = self.blocks
+        return across * down * (self.block_px // self.cell_px) ** 2 * self.bins
+
+    @property
+    def descriptor(self) -> dict[str, object]:
+        """What the descriptor is, as files of classifiers tell it; lengths in px, the window as (width, height)."""
+        return {
+            "window": (self.window_width_px, self.window_height_px),
+            "cell": self.cell_px,
+            "block": self.block_px,
+            "stride": self.block_stride_px,
+            "bins": self.bins,
+            "signed": self.signed,
+            "clip": self.clip,
+            "gamma": self.gamma,
+        }
+
 
 class GroundKnobs(Group):
     """Where people stand, seen from the ground (appendix A, IV-C), and which of several sightings are one person."""

@@ -52,11 +52,11 @@ def stub(monkeypatch):
     def install(found=True):
         loads = []
 
-        def load(settings, backend):
+        def load(knobs, backend):
             loads.append(backend)
-            return Stub(settings.people, found)
+            return Stub(knobs, found)
 
-        monkeypatch.setattr(sys.modules["torchvision_dddas.cli.people"], "recognizer_of", load)
+        monkeypatch.setattr("torchvision_dddas.recognizing.recognizer_of", load)
         return loads
 
     install()
@@ -293,9 +293,10 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
                     time.sleep(60)
             yield tick
 
-        people = sys.modules["torchvision_dddas.cli.people"]
-        people.progress = stopping
-        people.recognizer_of = lambda settings, backend: Stub(settings.people)
+        import torchvision_dddas.recognizing
+
+        sys.modules["torchvision_dddas.cli.people"].progress = stopping
+        torchvision_dddas.recognizing.recognizer_of = lambda knobs, backend: Stub(knobs)
         torchvision_dddas.cli.main()
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "people", str(clip), *SMALL]

@@ -11,8 +11,9 @@ pytest.importorskip("torch")
 
 from export import train_people as script
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.recognizing import classifier_of, recognizer_of
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources.classifiers import classifier_of, features_of, read_classifier
+from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets.persons import people_of
 from torchvision_dddas.targets.scan import everywhere, windows
 from torchvision_dddas.types import LinearSvm, Part
@@ -85,7 +86,7 @@ def trained(folders):
 def test_what_was_trained_finds_people_again_in_other_pictures(trained):
     rng = np.random.default_rng(99)
     knobs = SMALL.model_copy(update={"classifier": str(trained)})
-    recognizer = load_recognizer("torch", knobs, classifier_of(knobs))
+    recognizer = recognizer_of(knobs, "torch")
     right = 0
     for _ in range(10):
         image = background(rng, (160, 120))
@@ -102,7 +103,7 @@ def test_what_was_trained_finds_people_again_in_other_pictures(trained):
 def test_hard_negatives_push_the_background_below_zero(trained):
     rng = np.random.default_rng(7)
     knobs = SMALL.model_copy(update={"classifier": str(trained)})
-    recognizer = load_recognizer("torch", knobs, classifier_of(knobs))
+    recognizer = recognizer_of(knobs, "torch")
     image = background(rng, (320, 240))
     parts = everywhere((320, 240), knobs)
     scores = np.concatenate([m.ravel() for m in recognizer.scores([image], [parts])[0]])
@@ -139,7 +140,7 @@ def test_descriptors_under_the_weights_are_the_recognizers_scores(knobs):
     rng = np.random.default_rng(1)
     image = background(rng, (200, 170))
     size = knobs.window_width_px, knobs.window_height_px
-    weights = rng.normal(size=features_of(knobs)).astype(np.float32)
+    weights = rng.normal(size=knobs.features).astype(np.float32)
     parts = everywhere((200, 170), knobs)
     maps = load_recognizer("torch", knobs, LinearSvm(weights, 0.5)).scores([image], [parts])[0]
     places, wanted = [], []

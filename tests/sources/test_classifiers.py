@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.recognizing import classifier_of
 from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources.classifiers import classifier_of, features_of, layout_of, read_classifier
+from torchvision_dddas.sources.classifiers import read_classifier
 
 WEIGHTS = np.array([0.5, -1.25, 3.0, 0.0, 2.0, -0.75], np.float32)
 BIAS = -0.5
@@ -28,7 +29,7 @@ def write(folder, name, content):
 def test_the_shipped_classifier_is_opencvs_default_people_detector():
     svm = classifier_of(PeopleKnobs())
     theirs = np.ravel(cv2.HOGDescriptor.getDefaultPeopleDetector())
-    assert features_of(PeopleKnobs()) == 3780
+    assert PeopleKnobs().features == 3780
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), theirs, rtol=0, atol=1e-8)
 
 
@@ -45,7 +46,7 @@ def test_the_length_of_a_descriptor_is_opencvs(knobs, length):
     made = PeopleKnobs(**knobs)
     window, stride = (made.window_width_px, made.window_height_px), (made.block_stride_px,) * 2
     theirs = cv2.HOGDescriptor(window, (16, 16), stride, (8, 8), made.bins).getDescriptorSize()
-    assert features_of(made) == theirs == length
+    assert made.features == theirs == length
 
 
 @pytest.mark.parametrize(
@@ -75,7 +76,7 @@ def test_without_a_bias_it_is_zero(tmp_path):
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])
 def test_what_opencvs_descriptor_saves_is_read_with_its_layout(tmp_path, ending):
     knobs = PeopleKnobs(window_width_px=32, window_height_px=64, classifier=str(tmp_path / f"hog.{ending}"))
-    numbers = np.random.default_rng(0).normal(size=features_of(knobs) + 1).astype(np.float32)
+    numbers = np.random.default_rng(0).normal(size=knobs.features + 1).astype(np.float32)
     theirs = cv2.HOGDescriptor((32, 64), (16, 16), (8, 8), (8, 8), 9, 1, -1, 0, 0.2, True)
     theirs.setSVMDetector(numbers)
     theirs.save(knobs.classifier)
@@ -155,7 +156,7 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
 def test_a_mistake_gets_one_line_that_says_what_to_do(tmp_path, name, content, wanted, capfd):
     path = write(tmp_path, name, content)
     with pytest.raises(InputError) as error:
-        read_classifier(path, 6, layout_of(PeopleKnobs()))
+        read_classifier(path, 6, PeopleKnobs().descriptor)
     assert "\n" not in str(error.value)
     for part in [str(path), *wanted]:
         assert part in str(error.value)

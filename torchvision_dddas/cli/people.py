@@ -50,6 +50,7 @@ def people(
 
     Writes detections.txt (MOTChallenge), detections.csv with the feet, overlay.mp4 (.png for a picture) and run.json.
     """
+    from torchvision_dddas import recognizing
     from torchvision_dddas.settings import load
     from torchvision_dddas.sinks import saved
     from torchvision_dddas.sinks.people_output import SAVED
@@ -57,20 +58,12 @@ def people(
     settings, names = load(config, set_ or []), saved(save, SAVED)
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
-    recognizer = cache(lambda: recognizer_of(settings, backend.value))
+    recognizer = cache(lambda: recognizing.recognizer_of(settings.people, backend.value))
     for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
         journal = people_into(folder, clip, recognizer, settings, names, around, rate, quiet)
         if not quiet:
             for line in summary(journal, folder, names):
                 typer.echo(line)
-
-
-def recognizer_of(settings: "Settings", backend: str) -> "Recognizer":
-    """The recognizer that the settings name, on a back end. Raises InputError for a classifier that does not fit."""
-    from torchvision_dddas.sources.classifiers import classifier_of
-    from torchvision_dddas.vision import load_recognizer
-
-    return load_recognizer(backend, settings.people, classifier_of(settings.people))
 
 
 def people_into(

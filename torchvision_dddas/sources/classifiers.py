@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm
 
 SHIPPED = {"opencv": Path(__file__).parents[1] / "models" / "opencv_people.txt"}
 
 Layout = Mapping[str, object]
-"""What a file may say of the descriptor it was trained on: the keys of `layout_of`, all or some."""
+"""What a file may say of the descriptor it was trained on: the keys of `PeopleKnobs.descriptor`, all or some."""
 
 _KNOBS = {
     "window": "people.window_width_px and people.window_height_px",
@@ -29,41 +28,13 @@ _KNOBS = {
 _DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
 
 
-def layout_of(knobs: PeopleKnobs) -> dict[str, object]:
-    """What the descriptor is, as a file tells it: window (width, height), cell, block, stride in px, and the rest."""
-    return {
-        "window": (knobs.window_width_px, knobs.window_height_px),
-        "cell": knobs.cell_px,
-        "block": knobs.block_px,
-        "stride": knobs.block_stride_px,
-        "bins": knobs.bins,
-        "signed": knobs.signed,
-        "clip": knobs.clip,
-        "gamma": knobs.gamma,
-    }
-
-
-def features_of(knobs: PeopleKnobs) -> int:
-    """Numbers of the descriptor of one window."""
-    blocks = [
-        max(0, (side - knobs.block_px) // knobs.block_stride_px + 1)
-        for side in (knobs.window_width_px, knobs.window_height_px)
-    ]
-    return blocks[0] * blocks[1] * (knobs.block_px // knobs.cell_px) ** 2 * knobs.bins
-
-
-def classifier_of(knobs: PeopleKnobs) -> LinearSvm:
-    """The classifier that the settings name. Raises InputError as `read_classifier`."""
-    return read_classifier(knobs.classifier, features_of(knobs), layout_of(knobs))
-
-
 def read_classifier(name: str | Path, features: int, wanted: Layout | None = None) -> LinearSvm:
     """The classifier of a shipped name, or of a file; features: the length of the descriptor it must fit.
 
     Files: text (numbers apart by blanks, commas or lines; `#` begins a comment), .npy, .npz (weights, bias, and any of
-    the keys of `layout_of`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor with its SVMDetector,
-    or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the descriptor in use, which
-    must be the one that the file tells of, if it does.
+    the keys of `PeopleKnobs.descriptor`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor with its
+    SVMDetector, or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the descriptor in
+    use, which must be the one that the file tells of, if it does.
     Raises InputError: no such file, not readable, another length (with both), another descriptor, not finite numbers.
     """
     path = SHIPPED.get(str(name), Path(name))

@@ -203,15 +203,11 @@ def arranged(svm: LinearSvm, knobs: PeopleKnobs) -> np.ndarray:
 
     Raises InputError where the SVM is of another length than the descriptor.
     """
-    across, down = (
-        (window - knobs.block_px) // knobs.block_stride_px + 1
-        for window in (knobs.window_width_px, knobs.window_height_px)
-    )
-    cells = knobs.block_px // knobs.cell_px
-    wanted = across * down * cells**2 * knobs.bins
-    if svm.weights.size != wanted:
+    (across, down), cells = knobs.blocks, knobs.block_px // knobs.cell_px
+    if svm.weights.size != knobs.features:
         raise InputError(
-            f"the classifier {svm.origin} has {svm.weights.size} weights; a window of these settings has {wanted}"
+            f"the classifier {svm.origin} has {svm.weights.size} weights; a window of these settings has "
+            f"{knobs.features}"
         )
     weights = svm.weights.astype(np.float32).reshape(across, down, cells, cells, knobs.bins)
     return np.ascontiguousarray(weights.transpose(1, 0, 4, 3, 2)).reshape(down, across, -1)
