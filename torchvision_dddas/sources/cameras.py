@@ -10,10 +10,9 @@ longitude_deg = -110.95    # or east_m, north_m
 latitude_deg = 32.23
 """
 
-import csv
 import math
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.csv_text import Line, opened
 from torchvision_dddas.types import Camera, Poses
 
 LIMITS: dict[str, tuple[float, float]] = {
@@ -212,13 +212,8 @@ def read_poses(path: str | Path) -> PoseTable:
     Raises InputError with file and line: unreadable, no such column, half a place, no rows, not a finite number, out
     of range, a frame or time that does not come after the one before.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            return _parse(file, str(path))
-    except OSError as error:
-        raise InputError(f"poses {path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"poses {path} is no CSV text: {error}") from None
+    with opened(path, "poses") as (header, lines):
+        return _parse(header, lines, str(path))
 
 
 def poses_at(
@@ -270,9 +265,7 @@ def poses_at(
     return camera, Poses(place, heading, pitch)
 
 
-def _parse(lines: Iterable[str], path: str) -> PoseTable:
-    reader = csv.reader(lines, skipinitialspace=True)
-    header = [name.strip() for name in next(reader, [])]
+def _parse(header: list[str], lines: Iterator[Line], path: str) -> PoseTable:
     columns = ", ".join(header) or "none"
     if twice := [name for name in POSE_COLUMNS if header.count(name) > 1]:
         raise InputError(f"poses {path}: column {twice[0]} is named twice; wanted each name once")
@@ -291,14 +284,12 @@ def _parse(lines: Iterable[str], path: str) -> PoseTable:
     names = ["time_s" if timed else "frame", *wanted]
     places = [header.index(name) for name in names]
     rows: list[list[float]] = []
-    for row in reader:
-        if not any(cell.strip() for cell in row):
-            continue
-        cells = [row[place].strip() if place < len(row) else "" for place in places]
-        rows.append([_cell(c, n, path, reader.line_num) for c, n in zip(cells, names, strict=True)])
+    for number, row in lines:
+        cells = [row[place] if place < len(row) else "" for place in places]
+        rows.append([_cell(c, n, path, number) for c, n in zip(cells, names, strict=True)])
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
             raise InputError(
-                f"poses {path}, line {reader.line_num}: {names[0]} goes from {rows[-2][0]:g} to {rows[-1][0]:g}; "
+                f"poses {path}, line {number}: {names[0]} goes from {rows[-2][0]:g} to {rows[-1][0]:g}; "
                 "wanted each after the one before"
             )
     if not rows:

@@ -1,13 +1,13 @@
 """Heights of a person in pictures and how far off the person stood, from a CSV of `distance_m,height_px`."""
 
-import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.csv_text import Line, opened
 
 COLUMNS = ("distance_m", "height_px")
 
@@ -26,26 +26,18 @@ def read_measurements(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises InputError with file and line: unreadable, a column missing, no rows, not a number above 0.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            return _parse(file, str(path))
-    except OSError as error:
-        raise InputError(f"measurements {path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"measurements {path} is no CSV text: {error}") from None
+    with opened(path, "measurements") as (header, lines):
+        return _parse(header, lines, str(path))
 
 
-def _parse(lines: Iterable[str], path: str) -> tuple[np.ndarray, np.ndarray]:
-    reader = csv.reader(lines, skipinitialspace=True)
-    header = [name.strip() for name in next(reader, [])]
+def _parse(header: list[str], lines: Iterator[Line], path: str) -> tuple[np.ndarray, np.ndarray]:
     if missing := [name for name in COLUMNS if name not in header]:
         raise InputError(f"measurements {path} lacks {', '.join(missing)}; wanted {','.join(COLUMNS)}")
     places = [header.index(name) for name in COLUMNS]
     rows = []
-    for row in reader:
-        if any(cell.strip() for cell in row):
-            cells = [row[place].strip() if place < len(row) else "" for place in places]
-            rows.append([_number(c, n, path, reader.line_num) for c, n in zip(cells, COLUMNS, strict=True)])
+    for number, row in lines:
+        cells = [row[place] if place < len(row) else "" for place in places]
+        rows.append([_number(c, n, path, number) for c, n in zip(cells, COLUMNS, strict=True)])
     if not rows:
         raise InputError(f"measurements {path} has a header but no rows")
     distance, height = np.array(rows, float).T

@@ -1,12 +1,12 @@
 """Positions on the ground from a CSV, as `dddas locate` writes it."""
 
-import csv
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.csv_text import Line, opened
 from torchvision_dddas.sources.detections import LAST_FRAME
 from torchvision_dddas.types import Positions
 
@@ -29,18 +29,11 @@ def read_positions(path: str | Path) -> Positions:
     range (see LIMITS), a frame or target that is not whole and 1 or more, variances that are none, a longitude and
     latitude that only some rows have.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            return _parse(file, str(path))
-    except OSError as error:
-        raise InputError(f"positions {path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"positions {path} is no CSV text: {error}") from None
+    with opened(path, "positions") as (header, lines):
+        return _parse(header, lines, str(path))
 
 
-def _parse(lines: Iterable[str], path: str) -> Positions:
-    reader = csv.reader(lines, skipinitialspace=True)
-    header = [name.strip() for name in next(reader, [])]
+def _parse(header: list[str], lines: Iterator[Line], path: str) -> Positions:
     if missing := [name for name in COLUMNS if name not in header]:
         raise InputError(
             f"positions {path} lacks {', '.join(missing)}; its columns are {', '.join(header) or 'none'}, "
@@ -52,16 +45,14 @@ def _parse(lines: Iterable[str], path: str) -> Positions:
     optional = {*COVARIANCE, *DEGREES, "score"}
     rows: list[list[float]] = []
     lines_of: list[int] = []
-    for cells in reader:
-        if not any(cell.strip() for cell in cells):
-            continue
+    for number, cells in lines:
         if len(cells) != len(header):
             raise InputError(
-                f"positions {path}, line {reader.line_num}: {len(cells)} columns; the first line names {len(header)}"
+                f"positions {path}, line {number}: {len(cells)} columns; the first line names {len(header)}"
             )
-        row = [cells[header.index(name)].strip() for name in given]
-        rows.append([_number(c, n, n in optional, path, reader.line_num) for c, n in zip(row, given, strict=True)])
-        lines_of.append(reader.line_num)
+        row = [cells[header.index(name)] for name in given]
+        rows.append([_number(c, n, n in optional, path, number) for c, n in zip(row, given, strict=True)])
+        lines_of.append(number)
     table = np.array(rows, float).reshape(-1, len(given))
     order = np.argsort(table[:, 0], kind="stable")
     table, at = table[order], np.array(lines_of, int)[order]

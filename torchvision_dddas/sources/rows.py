@@ -1,10 +1,10 @@
 """A table's own words: its column names and cells as they stand, to be written again with more beside them."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.csv_text import opened
 
 MOT = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
 """What the columns of MOTChallenge text are, which has no first line that names them."""
@@ -35,14 +35,8 @@ def read_rows(path: str | Path, count: int, without: Sequence[str] = ()) -> tupl
 
 
 def _read(path: str | Path) -> tuple[list[str], list[list[str]]]:
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file, skipinitialspace=True)]
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is no CSV text: {error}") from None
-    rows = [row for row in rows if any(row)]
+    with opened(path) as (first, lines):
+        rows = [*([first] if any(first) else []), *(line.cells for line in lines)]
     # The first name may be empty: so a table with an index begins.
     if rows and next(cell for cell in rows[0] if cell)[0].isalpha():
         return rows[0], [[*row, *[""] * (len(rows[0]) - len(row))] for row in rows[1:]]

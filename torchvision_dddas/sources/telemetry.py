@@ -1,13 +1,13 @@
 """What the vehicle reports of itself, from a CSV of `time_s,altitude_m,speed_m_s`."""
 
-import csv
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.csv_text import Line, opened
 from torchvision_dddas.types import Telemetry
 
 COLUMNS = ("time_s", "altitude_m", "speed_m_s")
@@ -26,13 +26,8 @@ def read_telemetry(path: str | Path) -> Telemetry:
     Raises InputError with file and line: unreadable, a column missing, no rows, not a finite number, a
     negative speed, time running back.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            return _parse(file, str(path))
-    except OSError as error:
-        raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"telemetry {path} is no CSV text: {error}") from None
+    with opened(path, "telemetry") as (header, lines):
+        return _parse(header, lines, str(path))
 
 
 def at(telemetry: Telemetry, time_s: float, tolerance_s: float = 1.0) -> Flight | None:
@@ -48,9 +43,7 @@ def at(telemetry: Telemetry, time_s: float, tolerance_s: float = 1.0) -> Flight 
     )
 
 
-def _parse(lines: Iterable[str], path: str) -> Telemetry:
-    reader = csv.reader(lines, skipinitialspace=True)
-    header = [name.strip() for name in next(reader, [])]
+def _parse(header: list[str], lines: Iterator[Line], path: str) -> Telemetry:
     if missing := [name for name in COLUMNS if name not in header]:
         raise InputError(
             f"telemetry {path} lacks {', '.join(missing)}; its columns are {', '.join(header) or 'none'}, "
@@ -58,13 +51,11 @@ def _parse(lines: Iterable[str], path: str) -> Telemetry:
         )
     places = [header.index(name) for name in COLUMNS]
     rows: list[list[float]] = []
-    for row in reader:
-        if not any(cell.strip() for cell in row):
-            continue
-        rows.append([_number(row, place, header, path, reader.line_num) for place in places])
+    for number, cells in lines:
+        rows.append([_number(cells, place, header, path, number) for place in places])
         if len(rows) > 1 and rows[-1][0] < rows[-2][0]:
             raise InputError(
-                f"telemetry {path}, line {reader.line_num}: time_s runs back from {rows[-2][0]:g} to {rows[-1][0]:g}; "
+                f"telemetry {path}, line {number}: time_s runs back from {rows[-2][0]:g} to {rows[-1][0]:g}; "
                 "sort it by time"
             )
     if not rows:
@@ -74,7 +65,7 @@ def _parse(lines: Iterable[str], path: str) -> Telemetry:
 
 
 def _number(row: list[str], place: int, header: list[str], path: str, line: int) -> float:
-    text = row[place].strip() if place < len(row) else ""
+    text = row[place] if place < len(row) else ""
     try:
         value = float(text)
     except ValueError:
