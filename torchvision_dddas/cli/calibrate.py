@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 LEAST_M, MOST_M = 0.1, 10.0
 """Heights of a person, or of what stands in for one."""
 
+PLACES = ("longitude_deg", "latitude_deg", "east_m", "north_m")
+"""Keys whose numbers are written with all their digits."""
+
 Found = tuple[dict[str, float], list[str]]
 """Keys of a camera's TOML, and what to tell the user."""
 
@@ -205,9 +208,6 @@ def _check(key: str, value: float, unit: str) -> None:
             f"{key} would be {value:g} {unit}, which no camera has ({low:g} to {high:g}); check the distances in "
             "metres, the heights in pixels and the body height in metres"
         )
-
-
-PLACES = ("longitude_deg", "latitude_deg", "east_m", "north_m")
 
 
 def _check_out(path: Path, table: Path | None) -> None:

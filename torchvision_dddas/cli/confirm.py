@@ -42,7 +42,7 @@ def confirm(
         bool | None,
         typer.Option(
             "--identities/--no-identities",
-            help="Whether the numbers of positions are targets that last, so that looks add up. [default: by table]",
+            help="Whether target numbers last, so that looks add up. [default: identities of boxes do, positions' not]",
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-confirmed"),
@@ -120,7 +120,6 @@ def confirm_into(
         journal.notes += notes
         if not rows:
             journal.notes.append(f"{blobs} has no rows: nothing to confirm")
-            journal.counts = {"kinds": {}, "rows_looked_at": 0, "notes": journal.notes}
         with progress("confirm", None, quiet) as tick:
             for frame in found:
                 output.write(frame)

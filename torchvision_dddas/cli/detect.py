@@ -67,7 +67,9 @@ def detect_clip(
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.sinks import Output
+    from torchvision_dddas.sinks.whole import refuse_own_input
 
+    refuse_own_input([Path(clip)], [folder / name for name in Output.files], "folder with --out")
     with Output(folder, save) as output:
         from torchvision_dddas.run import run
         from torchvision_dddas.sources import open_source

@@ -92,7 +92,6 @@ def ground_into(
                 tick()
         if not any(len(table) for table in read):
             journal.notes.append("the tables have no rows: nobody to locate")
-            journal.counts = {"people": 0, "sightings": journal.by, "notes": journal.notes}
     return journal
 
 

@@ -81,11 +81,10 @@ def people_into(
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.sinks.people_output import PeopleOutput
+    from torchvision_dddas.sinks.whole import refuse_own_input
 
-    written = [(folder / name).resolve() for name in PeopleOutput.files]
-    for what, path in (("--around ", around), ("", Path(clip))):
-        if path is not None and path.resolve() in written:
-            raise InputError(f"{what}{path} is a file that this run writes; choose another folder with --out")
+    given = [Path(clip), *([] if around is None else [around])]
+    refuse_own_input(given, [folder / name for name in PeopleOutput.files], "folder with --out")
     with PeopleOutput(folder, save) as output:
         from torchvision_dddas.recognizing import recognize
         from torchvision_dddas.sources import open_source

@@ -81,9 +81,10 @@ def track_into(
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.sinks.track_output import TrackOutput
+    from torchvision_dddas.sinks.whole import refuse_own_input
 
-    if detections is not None and detections.resolve() in [(folder / name).resolve() for name in TrackOutput.files]:
-        raise InputError(f"--detections {detections} is a file that this run writes; choose another folder with --out")
+    given = [Path(name) for name in (clip, detections) if name is not None]
+    refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.sources import open_source
         from torchvision_dddas.sources.agreement import agreed, beginning

@@ -64,19 +64,19 @@ class ConfirmedTable:
 
 
 class ConfirmJournal(Record):
-    """The record of a run that confirms blobs. kinds: rows of each kind. notes: what the user should know."""
+    """The record of a run that confirms blobs. kinds: rows of each kind."""
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         super().__init__(folder, facts)
         self.kinds: Counter[str] = Counter()
         self.looked = 0
-        self.notes: list[str] = []
+        self.counts = {"kinds": {}, "rows_looked_at": 0}
 
     def write(self, confirmed: Confirmed) -> None:
         """Take note of a frame."""
         self.kinds.update(confirmed.kind)
         self.looked += sum(bool(names) for names in confirmed.seen_by)
-        self.counts = {"kinds": dict(self.kinds), "rows_looked_at": self.looked, "notes": self.notes}
+        self.counts = {"kinds": dict(self.kinds), "rows_looked_at": self.looked}
         self.note(confirmed.frame, len(confirmed.kind), {})
 
 

@@ -46,7 +46,7 @@ class Durations:
 class Record:
     """Collects the facts of a run. The file says `running` from the first frame on, so that a killed run shows.
 
-    counts: what a command wants to say beside the frames and targets.
+    counts: what a command wants to say beside the frames and targets. notes: what the user should know of the run.
     """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
@@ -59,6 +59,7 @@ class Record:
         self._adjustments: list[dict[str, Any]] = []
         self.frames = self.targets = self.unreliable_frames = 0
         self.problems: list[str] = []
+        self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
         self._last = 0  # number of the frame noted last
 
@@ -107,6 +108,7 @@ class Record:
             "frames": {"written": self.frames, "unreliable": self.unreliable_frames},
             "targets": self.targets,
             **self.counts,
+            "notes": list(self.notes),
             "problems": list(self.problems),
             "unreliable": self._unreliable,
             "adjustments": self._adjustments,

@@ -16,7 +16,7 @@ SAVED = ("overlay",)
 
 
 class PeopleJournal(Record):
-    """The record of a run that recognizes people; notes say what the user should know of it.
+    """The record of a run that recognizes people.
 
     unlikely: people who are less likely than not ones. cut: people whom the picture's border cuts. share: windows
     searched, as a share of all those of all frames. overlay: name of the film, or of the picture where there is one.
@@ -27,7 +27,6 @@ class PeopleJournal(Record):
         self.unlikely = self.cut = self.everywhere = self.nowhere = self.unread = 0
         self.share = 0.0
         self.overlay = "overlay.mp4"
-        self.notes: list[str] = []
 
     def write(self, recognized: Recognized) -> None:
         """Take note of a frame."""
@@ -49,7 +48,6 @@ class PeopleJournal(Record):
                 "frames_in_regions": self.frames + 1 - self.unread - self.everywhere - self.nowhere,
                 "frames_nowhere": self.nowhere,
             },
-            "notes": self.notes,
         }
         self.note(
             recognized.frame.number,

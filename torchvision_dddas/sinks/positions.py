@@ -164,21 +164,20 @@ class PositionJournal(Record):
     """The record of a run that locates people.
 
     people: rows of positions.csv. by: sightings by what told their distance, `bearing` where nothing did.
-    notes: what the user should know.
     """
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         super().__init__(folder, facts)
         self.people = 0
         self.by = dict.fromkeys(("both", "height", "feet", "bearing"), 0)
-        self.notes: list[str] = []
+        self.counts = {"people": 0, "sightings": self.by}
 
     def write(self, located: Located) -> None:
         """Take note of a frame."""
         self.people += len(located.positions)
         for by in located.sightings.by.tolist():
             self.by[by] += 1
-        self.counts = {"people": self.people, "sightings": self.by, "notes": self.notes}
+        self.counts = {"people": self.people, "sightings": self.by}
         self.note(located.frame, len(located.sightings), {})
 
 

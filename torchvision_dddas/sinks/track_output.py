@@ -16,7 +16,7 @@ SAVED = ("overlay",)
 
 
 class TrackJournal(Record):
-    """The record of a run that gives identities; notes say what the user should know of it.
+    """The record of a run that gives identities.
 
     identities: how many were given; they are numbered from 1 without gaps. first: number of the first frame.
     """
@@ -24,7 +24,6 @@ class TrackJournal(Record):
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         super().__init__(folder, facts)
         self.identities = self.bridges = self.untracked = self.first = 0
-        self.notes: list[str] = []
 
     def write(self, followed: Followed) -> None:
         """Take note of a frame."""
@@ -41,7 +40,6 @@ class TrackJournal(Record):
             "tracked": self.targets + targets - self.untracked,
             "untracked": self.untracked,
             "bridges": self.bridges,
-            "notes": self.notes,
         }
         self.note(followed.number, targets, followed.seconds, followed.adjustments, followed.cause or None)
 
