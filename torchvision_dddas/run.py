@@ -13,12 +13,12 @@ from torchvision_dddas import control, windows
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.pipeline import Found, Observation, admitted, draw_targets, observe, table
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.sources.telemetry import Flight, at
+from torchvision_dddas.sources.telemetry import at
 from torchvision_dddas.targets.history import MotionHistory
 from torchvision_dddas.targets.motion import DenseFlow
 from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.small import SmallTracks, candidates
-from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Adjustment, Flight, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision.protocol import View, Vision, Window
 
 # A picture whose grey levels spread by less than this shows nothing, not even through fog.

@@ -470,6 +470,92 @@ class ConfirmKnobs(Group):
     )
 
 
+class LandmarkKnobs(Group):
+    """How ground vehicles serve as landmarks: found by colour, told from targets, followed (appendix A, IV-A)."""
+
+    differentiation: Literal["exact", "greedy"] = knob(
+        "exact", "-", meaning="which blob is which landmark: as many as possible at the least distance; or row by row"
+    )
+    centre: Literal["motion", "colour"] = knob(
+        "motion", "-", meaning="where a landmark that has a blob is: the blob's centre, or that of its colour"
+    )
+    reach_px: float = knob(
+        40.0, "px", 0, 10000, meaning="a blob further from a landmark's colour is not the landmark's"
+    )
+    interval_frames: int = knob(
+        10, "frames", 1, 10000, meaning="every so many frames landmarks are told from targets anew (tracking interval)"
+    )
+    least_area_px: int = knob(12, "px", 1, 1_000_000, meaning="a patch of colour smaller than this is none")
+    pixel_sigma: float = knob(1.0, "px", 0.01, 100, meaning="standard deviation of a landmark's place in the picture")
+    sigma_m: float = knob(
+        1.43, "m", 0, 1000, meaning="of a landmark's report where it does not say: a GPS of 3.5 m in 95 %"
+    )
+    common_sigma_m: float = knob(
+        0.0, "m", 0, 1000, meaning="standard deviation of the error that all the team's receivers share"
+    )
+    gap_s: float = knob(
+        5.0, "s", 0, 3600, meaning="a dropout of reports longer than this without planned waypoints ends a landmark"
+    )
+    drift_m_s: float = knob(0.5, "m/s", 0, 100, meaning="how fast a place gets uncertain during a dropout")
+    height_m: float = knob(0.0, "m", 0, 20, meaning="height above ground of the point that shows in the picture")
+    least: int = knob(4, "landmarks", 4, 64, meaning="landmarks used where they are detected well (4-or-more rule)")
+    rule: Literal["all", "source"] = knob(
+        "all", "-", meaning="all: every landmark at hand; source: more than `least` only where detection is poor"
+    )
+    poor_speed_m_s: float = knob(
+        2.0, "m/s", 0, 100, meaning="source rule: landmarks that move faster on average count as poorly detected"
+    )
+
+
+class AerialKnobs(Group):
+    """How the picture from the air is laid on the ground by landmarks and telemetry (appendix A, IV-B)."""
+
+    mode: Literal["pose", "homography", "paper"] = knob(
+        "pose",
+        "-",
+        meaning="pose: the camera's, by landmarks and telemetry; homography: by landmarks alone; paper: raw degrees",
+    )
+    hfov_deg: float = knob(
+        70.0, "deg", 1, 170, meaning="width of the field of view where neither camera nor telemetry says it"
+    )
+    pitch_deg: float = knob(
+        90.0, "deg", -90, 90, meaning="how far the camera looks below the horizon where neither says it; 90: down"
+    )
+    focal_sigma: float = knob(0.01, "-", 0, 1, meaning="standard deviation of a focal length that is given, as a share")
+    focal_guess_sigma: float = knob(0.2, "-", 0, 1, meaning="the same where it is not given but hfov_deg guessed")
+    tilt_sigma_deg: float = knob(1.0, "deg", 0, 90, meaning="standard deviation of the reported tilt, each way")
+    heading_sigma_deg: float = knob(5.0, "deg", 0, 180, meaning="standard deviation of the reported heading")
+    altitude_sigma: float = knob(0.02, "-", 0, 10, meaning="standard deviation of the altitude, as a share of it")
+    altitude_sigma_m: float = knob(0.0, "m", 0, 1000, meaning="and in metres")
+    position_sigma_m: float = knob(
+        1.43, "m", 0, 1000, meaning="standard deviation of the vehicle's place, east and north each: 3.5 m in 95 %"
+    )
+    target_sigma_px: float = knob(1.0, "px", 0, 100, meaning="standard deviation of a target's place in the picture")
+    point: Literal["auto", "centre", "foot"] = knob(
+        "auto",
+        "-",
+        meaning="which point of a box is on the ground: its centre; the foot of a body whose middle is the centre; "
+        "auto: the feet that the table names, the foot for tables of dddas, else the centre",
+    )
+    target_height_m: float = knob(1.7, "m", 0, 100, meaning="height of the body whose foot is sought")
+    gate_probability: float = knob(
+        0.999, "-", 0.5, 0.999999, meaning="share of right landmarks that pass the test against what is expected"
+    )
+    correlation_s: float = knob(
+        20.0,
+        "s",
+        0,
+        10000,
+        meaning="time over which errors of telemetry and receivers stay alike; 0: frames stand alone",
+    )
+    least_spread: float = knob(
+        0.02, "-", 0, 1, meaning="landmarks whose width is a smaller share of their length count as on one line"
+    )
+    clock_offset_s: float = knob(
+        0.0, "s", -1e6, 1e6, meaning="added to the times of telemetry and landmarks to get those of the clip"
+    )
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -487,6 +573,8 @@ class Settings(Group):
     people: PeopleKnobs = PeopleKnobs()
     ground: GroundKnobs = GroundKnobs()
     confirm: ConfirmKnobs = ConfirmKnobs()
+    landmarks: LandmarkKnobs = LandmarkKnobs()
+    aerial: AerialKnobs = AerialKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------

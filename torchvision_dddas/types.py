@@ -20,14 +20,65 @@ class Frame:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the vehicle reports of itself, one row a sample, sorted by time.
+    """What the vehicle reports of itself, one row a sample, sorted by time; NaN where it does not say.
 
-    time_s, altitude_m (above ground) and speed_m_s (over ground) are (N,) float64.
+    time_s: (N,) float64 since the clip's first frame. altitude_m: (N,) above ground. speed_m_s: (N,) over ground.
+    place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
+    above_sea_m: (N,). heading_rad, pitch_rad, roll_rad: (N,) how the camera looks, as in Camera; straight down is a
+    pitch of pi/2, where the heading is that of the picture's upper edge. hfov_rad: (N,) width of its field of view.
+    vehicle_heading_rad: (N,) of the vehicle's nose, which need not be the camera's.
+    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known. origin: what it was read from.
     """
 
     time_s: np.ndarray
     altitude_m: np.ndarray
     speed_m_s: np.ndarray
+    place: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    geographic: bool = True
+    above_sea_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    pitch_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    roll_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    hfov_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    vehicle_heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    start_utc_s: float = float("nan")
+    origin: str = ""
+
+    def __post_init__(self) -> None:
+        # A column that was not given is one of unknown values.
+        for name in COLUMNS_OF_TELEMETRY:
+            given = getattr(self, name)
+            if len(given) == 0 < len(self.time_s):
+                object.__setattr__(self, name, np.full((len(self.time_s), *given.shape[1:]), np.nan))
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+COLUMNS_OF_TELEMETRY = (
+    "place",
+    "above_sea_m",
+    "heading_rad",
+    "pitch_rad",
+    "roll_rad",
+    "hfov_rad",
+    "vehicle_heading_rad",
+)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What the telemetry says at one moment; the fields as in Telemetry, NaN where it does not say."""
+
+    altitude_m: float
+    speed_m_s: float = float("nan")
+    place: tuple[float, float] = (float("nan"), float("nan"))
+    above_sea_m: float = float("nan")
+    heading_rad: float = float("nan")
+    pitch_rad: float = float("nan")
+    roll_rad: float = float("nan")
+    hfov_rad: float = float("nan")
+    vehicle_heading_rad: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -224,6 +275,91 @@ class Sightings:
 
 
 @dataclass(frozen=True)
+class Landmarks:
+    """What is known of landmarks, ground vehicles of known place: one row a report, sorted by frame.
+
+    frame: (N,) float64 from 1; a report between two pictures has a broken number. landmark: (N,) int64, which of the
+    names. image_px: (N, 2) u, v from the first pixel's centre; NaN where the row says no place in a picture.
+    place: (N, 2), longitude and latitude in degrees if geographic, else local metres east and north; NaN in a dropout.
+    sigma_m: (N,) standard deviation of the place along east and along north each, NaN where the row does not say.
+    planned: (N,) bool, a waypoint that the vehicle means to pass, not a report. line: (N,) int64, in the file.
+    """
+
+    names: tuple[str, ...]
+    frame: np.ndarray
+    landmark: np.ndarray
+    image_px: np.ndarray
+    place: np.ndarray
+    sigma_m: np.ndarray
+    planned: np.ndarray
+    line: np.ndarray
+    geographic: bool = True
+    path: str = ""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
+class Marks:
+    """The landmarks of one frame, one row each.
+
+    landmark: (n,) int64, which of the names. image_px: (n, 2), NaN where the picture does not show it.
+    east_north_m: (n, 2) local metres, NaN where unknown. sigma_m: (n,) of the place, along east and along north each.
+    pixel_sigma: (n,) of u and of v each. up_m: (n,) of the point seen, above the local plane.
+    """
+
+    landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    image_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    sigma_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    pixel_sigma: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    up_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.landmark)
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Where a camera is and how it looks.
+
+    place_m: (3,) east, north, up in local metres. axes: (3, 3), its columns are the camera's right, down and forward
+    in east, north, up. focal: its focal length as a share of what the Camera says.
+    """
+
+    place_m: np.ndarray
+    axes: np.ndarray
+    focal: float = 1.0
+
+
+@dataclass(frozen=True)
+class Fix:
+    """How the picture of one frame lies on the ground, and how well that is known.
+
+    by: what told it: pose, homography, paper, telemetry (no landmark could be used), or "" (nothing: see cause).
+    pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
+    image_from_ground: (3, 3) on local metres, with matrix_covariance (8, 8) of its first eight elements, h33 = 1; where
+    there is no pose. landmark: (n,) which were seen; state: for each used, reassigned, excluded.
+    chi2, freedom: of the landmarks against what was expected of them; NaN and 0 where nothing was expected.
+    changes: what was repaired or excluded and why, in words. cause: why nothing could be concluded, or how little.
+    """
+
+    frame: int
+    by: str
+    pose: CameraPose | None = None
+    covariance: np.ndarray | None = None
+    image_from_ground: np.ndarray | None = None
+    matrix_covariance: np.ndarray | None = None
+    landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    state: tuple[str, ...] = ()
+    chi2: float = float("nan")
+    freedom: int = 0
+    changes: tuple[str, ...] = ()
+    cause: str = ""
+
+
+@dataclass(frozen=True)
 class Positions:
     """Where targets stand on the ground, one row a sighting, sorted by frame.
 
@@ -263,6 +399,29 @@ class Located:
     cut: np.ndarray
     score: np.ndarray
     box_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class Grounded:
+    """All that is known of one frame after its targets were located from the air.
+
+    positions: the targets that could be located; covariance_m2 is that of the absolute place. row: (P,) which of the
+    frame's targets each is. relative_m2: (P, 2, 2) covariance of the place relative to the team of landmarks, without
+    the error that all its receivers share. velocity_m_s: (P, 2) east, north, NaN where unknown. box_px: (N, 4), all.
+    time_s: of the frame. marks: the frame's landmarks as they were used. adjustments, seconds: as in Scene.
+    """
+
+    frame: int
+    time_s: float
+    positions: Positions
+    row: np.ndarray
+    relative_m2: np.ndarray
+    velocity_m_s: np.ndarray
+    box_px: np.ndarray
+    fix: Fix
+    marks: Marks
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

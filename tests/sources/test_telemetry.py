@@ -58,12 +58,18 @@ def test_a_file_that_is_absent_or_no_text_is_refused(tmp_path: Path) -> None:
         read_telemetry(tmp_path / "bytes.csv")
 
 
+def _told(flown: Telemetry, time_s: float) -> tuple[float, float]:
+    flight = at(flown, time_s)
+    assert flight is not None
+    return flight.altitude_m, flight.speed_m_s
+
+
 def test_between_samples_it_is_linear_and_far_outside_nothing_is_known() -> None:
     flown = Telemetry(np.array([1.0, 3.0]), np.array([20.0, 40.0]), np.array([4.0, 8.0]))
-    assert at(flown, 1.5) == (25, 5)
-    assert at(flown, 3) == (40, 8)
-    assert at(flown, 0.5) == (20, 4)
-    assert at(flown, 3.9) == (40, 8)
+    assert _told(flown, 1.5) == (25, 5)
+    assert _told(flown, 3) == (40, 8)
+    assert _told(flown, 0.5) == (20, 4)
+    assert _told(flown, 3.9) == (40, 8)
     assert at(flown, 4.1) is None
     assert at(flown, -0.1) is None
     assert at(flown, 0.5, tolerance_s=0.1) is None

@@ -2,22 +2,14 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.csv_text import Line, opened
-from torchvision_dddas.types import Telemetry
+from torchvision_dddas.types import Flight, Telemetry
 
 COLUMNS = ("time_s", "altitude_m", "speed_m_s")
-
-
-class Flight(NamedTuple):
-    """Altitude above ground and speed over ground at one moment."""
-
-    altitude_m: float
-    speed_m_s: float
 
 
 def read_telemetry(path: str | Path) -> Telemetry:

@@ -6,9 +6,21 @@ from importlib.util import find_spec
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs, Settings
 from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.protocol import Foreground, Recognizer, View, Vision, Window
+from torchvision_dddas.vision.protocol import ColourFinder, Foreground, PlaneSolver, Recognizer, View, Vision, Window
 
-__all__ = ["Foreground", "Recognizer", "View", "Vision", "Window", "load", "load_recognizer"]
+__all__ = [
+    "ColourFinder",
+    "Foreground",
+    "PlaneSolver",
+    "Recognizer",
+    "View",
+    "Vision",
+    "Window",
+    "load",
+    "load_colours",
+    "load_recognizer",
+    "load_solver",
+]
 
 
 def load(backend: str, settings: Settings) -> Vision:
@@ -34,6 +46,28 @@ def load_recognizer(backend: str, knobs: PeopleKnobs, svm: LinearSvm) -> Recogni
     from torchvision_dddas.vision.torch_people import TorchRecognizer
 
     return TorchRecognizer(knobs, svm)
+
+
+def load_solver(backend: str) -> PlaneSolver:
+    """What solves plane homographies, on the back end that `load` would take. Raises InputError as `load` does."""
+    if not _torch_wanted(backend):
+        from torchvision_dddas.vision.onboard_plane import OnboardSolver
+
+        return OnboardSolver()
+    from torchvision_dddas.vision.torch_plane import TorchSolver
+
+    return TorchSolver()
+
+
+def load_colours(backend: str) -> ColourFinder:
+    """What finds colours, on the back end that `load` would take. Raises InputError as `load` does."""
+    if not _torch_wanted(backend):
+        from torchvision_dddas.vision.onboard_colours import OnboardColours
+
+        return OnboardColours()
+    from torchvision_dddas.vision.torch_colours import TorchColours
+
+    return TorchColours()
 
 
 def _torch_wanted(backend: str) -> bool:

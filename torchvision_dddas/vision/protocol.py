@@ -102,3 +102,33 @@ class Recognizer(Protocol):
         A part that is smaller than the window has an empty map.
         """
         ...
+
+
+class PlaneSolver(Protocol):
+    """A back end's solver of plane homographies, batched, float64."""
+
+    name: str
+
+    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """image_from_ground (B, 3, 3), h33 = 1, and whether each is valid (B,), from ground and image (B, n, 2).
+
+        Weighted least squares, Hartley-normalised; weight (B, n), 0 for a row that is none.
+        """
+        ...
+
+    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same as the source solves it: normal equations of the given coordinates, such as degrees."""
+        ...
+
+
+class ColourFinder(Protocol):
+    """A back end's search for colours."""
+
+    name: str
+
+    def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(K, H, W) uint8, 255 where the BGR image lies within a range of hue, saturation and value; others 0.
+
+        low, high: (K, 3), OpenCV's units (hue 0 to 180); a range whose lowest hue is above its highest goes over 0.
+        """
+        ...
