@@ -22,6 +22,7 @@ import numpy as np
 import report
 from scipy.optimize import least_squares, linear_sum_assignment
 
+from torchvision_dddas.metrics.detection import iou
 from torchvision_dddas.settings import GroundKnobs
 from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.targets.ranging import sight, touches_border
@@ -125,20 +126,12 @@ def detected(path: Path, interval: int, truth: People, size: tuple[int, int], le
     for number in np.unique(table.frame):
         rows = np.arange(len(table))[table.rows(number)]
         there = np.flatnonzero(truth.frame == 1 + (number - 1) * interval)
-        iou = overlaps(table.box_px[rows], truth.box_px[there])
-        for a, b in zip(*linear_sum_assignment(-np.where(iou < least, 0, iou)), strict=True):
-            if iou[a, b] >= least:
+        shared = iou(table.box_px[rows], truth.box_px[there])
+        for a, b in zip(*linear_sum_assignment(-np.where(shared < least, 0, shared)), strict=True):
+            if shared[a, b] >= least:
                 ours.append(rows[a])
                 theirs.append(there[b])
     return People(truth.frame[theirs], table.box_px[ours], cut[ours], truth.east_north_m[theirs])
-
-
-def overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N, M) IoU."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, :2] + a[:, None, 2:], b[None, :, :2] + b[None, :, 2:])
-    common = np.clip(high - low, 0, None).prod(axis=2)
-    return common / (a[:, 2:].prod(axis=1)[:, None] + b[:, 2:].prod(axis=1) - common)
 
 
 def seen(people: People, camera: Camera, knobs: GroundKnobs) -> Sightings:

@@ -63,3 +63,15 @@ def dddas():
     from torchvision_dddas.cli import app
 
     return lambda *words: CliRunner().invoke(app, [str(w) for w in words])
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a file: file(name, text) gives its path."""
+
+    def write(name, text):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write

@@ -10,16 +10,6 @@ from torchvision_dddas.sources.cameras import read_camera
 PERSON = ("--body-height", 1.8, "--distance", 9)
 
 
-@pytest.fixture
-def file(tmp_path):
-    def write(name, text):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
-
-
 def test_a_person_at_a_known_distance_gives_the_focal_length(dddas, tmp_path):
     out = tmp_path / "camera.toml"
     result = dddas("calibrate", *PERSON, "--pixels", 200, "--size", "640x480", "--out", out)

@@ -36,6 +36,15 @@ def test_everything_is_saved_by_default_and_the_end_is_summed_up(dddas, engine, 
     assert "registration" in record["settings"]
 
 
+def test_the_clip_is_not_written_over(dddas, engine, clip, tmp_path):
+    (tmp_path / "out").mkdir()
+    film = tmp_path / "out/overlay.mp4"
+    film.write_bytes(b"a clip")
+    said = bad(dddas("detect", film, "--out", tmp_path / "out"))
+    assert "overlay.mp4 is a file that this run writes; choose another folder with --out" in said
+    assert film.read_bytes() == b"a clip"
+
+
 def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, engine, clip, tmp_path):
     (clip / "00002.png").write_bytes(b"no picture")
     result = dddas("detect", clip, "--out", tmp_path / "out", "--save", "none")

@@ -14,16 +14,6 @@ CAMERA = "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheight_m = 1.2\n"
 PEOPLE = np.array([[-1.0, 10.0], [2.0, 14.0]])
 
 
-@pytest.fixture
-def file(tmp_path):
-    def write(name, text):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
-
-
 def walked(frame):
     """Where people who go north are."""
     return PEOPLE + np.array([0, 0.1 * frame])

@@ -210,6 +210,12 @@ def test_a_table_that_the_run_would_write_over_is_refused(dddas, table, tmp_path
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_a_clip_that_the_run_would_write_over_is_refused(dddas, tmp_path):
+    film = tmp_path / "out/overlay.mp4"
+    said = bad(dddas("track", film, "--out", tmp_path / "out"))
+    assert "overlay.mp4 is a file that this run writes; choose another folder with --out" in said
+
+
 def test_the_record_of_a_run_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
     text = walker(range(501, 560), x=0) + walker(range(502, 560), x=40)
     dddas("track", "--detections", table(text), "--interval", 2, "--out", tmp_path / "out", "--quiet")

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchvision_dddas.settings import ConfirmKnobs, GroundKnobs, PeopleKnobs
+from torchvision_dddas.targets.boxes import shared_px
 from torchvision_dddas.targets.scan import smallest_body_px
 from torchvision_dddas.types import Camera
 
@@ -122,9 +123,8 @@ def confirm_boxes(
     blobs less tall without a person. aspect: of a body, width over height.
     """
     blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
-    a, b = blob_px[:, None], person_px[None]
-    side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    common, areas = np.prod(np.maximum(side, 0), axis=-1), (np.prod(a[..., 2:], axis=-1), np.prod(b[..., 2:], axis=-1))
+    common = shared_px(blob_px[:, None], person_px)
+    areas = blob_px[:, None, 2:].prod(axis=-1), person_px[:, 2:].prod(axis=-1)
     inside = common >= knobs.share * np.minimum(*areas)
     people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, knobs)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.targets import scan
+from torchvision_dddas.targets.boxes import shared_px
 from torchvision_dddas.types import Adjustment, Part, People
 
 Regions = tuple[np.ndarray, np.ndarray]
@@ -136,9 +137,7 @@ def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tupl
 
 def _covered(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     """(N,) share of each box that the others cover, those that overlap counted twice."""
-    low = np.maximum(box_px[:, None, :2], other_px[:, :2])
-    high = np.minimum(box_px[:, None, :2] + box_px[:, None, 2:], other_px[:, :2] + other_px[:, 2:])
-    return np.clip(high - low, 0, None).prod(axis=2).sum(axis=1) / box_px[:, 2:].prod(axis=1)
+    return shared_px(box_px[:, None], other_px).sum(axis=1) / box_px[:, 2:].prod(axis=1)
 
 
 class Search:

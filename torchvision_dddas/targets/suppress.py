@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from torchvision_dddas.targets.boxes import shared_px
+
 # A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.
 _WHOLE = 1 - 1e-9
 
@@ -16,8 +18,8 @@ def nms(
     of the smaller of the two: legs and heads score as small people inside the box of the whole one.
     """
     order = np.argsort(-np.asarray(score, float), kind="stable")
-    x, y, width, height = np.asarray(box_px, float).reshape(-1, 4)[order].T
-    right, bottom, area = x + width, y + height, width * height
+    box = np.asarray(box_px, float).reshape(-1, 4)[order]
+    area = box[:, 2] * box[:, 3]
     left = np.ones(len(order), bool)
     kept = []
     for i in range(len(order)):
@@ -25,9 +27,7 @@ def nms(
             continue
         kept.append(i)
         rest = slice(i + 1, None)
-        across = np.minimum(right[i], right[rest]) - np.maximum(x[i], x[rest])
-        down = np.minimum(bottom[i], bottom[rest]) - np.maximum(y[i], y[rest])
-        shared = np.maximum(across, 0) * np.maximum(down, 0) * _WHOLE
+        shared = shared_px(box[i], box[rest]) * _WHOLE
         left[rest] &= shared <= overlap * (area[i] + area[rest] - shared)
         left[rest] &= shared <= contained * np.minimum(area[i], area[rest])
     return order[np.array(kept, np.int64)]
@@ -45,11 +45,11 @@ def settled(
     Centres are averaged, and logarithms of sizes. A kept box without weight stays where it is.
     """
     box_px, weight = np.asarray(box_px, float).reshape(-1, 4), np.asarray(weight, float)
-    low, high, area = box_px[:, :2], box_px[:, :2] + box_px[:, 2:], box_px[:, 2:].prod(axis=1)
-    place = np.concatenate([(low + high) / 2, np.log(box_px[:, 2:])], axis=1)
+    area = box_px[:, 2:].prod(axis=1)
+    place = np.concatenate([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)
     mean = place[kept]
     for k, row in enumerate(kept):
-        shared = np.clip(np.minimum(high[row], high) - np.maximum(low[row], low), 0, None).prod(axis=1)
+        shared = shared_px(box_px[row], box_px)
         near = shared >= overlap * (area[row] + area - shared)
         total = weight[near].sum()
         if total > 0:
