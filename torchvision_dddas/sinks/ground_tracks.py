@@ -1,0 +1,101 @@
+"""The places of all targets over time, kept while frames go by: what maps are made of at the end."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from torchvision_dddas.types import Positions
+
+_ROW = np.dtype(
+    [
+        ("frame", "i8"),
+        ("target", "i8"),
+        ("time_s", "f8"),
+        ("east_north_m", "f8", 2),
+        ("covariance_m2", "f8", (2, 2)),
+        ("lonlat_deg", "f8", 2),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class GroundTracks:
+    """All places of all targets, one row a place, by target and then by time.
+
+    target, frame: (N,) int64. time_s: (N,) since the clip's first frame, NaN where unknown. east_north_m: (N, 2).
+    covariance_m2: (N, 2, 2), NaN where unknown. lonlat_deg: (N, 2); None where there is no geographic origin.
+    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
+    """
+
+    target: np.ndarray
+    frame: np.ndarray
+    time_s: np.ndarray
+    east_north_m: np.ndarray
+    covariance_m2: np.ndarray
+    lonlat_deg: np.ndarray | None
+    start_utc_s: float = float("nan")
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @cached_property
+    def of(self) -> dict[int, slice]:
+        """The rows of each target."""
+        targets, first = np.unique(self.target, return_index=True)
+        ends = [*first[1:].tolist(), len(self)]
+        return {t: slice(a, b) for t, a, b in zip(targets.tolist(), first.tolist(), ends, strict=True)}
+
+    @property
+    def sigma_m(self) -> np.ndarray:
+        """(N,) how well each place is known: the root of the covariance's trace, NaN where it is not."""
+        return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+
+    def once_a(self, seconds: float, rows: slice) -> list[int]:
+        """Rows of a target at least so far apart in time, among them its first and its last; all where no time is."""
+        time = self.time_s[rows]
+        if not np.isfinite(time).all():
+            return list(range(rows.start, rows.stop))
+        chosen: list[int] = []
+        due = -np.inf
+        for row, at in enumerate(time.tolist(), rows.start):
+            # A hair less, so that the rounding of time stamps costs no row.
+            if at >= due - 1e-6:
+                chosen.append(row)
+                due = at + seconds
+        if chosen and chosen[-1] != rows.stop - 1:
+            chosen.append(rows.stop - 1)
+        return chosen
+
+
+class Gathered:
+    """Rows of GroundTracks as they come: 104 bytes each, at most twice that while the space for them grows."""
+
+    def __init__(self) -> None:
+        self._rows = np.zeros(256, _ROW)
+        self._count = 0
+
+    def add(self, positions: Positions, time_s: float = float("nan")) -> None:
+        """Keep the places of a frame."""
+        count = self._count + len(positions)
+        if count > len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros(max(count, len(self._rows)), _ROW)])
+        rows = self._rows[self._count : count]
+        rows["frame"], rows["target"], rows["time_s"] = positions.frame, positions.target, time_s
+        rows["east_north_m"], rows["covariance_m2"] = positions.east_north_m, positions.covariance_m2
+        rows["lonlat_deg"] = np.nan if positions.lonlat_deg is None else positions.lonlat_deg
+        self._count = count
+
+    def tracks(self, geographic: bool, start_utc_s: float = float("nan")) -> GroundTracks:
+        """What was kept, by target. geographic: whether the positions had longitudes and latitudes."""
+        rows = self._rows[: self._count]
+        rows = rows[np.argsort(rows["target"], kind="stable")]
+        return GroundTracks(
+            rows["target"],
+            rows["frame"],
+            rows["time_s"],
+            rows["east_north_m"],
+            rows["covariance_m2"],
+            rows["lonlat_deg"] if geographic else None,
+            start_utc_s,
+        )
