@@ -360,6 +360,20 @@ class Fix:
 
 
 @dataclass(frozen=True)
+class Elevation:
+    """Heights of the ground on a grid of local metres.
+
+    up_m: (R, C) above the local plane, rows to the north, columns to the east; NaN where unknown. corner_m: east and
+    north of the first. step_m: from one to the next. base_m: what the raster says where up is 0.
+    """
+
+    up_m: np.ndarray
+    corner_m: tuple[float, float]
+    step_m: float
+    base_m: float = 0.0
+
+
+@dataclass(frozen=True)
 class Positions:
     """Where targets stand on the ground, one row a sighting, sorted by frame.
 
