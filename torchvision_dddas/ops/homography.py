@@ -11,7 +11,18 @@ from torch import Tensor
 from . import consensus, linear
 from .consensus import draw_samples, transfer, transfer_error
 
-__all__ = ["compose", "draw_samples", "fit", "four_point", "invert", "ransac", "refine", "transfer", "transfer_error"]
+__all__ = [
+    "compose",
+    "draw_samples",
+    "fit",
+    "fit_raw",
+    "four_point",
+    "invert",
+    "ransac",
+    "refine",
+    "transfer",
+    "transfer_error",
+]
 
 SAMPLE_SIZE = 4
 
@@ -68,6 +79,26 @@ def fit(
     valid = valid & ((weight > 0).sum(1) >= SAMPLE_SIZE) & (matrix[:, 2, 2].abs() > 1e-9)
     matrix = torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=wide, device=p.device))
     return normalised(matrix).to(p.dtype), valid
+
+
+def fit_raw(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
+    """As the source prints it (appendix A, eq. 8 to 10): A m = k of four pairs, AᵀA m = Aᵀk of more, as they are given.
+
+    No weights and no normalisation: in degrees cond(A) is about 1e13, that of AᵀA beyond float64, and what comes out
+    of more than four pairs is wrong by decimetres or more even if the pairs are perfect. It is kept to show just that.
+    Therefore a pivot counts as zero only if it is zero; valid is False then, or with fewer than four pairs.
+    """
+    (x, y), (u, v) = p.unbind(-1), q.unbind(-1)
+    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    rows_u = torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y, u], -1)
+    rows_v = torch.stack([zero, zero, zero, x, y, one, -v * x, -v * y, v], -1)
+    rows = torch.cat([rows_u, rows_v], 1)
+    if p.shape[1] != SAMPLE_SIZE:
+        rows = rows[..., :8].mT @ rows
+    solution, valid = linear.solve(rows[..., :8], rows[..., 8:], tolerance=0.0)
+    valid = valid & torch.isfinite(solution).all(-1).all(-1) & (p.shape[1] >= SAMPLE_SIZE)
+    matrix = torch.cat([solution[..., 0], torch.ones_like(solution[:, :1, 0])], 1).reshape(-1, 3, 3)
+    return torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=p.dtype, device=p.device)), valid
 
 
 def ransac(
