@@ -85,7 +85,7 @@ def _view(
     elif origin is not None:
         degrees = geodesy.lonlat(seen.east_north_m, origin)
     score = table.score if table.probable else np.ones(len(table))
-    return View(table, seen, _targets(table), cut, score, degrees)
+    return View(table, seen, table.targets, cut, score, degrees)
 
 
 def looks(views: Sequence[View], within_frames: int = 0) -> Iterator[tuple[int, list[np.ndarray]]]:
@@ -169,25 +169,6 @@ def _together(
         None if found.origin_deg is None else geodesy.lonlat(fused.east_north_m, found.origin_deg),
     )
     return positions, fused.members
-
-
-def _targets(table: DetectionTable) -> np.ndarray:
-    """The identity of each row; where a row has none, its place in the frame, after the identities of the table.
-
-    Raises InputError where a frame has one identity twice.
-    """
-    identity = table.identity if table.identity is not None else np.full(len(table), -1)
-    order = np.lexsort((table.line, identity, table.frame))
-    before, after = order[:-1], order[1:]
-    twice = (table.frame[before] == table.frame[after]) & (identity[before] == identity[after]) & (identity[after] > 0)
-    if twice.any():
-        row = after[twice.argmax()]
-        raise InputError(
-            f"{table.path}, line {table.line[row]}: identity {identity[row]} is there already in frame "
-            f"{table.frame[row]}; wanted each once a frame, or -1 where there are none"
-        )
-    place = np.arange(len(table)) - np.searchsorted(table.frame, table.frame) + 1
-    return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
 
 
 def _of(sightings: Sightings, rows: np.ndarray) -> Sightings:

@@ -14,6 +14,9 @@ from torchvision_dddas.types import Detections
 COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
 """The named columns that a CSV must have; `score` may be there as well, any other is ignored."""
 
+FEET = ("feet_u_px", "feet_v_px")
+"""Columns of the point between the feet, from the first pixel's centre."""
+
 LAST_FRAME = 10_000_000
 """A higher frame number is taken for a mistake, such as a time stamp."""
 
@@ -37,7 +40,8 @@ class DetectionTable:
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
     line: (N,) int64, where the row stands in the file, from 1. own: whether `dddas detect` says that all were moving.
     identity: (N,) int64 from 1, -1 for a row without one. cut: (N,) bool, whether the picture's border cuts the target;
-    None where the table does not say.
+    None where the table does not say. feet_px: (N, 2) u, v of the point between the feet, likewise.
+    ours: whether `dddas detect` or `dddas track` wrote it: its boxes are about whole bodies.
     """
 
     path: str
@@ -48,6 +52,8 @@ class DetectionTable:
     own: bool = False
     identity: np.ndarray | None = None
     cut: np.ndarray | None = None
+    feet_px: np.ndarray | None = None
+    ours: bool = False
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -92,6 +98,25 @@ class DetectionTable:
         """Where the rows of a frame are."""
         return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
 
+    @cached_property
+    def targets(self) -> np.ndarray:
+        """(N,) int64, the identity of each row; where it has none, its place in the frame, after those of the table.
+
+        Raises InputError where a frame has one identity twice.
+        """
+        identity = self.identity if self.identity is not None else np.full(len(self), -1)
+        order = np.lexsort((self.line, identity, self.frame))
+        before, after = order[:-1], order[1:]
+        twice = (self.frame[before] == self.frame[after]) & (identity[before] == identity[after])
+        if (twice & (identity[after] > 0)).any():
+            row = after[(twice & (identity[after] > 0)).argmax()]
+            raise InputError(
+                f"{self.path}, line {self.line[row]}: identity {identity[row]} is there already in frame "
+                f"{self.frame[row]}; wanted each once a frame, or -1 where there are none"
+            )
+        place = np.arange(len(self)) - np.searchsorted(self.frame, self.frame) + 1
+        return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
+
     def at(self, frame: int) -> Detections:
         """The detections of a frame, of kind `given`."""
         here = self.rows(frame)
@@ -103,9 +128,9 @@ class DetectionTable:
 def read_detections(path: str | Path) -> DetectionTable:
     """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names COLUMNS.
 
-    An id, or a column `identity`, that is no whole number from 1 is none. A column `cut` of 0 and 1 is kept; any other
-    and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table without
-    rows is valid: `dddas detect` writes one for a clip in which nothing moves.
+    An id, or a column `identity`, that is no whole number from 1 is none. A column `cut` of 0 and 1 is kept, and so are
+    FEET; any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A
+    table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
     below 1 or above LAST_FRAME, a width or height below LEAST_PX, a place or size beyond FARTHEST_PX, a column named
     twice, a few scores outside [0, 1] (see FEW_SHARE), a cut that is neither 0 nor 1.
@@ -117,15 +142,16 @@ def read_detections(path: str | Path) -> DetectionTable:
     except UnicodeDecodeError as error:
         raise InputError(f"detections {path} is no text: {error}") from None
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    own = cuts = False
+    own = ours = cuts = feet = False
     if content and _named(content[0][1]):
         number, header = content.pop(0)
         rows = list(_by_name(content, header, f"detections {path}", number))
         own = _all_moving(content, header)
-        cuts = "cut" in _cells(header)
+        ours = own or {"identity", "kind", "row", "speed_px_per_frame"} <= set(_cells(header))
+        cuts, feet = "cut" in _cells(header), set(FEET) <= set(_cells(header))
     else:
         rows = list(_by_place(content, f"detections {path}"))
-    table = np.array(rows, np.float64).reshape(-1, 9)
+    table = np.array(rows, np.float64).reshape(-1, 11)
     _refuse_few_outside(table[:, 5], table[:, 6], f"detections {path}")
     table = table[np.argsort(table[:, 0], kind="stable")]
     return DetectionTable(
@@ -137,6 +163,8 @@ def read_detections(path: str | Path) -> DetectionTable:
         own,
         table[:, 7].astype(np.int64),
         table[:, 8] > 0 if cuts else None,
+        table[:, 9:11] if feet else None,
+        ours,
     )
 
 
@@ -154,7 +182,7 @@ def _by_place(content: Sequence[tuple[int, str]], name: str) -> Iterator[list[fl
                 f"{name}, line {number}: {len(cells)} column{'s' * (len(cells) != 1)}; wanted frame,id,x,y,w,h[,score]"
             )
         row = _row((cells[0], *cells[2:6]), cells[6] if len(cells) > 6 else "", number, name)
-        yield [*row, _identity(cells[1]), 0.0]
+        yield [*row, _identity(cells[1]), 0.0, math.nan, math.nan]
 
 
 def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: int) -> Iterator[list[float]]:
@@ -168,7 +196,9 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
         raise InputError(f"{name}, line {line}: column {twice[0]} is named twice; wanted each name once")
     places = [names.index(column) for column in COLUMNS]
     # A column that is not there is read as an empty cell after the last.
-    score, identity, cut = (names.index(n) if n in names else len(names) for n in ("score", "identity", "cut"))
+    score, identity, cut, *feet = (
+        names.index(n) if n in names else len(names) for n in ("score", "identity", "cut", *FEET)
+    )
     for number, text in content:
         cells = _cells(text)
         if len(cells) != len(names):
@@ -177,7 +207,11 @@ def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: i
         row = _row([cells[place] for place in places], cells[score], number, name)
         if cells[cut] not in ("", "0", "1"):
             raise InputError(f"{name}, line {number}: cut is '{cells[cut]}'; wanted 1 where the border cuts it, else 0")
-        yield [*row, _identity(cells[identity]), float(cells[cut] == "1")]
+        standing = [_number(cells[place]) if cells[place] else math.nan for place in feet]
+        for value, place, column in zip(standing, feet, FEET, strict=True):
+            if value is None or abs(value) > FARTHEST_PX:
+                raise InputError(f"{name}, line {number}: {column} is '{cells[place]}'; wanted pixels, or nothing")
+        yield [*row, _identity(cells[identity]), float(cells[cut] == "1"), *(v for v in standing if v is not None)]
 
 
 def _cells(line: str) -> list[str]:
