@@ -28,6 +28,7 @@ class Telemetry:
     pitch of pi/2, where the heading is that of the picture's upper edge. hfov_rad: (N,) width of its field of view.
     vehicle_heading_rad: (N,) of the vehicle's nose, which need not be the camera's.
     start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known. origin: what it was read from.
+    notes: what the user should know of it: what was cut off, left out, or derived.
     """
 
     time_s: np.ndarray
@@ -43,6 +44,7 @@ class Telemetry:
     vehicle_heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     start_utc_s: float = float("nan")
     origin: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         # A column that was not given is one of unknown values.
@@ -318,6 +320,22 @@ class Marks:
 
     def __len__(self) -> int:
         return len(self.landmark)
+
+
+@dataclass(frozen=True)
+class Colours:
+    """The colours that landmarks wear, one row a landmark: ranges of hue, saturation and value, ends included.
+
+    low, high: (K, 3) int64 in OpenCV's units, hue 0 to 180 and the others 0 to 255; a range whose lowest hue is above
+    its highest goes over 0.
+    """
+
+    names: tuple[str, ...]
+    low: np.ndarray
+    high: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 @dataclass(frozen=True)
