@@ -13,7 +13,7 @@ from torchvision_dddas import control, windows
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.pipeline import Found, Observation, admitted, draw_targets, observe, table
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.sources.telemetry import at
+from torchvision_dddas.sources.telemetry import at, check_overlap
 from torchvision_dddas.targets.history import MotionHistory
 from torchvision_dddas.targets.motion import DenseFlow
 from torchvision_dddas.targets.projective import chain
@@ -75,25 +75,15 @@ def run(
     """
     count = getattr(source, "count", None)
     if telemetry is not None and count:
-        _check_overlap(telemetry, (count - 1) / source.rate_hz)
+        check_overlap(telemetry, (count - 1) / source.rate_hz)
     loop = Loop(vision, settings, source.rate_hz, telemetry, batch or (8 if vision.name == "torch" else 1))
     last_s = 0.0
     for frame in source:
         last_s = frame.time_s
         yield from loop.feed(frame)
     if telemetry is not None:
-        _check_overlap(telemetry, last_s)
+        check_overlap(telemetry, last_s)
     yield from loop.end(getattr(source, "last", 0))
-
-
-def _check_overlap(telemetry: Telemetry, last_s: float) -> None:
-    """Raises InputError for telemetry that tells nothing about a clip from 0 to last_s."""
-    from_s, to_s = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
-    if at(telemetry, 0.0) is None and at(telemetry, last_s) is None and not 0 <= from_s <= last_s:
-        raise InputError(
-            f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to {last_s:.1f} s; they do not overlap: "
-            "count time_s from the clip's first frame"
-        )
 
 
 class Loop:

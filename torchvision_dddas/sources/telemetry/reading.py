@@ -1,0 +1,48 @@
+"""Which kind of log a file is, by what is in it, then by its name."""
+
+import re
+from pathlib import Path
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.telemetry.srt import read_subtitles
+from torchvision_dddas.sources.telemetry.table import read_table
+from torchvision_dddas.types import Telemetry
+
+KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
+
+
+def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Path | None = None) -> Telemetry:
+    """What a vehicle reports of itself. clock_offset_s: added to its times to get those since the clip's first frame.
+
+    clip: the video that it belongs to; of use for a table that counts frames instead of telling times.
+    Raises InputError in one line where the file cannot be read or nothing in it can be used. What can be read of a
+    damaged file is returned, and its notes say what could not.
+    """
+    path, clip = Path(path), Path(clip) if clip is not None else None
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
+    if path.suffix.lower() == ".csv":
+        return read_table(path, clock_offset_s, clip)
+    if not head.strip():
+        raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
+    text = _text(head)
+    if text is not None and re.search(r"-->|\bGPS\s*\(|\[\s*latitude", text):
+        whole = path.read_bytes()
+        return read_subtitles(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)
+    if text is not None and "," in text:
+        return read_table(path, clock_offset_s, clip)
+    raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
+
+
+def _text(content: bytes) -> str | None:
+    """The content as text; None where it is none."""
+    if b"\0" in content:
+        return None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # The last letter may have been cut in two.
+        return content[: error.start].decode("utf-8-sig") if error.start > len(content) - 4 else None
