@@ -2,18 +2,24 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from torchvision_dddas.control import (
+    LandmarkUse,
     Regime,
     adjusted,
+    best_spread,
     bounded,
+    chosen,
     interval_from_flow,
     interval_from_telemetry,
     regime_at,
+    spread_m2,
     steered,
 )
-from torchvision_dddas.settings import IntervalKnobs, Settings, with_knobs
+from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, with_knobs
+from torchvision_dddas.types import Marks
 
 KNOBS = IntervalKnobs(minimum_frames=1, maximum_frames=12)
 BASE = with_knobs(
@@ -122,3 +128,74 @@ def test_where_telemetry_ends_the_bounds_in_metres_end_and_that_is_recorded():
     assert after == Regime(BASE)
     assert {r.cause for r in records} == {"no telemetry for this frame"}
     assert steered(10, after, None, 10, BASE) == (after, ())
+
+
+# The 4-or-more rule.
+
+SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
+SOURCE = LandmarkKnobs(rule="source", poor_speed_m_s=2.0)
+
+
+def marks_at(places, seen=None):
+    image = np.array(places, float) * 20
+    image[[k for k in range(len(places)) if seen is not None and k not in seen]] = np.nan
+    n = len(places)
+    return Marks(np.arange(n), image, np.array(places, float), np.ones(n), np.ones(n), np.zeros(n))
+
+
+def test_every_landmark_in_view_is_used_by_default_and_no_other():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkKnobs())
+    assert (rows.tolist(), use.landmark, record) == ([0, 1, 2, 4, 5], (0, 1, 2, 4, 5), ())
+
+
+def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
+    assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
+    rows, use, (record,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
+    assert len(rows) == 6 and use.poor
+    assert (record.frame, record.knob, record.old, record.new) == (2, "landmarks.used", 4, 6)
+    assert record.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
+    _, use, (record,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
+    assert (record.old, record.new, use.poor) == (6, 4, False)
+
+
+def test_four_fast_landmarks_alone_change_nothing():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 3}), np.full(6, 9.0), SOURCE)
+    assert (rows.tolist(), use.poor, record) == ([0, 1, 2, 3], False, ())
+
+
+def test_a_speed_around_the_threshold_does_not_make_the_number_flutter():
+    use, changes = LandmarkUse(), 0
+    for frame, speed in enumerate([1.9, 2.1, 1.9, 2.1, 1.8, 2.05] * 5, 1):
+        _, use, record = chosen(frame, use, marks_at(SIX), np.full(6, speed), SOURCE)
+        changes += len(record)
+    assert changes == 1
+
+
+def test_an_unknown_speed_leaves_the_number_as_it_is():
+    for poor, count in ((True, 6), (False, 4)):
+        rows, use, record = chosen(1, LandmarkUse((0, 1, 2, 3), poor), marks_at(SIX), np.full(6, np.nan), SOURCE)
+        assert (len(rows), use.poor, record) == (count, poor, ())
+
+
+def test_the_four_in_use_stay_until_others_are_clearly_better_spread():
+    places = SIX.copy()
+    places[4] = (10.4, 10.4)  # a little better than the corner beside it
+    held = LandmarkUse((0, 1, 2, 3))
+    assert spread_m2(places[[0, 1, 3, 4]]) >= spread_m2(places[:4])
+    assert chosen(1, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 2, 3]
+    places[2] = (5.0, 0.1)  # and now that one lies on a line with two others
+    assert chosen(2, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 3, 4]
+
+
+def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmarks_in_one_place():
+    assert spread_m2(np.array([[0, 0], [4, 0], [0, 2], [4, 3.0]])) == pytest.approx(4.0)
+    assert best_spread(SIX, 4).tolist() == [0, 1, 2, 3]
+    crowd = np.concatenate([np.full((20, 2), 5.0), SIX[:4]])
+    assert best_spread(crowd, 4).tolist() == [20, 21, 22, 23]
+    assert best_spread(np.full((9, 2), 5.0), 4).tolist() == sorted(set(best_spread(np.full((9, 2), 5.0), 4).tolist()))
+
+
+def test_landmarks_all_on_one_line_are_taken_as_far_apart_as_they_are():
+    row = np.array([[k, 2.0 * k] for k in range(6)])
+    assert {0, 5} <= set(best_spread(row, 4).tolist())
