@@ -37,8 +37,8 @@ def ground(
 ) -> None:
     """Locate people seen by cameras on the ground, by their height and their feet; several cameras are fused.
 
-    Writes positions.csv, sightings.csv (what each camera alone says), tracks.geojson where longitudes are known, and
-    run.json under --out.
+    Writes positions.csv, sightings.csv (what each camera alone says), tracks.geojson and tracks.kml where longitudes
+    are known, and run.json under --out.
     """
     from torchvision_dddas.settings import load
 
@@ -107,5 +107,7 @@ def summary(journal: "PositionJournal", folder: Path) -> list[str]:
     lines = [f"{journal.frames} frames, {journal.targets} sightings ({told}), {journal.people} positions"]
     if by["bearing"]:
         lines.append(f"note: {by['bearing']} sightings have a bearing but no distance (see sightings.csv)")
-    made = [name for name in ("positions.csv", "sightings.csv", "tracks.geojson") if (folder / name).exists()]
+    made = [
+        name for name in ("positions.csv", "sightings.csv", "tracks.geojson", "tracks.kml") if (folder / name).exists()
+    ]
     return [*lines, *(f"note: {note}" for note in journal.notes), f"{folder}: {', '.join([*made, 'run.json'])}"]

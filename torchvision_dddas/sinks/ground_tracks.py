@@ -1,7 +1,9 @@
 """The places of all targets over time, kept while frames go by: what maps are made of at the end."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +17,7 @@ _ROW = np.dtype(
         ("east_north_m", "f8", 2),
         ("covariance_m2", "f8", (2, 2)),
         ("lonlat_deg", "f8", 2),
+        ("velocity_m_s", "f8", 2),
     ]
 )
 
@@ -24,8 +27,8 @@ class GroundTracks:
     """All places of all targets, one row a place, by target and then by time.
 
     target, frame: (N,) int64. time_s: (N,) since the clip's first frame, NaN where unknown. east_north_m: (N, 2).
-    covariance_m2: (N, 2, 2), NaN where unknown. lonlat_deg: (N, 2); None where there is no geographic origin.
-    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
+    covariance_m2: (N, 2, 2), velocity_m_s: (N, 2), NaN where unknown. lonlat_deg: (N, 2); None where there is no
+    geographic origin. start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
     """
 
     target: np.ndarray
@@ -34,6 +37,7 @@ class GroundTracks:
     east_north_m: np.ndarray
     covariance_m2: np.ndarray
     lonlat_deg: np.ndarray | None
+    velocity_m_s: np.ndarray
     start_utc_s: float = float("nan")
 
     def __len__(self) -> int:
@@ -43,39 +47,48 @@ class GroundTracks:
     def of(self) -> dict[int, slice]:
         """The rows of each target."""
         targets, first = np.unique(self.target, return_index=True)
-        ends = [*first[1:].tolist(), len(self)]
-        return {t: slice(a, b) for t, a, b in zip(targets.tolist(), first.tolist(), ends, strict=True)}
+        edges = pairwise([*first.tolist(), len(self)])
+        return {target: slice(*edge) for target, edge in zip(targets.tolist(), edges, strict=True)}
 
     @property
     def sigma_m(self) -> np.ndarray:
         """(N,) how well each place is known: the root of the covariance's trace, NaN where it is not."""
         return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
 
-    def once_a(self, seconds: float, rows: slice) -> list[int]:
-        """Rows of a target at least so far apart in time, among them its first and its last; all where no time is."""
-        time = self.time_s[rows]
-        if not np.isfinite(time).all():
-            return list(range(rows.start, rows.stop))
+    @cached_property
+    def times_utc(self) -> list[str] | None:
+        """When each place was taken, ISO 8601 to the millisecond; None where no clock is known."""
+        if not (math.isfinite(self.start_utc_s) and np.isfinite(self.time_s).all()):
+            return None
+        return iso_utc(self.start_utc_s + self.time_s)
+
+    def spaced(self, seconds: float, rows: slice) -> list[int]:
+        """Rows of a target about so far apart in time, its last among them; that alone where no time is known."""
+        last = rows.stop - 1
+        due = -math.inf
         chosen: list[int] = []
-        due = -np.inf
-        for row, at in enumerate(time.tolist(), rows.start):
+        for row, at in enumerate(self.time_s[rows].tolist(), rows.start):
             # A hair less, so that the rounding of time stamps costs no row.
             if at >= due - 1e-6:
                 chosen.append(row)
                 due = at + seconds
-        if chosen and chosen[-1] != rows.stop - 1:
-            chosen.append(rows.stop - 1)
-        return chosen
+        return chosen if chosen and chosen[-1] == last else [*chosen, last]
+
+
+def iso_utc(utc_s: np.ndarray) -> list[str]:
+    """Seconds since 1970 as ISO 8601 to the millisecond, as in 2026-03-01T12:00:00.250Z."""
+    stamps = np.round(np.asarray(utc_s, float) * 1000).astype("i8").astype("M8[ms]")
+    return [f"{stamp}Z" for stamp in np.datetime_as_string(stamps).tolist()]
 
 
 class Gathered:
-    """Rows of GroundTracks as they come: 104 bytes each, at most twice that while the space for them grows."""
+    """Rows of GroundTracks as they come: 104 bytes each, up to three times that while the space for them grows."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(256, _ROW)
         self._count = 0
 
-    def add(self, positions: Positions, time_s: float = float("nan")) -> None:
+    def add(self, positions: Positions, time_s: float = math.nan, velocity_m_s: np.ndarray | None = None) -> None:
         """Keep the places of a frame."""
         count = self._count + len(positions)
         if count > len(self._rows):
@@ -84,9 +97,10 @@ class Gathered:
         rows["frame"], rows["target"], rows["time_s"] = positions.frame, positions.target, time_s
         rows["east_north_m"], rows["covariance_m2"] = positions.east_north_m, positions.covariance_m2
         rows["lonlat_deg"] = np.nan if positions.lonlat_deg is None else positions.lonlat_deg
+        rows["velocity_m_s"] = np.nan if velocity_m_s is None else velocity_m_s
         self._count = count
 
-    def tracks(self, geographic: bool, start_utc_s: float = float("nan")) -> GroundTracks:
+    def tracks(self, geographic: bool, start_utc_s: float = math.nan) -> GroundTracks:
         """What was kept, by target. geographic: whether the positions had longitudes and latitudes."""
         rows = self._rows[: self._count]
         rows = rows[np.argsort(rows["target"], kind="stable")]
@@ -97,5 +111,6 @@ class Gathered:
             rows["east_north_m"],
             rows["covariance_m2"],
             rows["lonlat_deg"] if geographic else None,
+            rows["velocity_m_s"],
             start_utc_s,
         )

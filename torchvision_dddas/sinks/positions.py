@@ -1,14 +1,15 @@
-"""Places on the ground as tables and as GeoJSON, and the folder of a run that gives them."""
+"""Places on the ground as tables and as maps, and the folder of a run that gives them."""
 
-import json
 import math
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.sinks.geojson import encoded, geojson
+from torchvision_dddas.sinks.ground_tracks import Gathered
 from torchvision_dddas.sinks.journal import NAME, Record
+from torchvision_dddas.sinks.kml import kml
 from torchvision_dddas.sinks.output import RunFolder
 from torchvision_dddas.sinks.tables import TextFiles
 from torchvision_dddas.sinks.whole import remove, temporary, write_whole
@@ -47,53 +48,6 @@ def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
             f"{located.cut[i]:d},{seen.by[i]},{rest}\n"
         )
     return "".join(lines)
-
-
-def geojson(positions: Positions) -> dict[str, Any]:
-    """A FeatureCollection (RFC 7946), a feature a target: a line, or a point where it was located once.
-
-    `frames` has the frame of each place, `sigma_m` how well it is known: the root of the covariance's trace, null where
-    it is not. A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
-    Raises ValueError where there is no geographic origin.
-    """
-    if positions.lonlat_deg is None:
-        raise ValueError("these positions have no longitude and latitude")
-    features = []
-    for target in np.unique(positions.target).tolist():
-        rows = np.flatnonzero(positions.target == target)
-        # 1e-8 of a degree is a millimetre.
-        places = [[round(float(v), 8) for v in positions.lonlat_deg[row]] for row in rows]
-        sigma = np.sqrt(np.trace(positions.covariance_m2[rows], axis1=1, axis2=2))
-        shape = _line(places) if len(rows) > 1 else {"type": "Point", "coordinates": places[0]}
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": shape,
-                "properties": {
-                    "target": target,
-                    "frames": positions.frame[rows].tolist(),
-                    "sigma_m": [round(float(s), 3) if math.isfinite(s) else None for s in sigma],
-                },
-            }
-        )
-    return {"type": "FeatureCollection", "features": features}
-
-
-def _line(places: list[list[float]]) -> dict[str, Any]:
-    lines = [places[:1]]
-    for before, after in pairwise(places):
-        if abs(after[0] - before[0]) > 180:
-            edge = math.copysign(180.0, before[0])
-            # Degrees to the edge, and from it on the other side.
-            here, there = abs(edge - before[0]), abs(-edge - after[0])
-            share = here / (here + there) if here + there > 0 else 0.0
-            latitude = round(before[1] + share * (after[1] - before[1]), 8)
-            lines[-1].append([edge, latitude])
-            lines.append([[-edge, latitude]])
-        lines[-1].append(after)
-    if len(lines) == 1:
-        return {"type": "LineString", "coordinates": lines[0]}
-    return {"type": "MultiLineString", "coordinates": lines}
 
 
 def _place(positions: Positions, row: int) -> list[str]:
@@ -135,29 +89,28 @@ class PositionTables:
 
 
 class Map:
-    """tracks.geojson, written at the end."""
+    """tracks.geojson and tracks.kml, written at the end."""
+
+    files = ("tracks.geojson", "tracks.kml")
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / "tracks.geojson"
-        self._parts: list[Positions] = []
+        self._paths = [folder / name for name in self.files]
+        self._gathered = Gathered()
 
     def write(self, located: Located) -> None:
         """Add the people of a frame."""
-        self._parts.append(located.positions)
+        self._gathered.add(located.positions)
 
     def close(self, complete: bool) -> None:
-        """Write the map. Raises OSError if it cannot be written."""
-        parts = self._parts
-        whole = Positions(lonlat_deg=np.zeros((0, 2)))
-        if parts:
-            names = ("frame", "target", "east_north_m", "covariance_m2", "score", "lonlat_deg")
-            columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-            whole = Positions(**columns)
-        write_whole(self._path, (json.dumps(geojson(whole)) + "\n").encode())
+        """Write the maps. Raises OSError if they cannot be written."""
+        tracks = self._gathered.tracks(geographic=True)
+        for path, content in zip(self._paths, (encoded(geojson(tracks)), kml(tracks).encode()), strict=True):
+            write_whole(path, content)
 
     def discard(self) -> None:
         """Remove what was begun."""
-        remove(temporary(self._path))
+        for path in self._paths:
+            remove(temporary(path))
 
 
 class PositionJournal(Record):
@@ -184,7 +137,7 @@ class PositionJournal(Record):
 class PositionOutput(RunFolder[Located]):
     """Everything that `dddas locate ground` writes. Raises InputError as RunFolder does."""
 
-    files = ("positions.csv", "sightings.csv", "tracks.geojson", NAME)
+    files = ("positions.csv", "sightings.csv", *Map.files, NAME)
 
     def __init__(self, folder: Path) -> None:
         """Claim a folder, as in RunFolder."""
@@ -200,7 +153,8 @@ class PositionOutput(RunFolder[Located]):
         return kept
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place, as in RunFolder; a map of an earlier run here goes if this one makes none."""
+        """Put everything in its place, as in RunFolder; maps of an earlier run here go if this one makes none."""
         super().close(complete)
         if not self._geographic:
-            remove(self.folder / "tracks.geojson")
+            for name in Map.files:
+                remove(self.folder / name)

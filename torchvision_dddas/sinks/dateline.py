@@ -1,0 +1,79 @@
+"""Lines and rings on the ellipsoid for maps that end at 180 degrees of longitude."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+_AXIS_M, _SQUARED_ECCENTRICITY = 6_378_137.0, 6.694379990141316e-3  # WGS84
+
+Place = list[float]
+"""Longitude and latitude in degrees."""
+
+
+def rounded(lonlat_deg: np.ndarray) -> list[Place]:
+    """Places to 1e-8 of a degree, which is a millimetre."""
+    found: list[Place] = np.round(lonlat_deg, 8).tolist()
+    return found
+
+
+def cut_line(places: list[Place]) -> list[list[Place]]:
+    """The line as lines of which none goes over 180 degrees; their ends there are no places of the line."""
+    lines = [places[:1]]
+    for before, after in pairwise(places):
+        if abs(after[0] - before[0]) > 180:
+            edge = math.copysign(180.0, before[0])
+            # Degrees to the edge, and from it on the other side.
+            here, there = abs(edge - before[0]), abs(-edge - after[0])
+            share = here / (here + there) if here + there > 0 else 0.0
+            latitude = round(before[1] + share * (after[1] - before[1]), 8)
+            lines[-1].append([edge, latitude])
+            lines.append([[-edge, latitude]])
+        lines[-1].append(after)
+    return lines
+
+
+def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
+    """A small ring of metres about a place as closed rings in degrees, two where it lies on both sides of 180 degrees.
+
+    ring_m: (K, 2) metres east and north, convex and anticlockwise, as the rings will be. Degrees a metre are those at
+    the place: on the ellipsoid 100 m off are 1 mm out. None where the ring comes too near a pole to be a ring there.
+    """
+    longitude, latitude = (float(v) for v in lonlat_deg)
+    reach = float(np.hypot(*ring_m.T).max())
+    to_pole_m = (90 - abs(latitude)) * 111_000
+    # Within a tenth of the way to the pole a degree of longitude changes its length by as much.
+    if not reach <= to_pole_m / 10:
+        return []
+    degrees = (longitude, latitude) + ring_m * degrees_per_metre(latitude)
+    rings = []
+    for west in (-540.0, -180.0, 180.0):
+        inside = _clip(_clip(degrees, west, 1.0), west + 360, -1.0)
+        if len(inside) >= 3:
+            places = rounded(np.clip(inside - (west + 180, 0.0), (-180, -90), (180, 90)))
+            rings.append([*places, places[0]])
+    return rings
+
+
+def degrees_per_metre(latitude_deg: float) -> np.ndarray:
+    """(2,) degrees of longitude and of latitude that a metre east, or north, is on the WGS84 ellipsoid."""
+    latitude = math.radians(latitude_deg)
+    root = math.sqrt(1 - _SQUARED_ECCENTRICITY * math.sin(latitude) ** 2)
+    along_parallel = _AXIS_M / root * math.cos(latitude)
+    along_meridian = _AXIS_M * (1 - _SQUARED_ECCENTRICITY) / root**3
+    return np.degrees([1 / along_parallel, 1 / along_meridian])
+
+
+def _clip(ring: np.ndarray, edge: float, side: float) -> np.ndarray:
+    """The part of a convex ring east (side 1) or west (-1) of a longitude."""
+    inside = (ring[:, 0] - edge) * side >= 0
+    if inside.all() or not inside.any():
+        return ring[inside]
+    kept = []
+    for k, (before, after) in enumerate(zip(np.roll(ring, 1, axis=0), ring, strict=True)):
+        if inside[k] != inside[k - 1]:
+            share = (edge - before[0]) / (after[0] - before[0])
+            kept.append([edge, before[1] + share * (after[1] - before[1])])
+        if inside[k]:
+            kept.append(after)
+    return np.array(kept)
