@@ -524,6 +524,9 @@ class AerialKnobs(Group):
     focal_sigma: float = knob(0.01, "-", 0, 1, meaning="standard deviation of a focal length that is given, as a share")
     focal_guess_sigma: float = knob(0.2, "-", 0, 1, meaning="the same where it is not given but hfov_deg guessed")
     tilt_sigma_deg: float = knob(1.0, "deg", 0, 90, meaning="standard deviation of the reported tilt, each way")
+    tilt_guess_sigma_deg: float = knob(
+        15.0, "deg", 0, 180, meaning="the same where the telemetry does not say it but pitch_deg is taken"
+    )
     heading_sigma_deg: float = knob(5.0, "deg", 0, 180, meaning="standard deviation of the reported heading")
     altitude_sigma: float = knob(0.02, "-", 0, 10, meaning="standard deviation of the altitude, as a share of it")
     altitude_sigma_m: float = knob(0.0, "m", 0, 1000, meaning="and in metres")
