@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import GroundKnobs
+from torchvision_dddas.targets.projection import straight
 from torchvision_dddas.types import Camera, Poses, Sightings
 
 PIXEL_SIGMA = 0.5
@@ -138,23 +139,9 @@ def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
     x, y = (u - camera.centre_px[0]) / camera.focal_px[0], (v - camera.centre_px[1]) / camera.focal_px[1]
     right, down = x, y
     if camera.k1 or camera.k2:
-        right, down = _straight(x, y, camera)
+        right, down = straight(x, y, camera)
     sine, cosine = np.sin(camera.roll_rad), np.cos(camera.roll_rad)
     return right * cosine - down * sine, right * sine + down * cosine
-
-
-def _straight(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Undo r -> r (1 + k1 r² + k2 r⁴) by Newton's steps on the radius."""
-    bent = np.hypot(x, y)
-    radius = bent.copy()
-    for _ in range(20):
-        slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
-        missing = bent - radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
-        # Beyond the radius where the lens folds the picture back nothing is seen twice.
-        radius = np.where(slope > 0.05, radius + missing / np.maximum(slope, 0.05), np.nan)
-    grown = 1 + camera.k1 * radius**2 + camera.k2 * radius**4
-    reached = np.abs(radius * grown - bent) < 1e-6
-    return np.where(reached, x / grown, np.nan), np.where(reached, y / grown, np.nan)
 
 
 def _inverse_distance(
