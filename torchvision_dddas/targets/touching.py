@@ -1,0 +1,42 @@
+"""Where blobs are, and which patches and points they hold."""
+
+import numpy as np
+
+from torchvision_dddas.targets.boxes import shared_px
+
+
+def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
+    """(N, 2) of the blobs' mass where the foreground is given, else of their boxes."""
+    centres = boxes[:, :2] + (boxes[:, 2:] - 1) / 2
+    if foreground is not None:
+        for row, box in enumerate(boxes):
+            left, top, right, bottom = _pixels(box, foreground.shape)
+            v, u = np.nonzero(foreground[top:bottom, left:right] == row + 1)
+            if len(u):
+                centres[row] = left + u.mean(), top + v.mean()
+    return centres
+
+
+def covering(box: np.ndarray | None, boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
+    """(N,) bool: the blobs that cover a good part of a patch, or are covered by it."""
+    if box is None or not len(boxes):
+        return np.zeros(len(boxes), bool)
+    if foreground is not None:
+        left, top, right, bottom = _pixels(box, foreground.shape)
+        part = foreground[top:bottom, left:right]
+        count = np.bincount(part.ravel(), minlength=len(boxes) + 1)[1 : len(boxes) + 1]
+        return count > 0.3 * part.size
+    common = shared_px(box[None], boxes)[0]
+    return common > 0.5 * np.minimum(box[2:].prod(), boxes[:, 2:].prod(axis=1))
+
+
+def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(P, N) bool: which points lie in which boxes."""
+    offset = points[:, None] - boxes[None, :, :2] + 0.5
+    return ((offset >= 0) & (offset <= boxes[None, :, 2:])).all(axis=2)
+
+
+def _pixels(box: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """left, top, right, bottom of a box inside a picture (H, W)."""
+    left, top, right, bottom = (round(v) for v in (*box[:2], *(box[:2] + box[2:])))
+    return max(left, 0), max(top, 0), min(right, shape[1]), min(bottom, shape[0])
