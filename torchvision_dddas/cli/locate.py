@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchvision_dddas.cli.aerial import aerial
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate, check_rate
 from torchvision_dddas.cli.progress import progress
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.sinks.positions import PositionJournal
 
 locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
+locate.command()(aerial)
 
 
 @locate.command()

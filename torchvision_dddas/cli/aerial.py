@@ -1,0 +1,218 @@
+"""`dddas locate aerial`: from the picture to the ground, seen from the air."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate, check_rate
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.geolocating import Locator
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.sinks.grounded import GroundedJournal
+    from torchvision_dddas.types import Camera
+
+Marked = Annotated[
+    Path, typer.Option("--landmarks", metavar="FILE", help="A CSV of landmarks: where they were, and where they show.")
+]
+Flown = Annotated[
+    Path | None,
+    typer.Option("--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, KLV, NMEA."),
+]
+Lens = Annotated[Path | None, typer.Option("--camera", metavar="FILE", help="The TOML of the camera.")]
+Heights = Annotated[
+    Path | None, typer.Option("--dem", metavar="FILE", help="Heights of the ground, a GeoTIFF. [default: it is level]")
+]
+Ortho = Annotated[
+    Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo under the map, a GeoTIFF.")
+]
+
+
+@explained
+def aerial(
+    table: Annotated[
+        Path, typer.Argument(metavar="TABLE", help="Detections or tracks, CSV or MOTChallenge text, of the clip.")
+    ],
+    landmarks: Marked,
+    telemetry: Flown = None,
+    camera: Lens = None,
+    dem: Heights = None,
+    clip: Annotated[
+        str | None, typer.Option(metavar="CLIP", help="The clip itself: for its rate and the size of its pictures.")
+    ] = None,
+    background: Ortho = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-positions"),
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Engine = Backend.auto,
+    save: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="cot,map,report, all or none; tables are always written.")
+    ] = None,
+    rate: Rate = None,
+    quiet: Quiet = False,
+) -> None:
+    """Locate what a clip shows from the air, by landmarks of known place and by what the vehicle reports.
+
+    Writes positions.csv, fixes.csv (how each picture lies on the ground), maps, a report and run.json under --out.
+    """
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.sinks.grounded import SAVED
+
+    given = AerialInput(landmarks, telemetry, camera, dem, background)
+    settings, names = load(config, set_ or []), saved(save, SAVED)
+    journal = aerial_into(out, table, given, settings, clip, backend.value, names, rate, quiet)
+    if not quiet:
+        for line in summary(journal, out):
+            typer.echo(line)
+
+
+@dataclass(frozen=True)
+class AerialInput:
+    """The files beside the clip or the table."""
+
+    landmarks: Path
+    telemetry: Path | None = None
+    camera: Path | None = None
+    dem: Path | None = None
+    background: Path | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """All that are given."""
+        named = (self.landmarks, self.telemetry, self.camera, self.dem, self.background)
+        return [file for file in named if file is not None]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What run.json says of them."""
+        return {
+            "landmarks_file": self.landmarks,
+            "telemetry": self.telemetry,
+            "camera": self.camera,
+            "dem": self.dem,
+            "background": self.background,
+        }
+
+
+def aerial_into(
+    folder: Path,
+    table: Path,
+    given: AerialInput,
+    settings: "Settings",
+    clip: str | None = None,
+    backend: str = "auto",
+    save: Sequence[str] = (),
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> "GroundedJournal":
+    """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
+    from torchvision_dddas.geolocating import check_table, locate
+    from torchvision_dddas.geolocating.table import frames_of
+    from torchvision_dddas.sinks.grounded import GroundedOutput
+    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.sources import open_source
+    from torchvision_dddas.sources.detections import read_detections
+
+    check_rate(rate_hz)
+    inputs = [table, *given.files, *([Path(clip)] if clip else [])]
+    refuse_own_input(inputs, [folder / name for name in GroundedOutput.files], "folder with --out")
+    with GroundedOutput(folder, save) as output:
+        read = read_detections(table)
+        source = open_source(clip, rate_hz=rate_hz) if clip else None
+        rate = source.rate_hz if source is not None else rate_hz
+        last = source.count if source is not None else read.last
+        locator, notes = locator_for(given, settings, source.size if source else None, rate, backend, last or read.last)
+        check_table(read, locator)
+        facts = {"input": table, **given.facts, "rows": len(read), **_about(locator), "settings": settings.model_dump()}
+        site = locator.site
+        start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
+        journal = output.begin(
+            facts, site.landmarks.names, site.origin_deg, start_utc_s, locator.rate_hz, given.background
+        )
+        journal.notes += notes
+        if not len(read):
+            journal.notes.append("the table has no rows: nothing to locate")
+        with progress("locate", len(frames_of(read, site.landmarks)), quiet) as tick:
+            for grounded in locate(read, locator):
+                output.write(grounded)
+                tick()
+    return journal
+
+
+def locator_for(
+    given: AerialInput,
+    settings: "Settings",
+    size: tuple[int, int] | None,
+    rate_hz: float | None,
+    backend: str,
+    last: int,
+) -> "tuple[Locator, list[str]]":
+    """What lays pictures on the ground, from the files; and what the user should know of it.
+
+    size: (width, height) of the pictures and rate_hz, None where unknown. last: number of the last frame.
+    Raises InputError for bad input.
+    """
+    from dataclasses import replace
+
+    from torchvision_dddas.geolocating import Locator, camera_of, site_of
+    from torchvision_dddas.sources.landmarks import read_landmarks
+    from torchvision_dddas.sources.telemetry import check_overlap, read_telemetry
+    from torchvision_dddas.vision import load_solver
+
+    offset = settings.aerial.clock_offset_s
+    notes: list[str] = []
+    landmarks = read_landmarks(given.landmarks, rate_hz, offset)
+    telemetry = read_telemetry(given.telemetry, offset) if given.telemetry is not None else None
+    if telemetry is not None:
+        if rate_hz is None:
+            raise InputError(
+                "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
+            )
+        check_overlap(telemetry, (last - 1) / rate_hz)
+        notes += telemetry.notes
+    if rate_hz is None:
+        notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
+    site = site_of(landmarks, telemetry)
+    if given.dem is not None:
+        from torchvision_dddas.sources.elevation import read_elevation
+
+        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
+    camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings)
+    locator = Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
+    return locator, [*notes, *more]
+
+
+def _camera(given: AerialInput) -> "Camera | None":
+    from torchvision_dddas.sources.cameras import read_camera
+
+    return read_camera(given.camera) if given.camera is not None else None
+
+
+def _about(locator: "Locator") -> dict[str, Any]:
+    """What run.json says of how pictures were laid on the ground."""
+    camera = locator.camera
+    return {
+        "origin_deg": locator.site.origin_deg,
+        "rate_hz": locator.rate_hz,
+        "lens": {"size_px": camera.size_px, "focal_px": camera.focal_px, "centre_px": camera.centre_px},
+    }
+
+
+def summary(journal: "GroundedJournal", folder: Path) -> list[str]:
+    """What to tell the user at the end."""
+    by = ", ".join(f"{count} by {name}" for name, count in journal.by.items() if count and name != "nothing")
+    lines = [
+        f"{journal.frames} frames ({by or 'none located'}), {journal.targets} targets, {journal.positions} positions"
+    ]
+    if gaps := journal.by["nothing"]:
+        lines.append(f"note: {gaps} frames could not be located: no positions there (why: run.json)")
+    made = [name for name in type(journal).made if (folder / name).exists()] if hasattr(journal, "made") else []
+    return [*lines, *(f"note: {note}" for note in journal.notes), f"{folder}: {', '.join([*made, 'run.json'])}"]

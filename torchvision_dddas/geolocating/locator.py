@@ -1,0 +1,182 @@
+"""How the picture lies on the ground, frame by frame, and where that puts the targets."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchvision_dddas.control import LandmarkUse, chosen
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geolocating.site import Site
+from torchvision_dddas.settings import AerialKnobs, Settings
+from torchvision_dddas.sources.telemetry import at
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.targets.courses import Courses
+from torchvision_dddas.targets.elevation import surface, up
+from torchvision_dddas.targets.metres import Movers
+from torchvision_dddas.targets.plane import absolute, ground_points
+from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.types import Adjustment, Camera, Fix, Flight, Grounded, Marks, Positions
+from torchvision_dddas.vision.protocol import PlaneSolver
+
+
+@dataclass(frozen=True)
+class Targets:
+    """The boxes of one frame.
+
+    target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is an identity.
+    score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; None: of none.
+    bodies: whether a box's centre is the middle of a body.
+    """
+
+    box_px: np.ndarray
+    target: np.ndarray
+    lasting: np.ndarray
+    score: np.ndarray
+    feet_px: np.ndarray | None = None
+    bodies: bool = False
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the picture of one frame lies on the ground, by which landmarks; adjustments and seconds as in Scene."""
+
+    fix: Fix
+    marks: Marks
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Locator:
+    """How the picture lies on the ground, frame by frame, and where that puts targets. Feed it frames in order."""
+
+    def __init__(
+        self, site: Site, camera: Camera, settings: Settings, solver: PlaneSolver, rate_hz: float, focal_known: bool
+    ) -> None:
+        """Raises InputError for aerial.mode = paper, which works in degrees, where the landmarks are in metres."""
+        if settings.aerial.mode == "paper" and site.origin_deg is None:
+            raise InputError(
+                "aerial.mode = paper works in degrees of longitude and latitude, and the landmarks are in metres; give "
+                "longitude_deg,latitude_deg, or take another mode"
+            )
+        self.site, self.camera, self.settings, self.rate_hz = site, camera, settings, rate_hz
+        self.courses = Courses(site.landmarks, settings.landmarks, rate_hz)
+        self._registrar = Registrar(camera, settings, solver, focal_known, site.landmarks.names)
+        self._movers = Movers()
+        self._use = LandmarkUse()
+        self._ground = surface(site.elevation) if site.elevation is not None else None
+
+    def time_s(self, frame: int) -> float:
+        """Of a frame, since the clip's first."""
+        return (frame - 1) / self.rate_hz
+
+    def marks(self, frame: int) -> Marks:
+        """The landmarks of a frame, on the ground: those whose place and height are known."""
+        return self._standing(self.courses.at(frame))
+
+    def look(self, frame: int, marks: Marks) -> Look:
+        """How the picture of a frame lies on the ground; marks: those of `marks`, with their places in the picture."""
+        start = time.perf_counter()
+        speeds = self.courses.speed_m_s(frame)[marks.landmark]
+        rows, self._use, adjustments = chosen(frame, self._use, marks, speeds, self.settings.landmarks)
+        used = chosen_rows(marks, rows)
+        degrees = None
+        if self.settings.aerial.mode == "paper" and self.site.origin_deg is not None:
+            degrees = geodesy.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
+        when = self.time_s(frame)
+        fix = self._registrar.step(frame, when, self.flight(when), used, degrees)
+        return Look(fix, used, adjustments, {"register": time.perf_counter() - start})
+
+    def flight(self, time_s: float) -> Flight | None:
+        """What the telemetry says, its altitude counted from up = 0; unknown where that is below the ground."""
+        flight = at(self.site.telemetry, time_s) if self.site.telemetry is not None else None
+        if flight is None:
+            return None
+        below, base = 0.0, 0.0
+        if self.site.elevation is not None:
+            base = self.site.elevation.base_m
+            below = float(up(self.site.elevation, np.array([flight.place]))[0])
+        altitude = flight.altitude_m + below
+        if not math.isfinite(altitude) and self.site.elevation is not None:
+            altitude = flight.above_sea_m - base
+        if not altitude > (below if math.isfinite(below) else 0.0):
+            altitude = math.nan
+        return replace(flight, altitude_m=altitude)
+
+    def ground(
+        self,
+        look: Look,
+        targets: Targets,
+        adjustments: Sequence[Adjustment] = (),
+        seconds: Mapping[str, float] | None = None,
+    ) -> Grounded:
+        """Where the targets of a frame stand by its fix; none that the fix cannot place. Feed it frames in order.
+
+        adjustments, seconds: what happened to the frame before, for the record.
+        """
+        fix = look.fix
+        start = time.perf_counter()
+        place, relative, own = self._laid(fix, targets)
+        rows = np.flatnonzero(np.isfinite(place).all(axis=1))
+        place, relative, own = place[rows], relative[rows], own[rows]
+        when, target = self.time_s(fix.frame), targets.target[rows]
+        velocity = self._movers.step(when, np.where(targets.lasting[rows], target, -1), place, own)
+        origin = self.site.origin_deg
+        positions = Positions(
+            np.full(len(rows), fix.frame),
+            target,
+            place,
+            absolute(relative, self.settings.landmarks.common_sigma_m),
+            targets.score[rows],
+            origin,
+            None if origin is None else geodesy.lonlat(place, origin),
+        )
+        spent = {**(seconds or {}), **look.seconds, "ground": time.perf_counter() - start}
+        moved = (*adjustments, *look.adjustments)
+        return Grounded(
+            fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, look.marks, moved, spent
+        )
+
+    def _laid(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
+        knobs = self.settings.aerial
+        pixels, lift = points_of(targets, knobs, fix.pose is not None)
+        place, relative = ground_points(fix, self.camera, pixels, knobs.target_sigma_px, lift, self._ground)
+        _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
+        return place, relative, relative - shared
+
+    def _standing(self, marks: Marks) -> Marks:
+        if self._ground is None or not len(marks):
+            return marks
+        marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
+        # Where the raster has no height, a landmark would be put on a plane that is not the ground's.
+        return chosen_rows(marks, np.isfinite(marks.up_m))
+
+
+def chosen_rows(marks: Marks, rows: np.ndarray) -> Marks:
+    """Some of the landmarks."""
+    return Marks(
+        marks.landmark[rows],
+        marks.image_px[rows],
+        marks.east_north_m[rows],
+        marks.sigma_m[rows],
+        marks.pixel_sigma[rows],
+        marks.up_m[rows],
+    )
+
+
+def points_of(targets: Targets, knobs: AerialKnobs, posed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) that stand for the targets, and how high above the ground those are (N,) m.
+
+    A body's foot is where its middle, half its height up, has its place: that takes a pose of the camera (posed).
+    """
+    centre = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
+    lift = np.zeros(len(centre))
+    if knobs.point == "auto" and targets.feet_px is not None:
+        named = np.isfinite(targets.feet_px).all(axis=1)
+        return np.where(named[:, None], targets.feet_px, centre), lift
+    if posed and (knobs.point == "foot" or (knobs.point == "auto" and targets.bodies)):
+        lift += knobs.target_height_m / 2
+    return centre, lift

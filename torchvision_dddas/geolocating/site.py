@@ -1,0 +1,105 @@
+"""Landmarks, telemetry and the camera as they are before the first frame: on one plane, in one kind of place."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.landmarks import looks_swapped
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
+
+
+@dataclass(frozen=True)
+class Site:
+    """Landmarks and telemetry in the same local metres, east and north of origin_deg.
+
+    origin_deg: (longitude, latitude); None where all is in local metres from the start.
+    """
+
+    landmarks: Landmarks
+    telemetry: Telemetry | None
+    origin_deg: tuple[float, float] | None
+    elevation: Elevation | None = None
+
+    @property
+    def places(self) -> np.ndarray:
+        """(N, 2) where landmarks and vehicle were, local metres."""
+        known = [self.landmarks.place, *([self.telemetry.place] if self.telemetry is not None else [])]
+        return np.concatenate([place[np.isfinite(place).all(axis=1)] for place in known])
+
+
+def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
+    """Everything in local metres: those of the landmarks, or east and north of the first place of one.
+
+    Raises InputError where no landmark has a place, degrees and metres are mixed, longitude and latitude look swapped,
+    or the vehicle's altitude is below the ground throughout.
+    """
+    known = np.isfinite(landmarks.place).all(axis=1)
+    if not known.any():
+        raise InputError(f"landmarks {landmarks.path}: no row has a place; wanted longitude_deg,latitude_deg or metres")
+    flown = telemetry is not None and np.isfinite(telemetry.place).all(axis=1).any()
+    if telemetry is not None and flown and telemetry.geographic != landmarks.geographic:
+        kinds = ("longitude and latitude", "local metres")
+        first, second = kinds if landmarks.geographic else kinds[::-1]
+        raise InputError(f"the landmarks are in {first}, the telemetry in {second}; give both in one kind")
+    if telemetry is not None:
+        _above_ground(telemetry)
+    if not landmarks.geographic:
+        return Site(landmarks, telemetry, None)
+    if telemetry is not None and flown:
+        where = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
+        longitude, latitude = (float(v) for v in np.median(where, axis=0))
+        if looks_swapped(landmarks, (longitude, latitude)):
+            raise InputError(
+                f"landmarks {landmarks.path}: longitude and latitude look swapped; the vehicle is at longitude "
+                f"{longitude:.5f}, latitude {latitude:.5f}"
+            )
+    longitude, latitude = landmarks.place[known][0].tolist()
+    origin = (longitude, latitude)
+    local = replace(landmarks, place=geodesy.east_north(landmarks.place, origin), geographic=False)
+    if telemetry is not None:
+        telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
+    return Site(local, telemetry, origin)
+
+
+def _above_ground(telemetry: Telemetry) -> None:
+    altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
+    if len(altitude) and (altitude <= 0).all():
+        raise InputError(
+            f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
+            "wanted metres above ground"
+        )
+
+
+def camera_of(
+    camera: Camera | None, size: tuple[int, int] | None, telemetry: Telemetry | None, settings: Settings
+) -> tuple[Camera, bool, list[str]]:
+    """The camera in the air, whether its focal length is given, and what the user should know of it.
+
+    camera: as its file says, None without one. size: (width, height) of the pictures where the camera does not say.
+    Raises InputError where the size is not known, or the camera's is another than that of the pictures.
+    """
+    if camera is not None:
+        if size is not None and tuple(camera.size_px) != tuple(size):
+            raise InputError(
+                f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
+                f"{size[0]} x {size[1]}; give the camera's file for this size"
+            )
+        return camera, True, []
+    if size is None:
+        raise InputError(
+            "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
+            "--set aerial.mode=homography, which needs neither"
+        )
+    knobs = settings.aerial
+    wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
+    hfov = float(np.median(wide)) if len(wide) else math.radians(knobs.hfov_deg)
+    focal = size[0] / 2 / math.tan(hfov / 2)
+    made = Camera("camera", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2), focal_sigma=knobs.focal_sigma)
+    if len(wide) or knobs.mode != "pose":
+        return made, bool(len(wide)), []
+    note = f"neither a camera's file nor telemetry says the field of view: {knobs.hfov_deg:g} degrees were taken for it"
+    return made, False, [f"{note} (aerial.hfov_deg)"]
