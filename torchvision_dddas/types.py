@@ -414,6 +414,18 @@ class Positions:
 
 
 @dataclass(frozen=True)
+class Ortho:
+    """A photo of the ground as seen from straight above, to lie under a map.
+
+    image: (H, W, 3) uint8, OpenCV's BGR order. east_north_from_pixel: (2, 3), local metres of (u, v, 1), from the first
+    pixel's centre.
+    """
+
+    image: np.ndarray
+    east_north_from_pixel: np.ndarray
+
+
+@dataclass(frozen=True)
 class Located:
     """All that is known of one frame after its people were located from the ground.
 
