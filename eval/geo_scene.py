@@ -1,0 +1,347 @@
+"""Simulated flights over landmarks, many at once: what is true, what is measured of it, and how sharp that can be.
+
+A scene is one frame: landmarks in a disc of 25 m radius; targets, half of them within 10 m of its middle as a crowd
+with its escort about it, half all over it; a camera at some altitude that looks at the middle. Measured are the
+landmarks' pixels and GPS, the targets' pixels and the telemetry, all with Gaussian errors. The picture's borders are
+left aside: from 50 m the disc is higher than the picture. The geometry is written out here and not taken from the
+package: so that an error there cannot hide.
+
+`pose_bound` and `homography_bound` are Cramér-Rao bounds: no unbiased estimate of a target's place from the same
+measurements has a smaller covariance, that of the pose with the priors counted as measurements.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ellipe
+
+from torchvision_dddas.types import Camera
+
+RADIUS_M, CROWD_M = 25.0, 10.0
+SIZE_PX = (1920, 1080)
+FOCAL_PX = SIZE_PX[0] / 2 / np.tan(np.radians(35))
+CAMERA = Camera("aerial", SIZE_PX, (FOCAL_PX, FOCAL_PX), ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2))
+"""1080p, a lens of 70 degrees."""
+
+SIGMA_OF = 1 / np.sqrt(-2 * np.log(0.05))
+"""Standard deviation along each axis of a GPS that is so many metres off in 95 %, as a share of those."""
+
+FOCAL_SIGMA, TILT_SIGMA, HEADING_SIGMA = 0.01, np.radians(1.0), np.radians(5.0)
+ALTITUDE_SIGMA, POSITION_SIGMA_M = 0.02, 3.5 * SIGMA_OF
+"""Of the telemetry, one standard deviation."""
+
+GPS = {
+    "exact": 0.0,
+    "2 cm RTK": 0.02,
+    "1.5 m": 1.5 * SIGMA_OF,
+    "3.5 m": 3.5 * SIGMA_OF,
+    "two RTK": np.nan,
+    "opposite RTK": np.nan,
+}
+"""Standard deviation of a landmark's place along each axis. RTK: of two landmarks, any or opposite; others 3.5 m."""
+
+LAYOUTS = ("ring", "small ring", "disc", "row", "corner", "L")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a batch of scenes has in common. common_m: sigma of the error that all receivers share, along each axis."""
+
+    altitude_m: float = 50.0
+    landmarks: int = 4
+    layout: str = "ring"
+    gps: str = "3.5 m"
+    pixel_sigma: float = 1.0
+    tilt_deg: float = 0.0
+    common_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """A batch of S scenes with n landmarks and T targets; the true_* are hidden from the estimates.
+
+    true_axes: (S, 3, 3) camera's right, down, forward. true_place: (S, 3). true_focal: (S,) share of the camera's.
+    axes, place: the telemetry's. true_marks, marks: (S, n, 2) east, north. sigma_m: (S, n). common_m: (S, 2) that all
+    places told share. marks_px, targets_px: (S, n or T, 2). true_targets: (S, T, 2).
+    """
+
+    case: Case
+    true_axes: np.ndarray
+    true_place: np.ndarray
+    true_focal: np.ndarray
+    true_marks: np.ndarray
+    true_targets: np.ndarray
+    axes: np.ndarray
+    place: np.ndarray
+    marks: np.ndarray
+    sigma_m: np.ndarray
+    common_m: np.ndarray
+    marks_px: np.ndarray
+    targets_px: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.true_focal)
+
+
+def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
+    """Draw them. Batches of the same seed have camera, telemetry, targets and their pixels in common."""
+    flight, crowd, team = (np.random.default_rng([seed, n]) for n in range(3))
+    heading = flight.uniform(-np.pi, np.pi, count)
+    tilt = np.radians(case.tilt_deg)
+    nominal = looking(heading, np.full(count, np.pi / 2 - tilt), np.zeros(count))
+    # A gimbal does not hold exactly: a degree of tilt, and the middle is missed by some metres.
+    true_axes = turned(flight.normal(0, TILT_SIGMA, (count, 3)) * (1, 1, 0)) @ nominal
+    back = case.altitude_m * np.tan(tilt) * np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    true_place = np.concatenate([flight.normal(0, 2, (count, 2)) - back, np.full((count, 1), case.altitude_m)], axis=1)
+    true_focal = np.exp(flight.normal(0, FOCAL_SIGMA, count))
+    away = flight.normal(0, (TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA), (count, 3))
+    axes = turned(away) @ true_axes
+    shift = (POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m)
+    # All receivers share an error, the aircraft's too.
+    common = flight.normal(0, 1, (count, 2)) * case.common_m
+    place = true_place + flight.normal(0, shift, (count, 3)) + np.pad(common, ((0, 0), (0, 1)))
+
+    inner = targets // 2
+    true_targets = np.concatenate([disc(crowd, (count, inner), CROWD_M), disc(crowd, (count, targets - inner))], axis=1)
+    noise = crowd.normal(0, case.pixel_sigma, (count, targets, 2))
+    targets_px = pixels(true_targets, true_axes, true_place, true_focal) + noise
+
+    true_marks = np.stack([layout(case.layout, case.landmarks, team) for _ in range(count)])
+    sigma_m = np.full((count, case.landmarks), GPS[case.gps])
+    if case.gps in ("two RTK", "opposite RTK"):
+        sigma_m[:] = GPS["3.5 m"]
+        other = case.landmarks // 2 if case.gps == "opposite RTK" else 1
+        sigma_m[:, [0, other]] = GPS["2 cm RTK"]
+        if case.gps == "two RTK":
+            sigma_m = team.permuted(sigma_m, axis=1)
+    marks = true_marks + team.normal(0, 1, true_marks.shape) * sigma_m[..., None] + common[:, None]
+    noise = team.normal(0, case.pixel_sigma, true_marks.shape)
+    marks_px = pixels(true_marks, true_axes, true_place, true_focal) + noise
+    return Scenes(
+        case, true_axes, true_place, true_focal, true_marks, true_targets, axes, place, marks, sigma_m, common,
+        marks_px, targets_px,
+    )  # fmt: skip
+
+
+def chosen(batch: Scenes, rows: np.ndarray) -> Scenes:
+    """The same scenes with some of their landmarks, rows (S, k)."""
+    which = np.arange(len(batch))[:, None], rows
+    case = replace(batch.case, landmarks=rows.shape[1])
+    parts = {name: getattr(batch, name)[which] for name in ("true_marks", "marks", "sigma_m", "marks_px")}
+    return replace(batch, case=case, **parts)
+
+
+def swapped(batch: Scenes, seed: int = 0) -> Scenes:
+    """The same scenes with the identities of two landmarks swapped, that of the first and of any other."""
+    other = np.random.default_rng([seed, 3]).integers(1, batch.case.landmarks, len(batch))
+    every, seen = np.arange(len(batch)), batch.marks_px.copy()
+    seen[every, 0], seen[every, other] = batch.marks_px[every, other], batch.marks_px[every, 0]
+    return replace(batch, marks_px=seen)
+
+
+def outlying(batch: Scenes, away_m: float, seed: int = 0) -> Scenes:
+    """The same scenes with the first landmark's GPS so far off, in any direction."""
+    turn = np.random.default_rng([seed, 4]).uniform(-np.pi, np.pi, len(batch))
+    marks = batch.marks.copy()
+    marks[:, 0] += away_m * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return replace(batch, marks=marks)
+
+
+def flights(case: Case, count: int, frames: int, step_s: float, alike_s: float, seed: int = 0) -> list[Scenes]:
+    """Batches of frames that follow each other: frame f of flight s is row s of batch f.
+
+    The errors of telemetry and receivers stay alike over `alike_s`, and the focal length's for good; pixels err anew.
+    The team drives about the middle at 1 m/s, the camera drifts at 1 m/s and sways by a degree.
+    """
+    rng, first = np.random.default_rng([seed, 5]), scenes(case, count, 2, seed)
+    keep = np.exp(-step_s / alike_s)
+    shape = first.marks.shape
+    sigma = np.array(
+        [TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m]
+    )
+    flight, team = rng.normal(0, 1, (count, 6)), rng.normal(0, 1, shape)
+    drift = rng.uniform(-np.pi, np.pi, count)
+    found = []
+    for f in range(frames):
+        angle, t = f * step_s / RADIUS_M, f * step_s
+        sway = turned(np.radians(1.0) * np.sin(t / 3) * np.stack([np.cos(drift), np.sin(drift), 0 * drift], axis=1))
+        axes = sway @ first.true_axes
+        way = np.stack([np.cos(drift), np.sin(drift), 0 * drift], axis=1)
+        place = first.true_place + (t - frames * step_s / 2) * way
+        c, s = np.cos(angle), np.sin(angle)
+        marks = first.true_marks @ np.array([[c, s], [-s, c]])
+        inner = 10
+        targets = np.concatenate([disc(rng, (count, inner), CROWD_M), disc(rng, (count, inner))], axis=1)
+        seen = [pixels(x, axes, place, first.true_focal) for x in (marks, targets)]
+        if f:
+            flight = keep * flight + np.sqrt(1 - keep**2) * rng.normal(0, 1, flight.shape)
+            team = keep * team + np.sqrt(1 - keep**2) * rng.normal(0, 1, shape)
+        found.append(
+            Scenes(
+                case, axes, place, first.true_focal, marks, targets,
+                turned((flight * sigma)[:, :3]) @ axes, place + (flight * sigma)[:, 3:],
+                marks + team * first.sigma_m[..., None], first.sigma_m, np.zeros((count, 2)),
+                *(x + rng.normal(0, case.pixel_sigma, x.shape) for x in seen),
+            )
+        )  # fmt: skip
+    return found
+
+
+def disc(rng: np.random.Generator, shape: tuple[int, ...], radius_m: float = RADIUS_M) -> np.ndarray:
+    """Points all over a disc, (*shape, 2)."""
+    far, turn = radius_m * np.sqrt(rng.uniform(0, 1, shape)), rng.uniform(-np.pi, np.pi, shape)
+    return np.stack([far * np.cos(turn), far * np.sin(turn)], axis=-1)
+
+
+def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Where n landmarks stand, (n, 2), turned at random.
+
+    ring: evenly about the disc's rim, each up to 10 degrees off; small ring: at half its radius. disc: anywhere. row:
+    all along a diameter, the row's width 2 to 4 % of its length. corner: within 6 m near the rim. L: evenly along two
+    legs of 25 m.
+    """
+    turn = rng.uniform(-np.pi, np.pi)
+    if name in ("ring", "small ring"):
+        angle = turn + 2 * np.pi * np.arange(n) / n + np.radians(rng.uniform(-10, 10, n))
+        return RADIUS_M / (1 + (name != "ring")) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    if name == "disc":
+        return disc(rng, (n,))
+    if name == "row":
+        along = np.linspace(-RADIUS_M, RADIUS_M, n)
+        aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * _to_ends(rng.uniform(0, 1, n))
+        points = np.stack([along, aside], axis=1)
+    elif name == "corner":
+        points = disc(rng, (n,), 6.0) + np.array([18.0, 0.0])
+    else:
+        leg = 25.0 * np.linspace(-1, 1, n)
+        points = np.stack([np.maximum(leg, 0), np.maximum(-leg, 0)], axis=1) - 25 / 3 + rng.normal(0, 0.5, (n, 2))
+    c, s = np.cos(turn), np.sin(turn)
+    return points @ np.array([[c, s], [-s, c]])
+
+
+def _to_ends(shares: np.ndarray) -> np.ndarray:
+    """Stretched to go from -0.5 to 0.5."""
+    return (shares - shares.min()) / np.ptp(shares) - 0.5
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The geometry.
+
+
+def looking(heading: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """(S, 3, 3) axes, columns right, down, forward in east, north, up."""
+    zero = np.zeros_like(heading)
+    right = np.stack([np.cos(heading), -np.sin(heading), zero], axis=-1)
+    forward = np.stack([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), -np.sin(pitch)], axis=-1)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll)[..., None], np.sin(roll)[..., None]
+    return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
+
+
+def turned(vector: np.ndarray) -> np.ndarray:
+    """(S, 3, 3) rotations about (S, 3) vectors by their lengths in radians."""
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))], axis=-2)
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross @ cross
+
+
+def pixels(ground: np.ndarray, axes: np.ndarray, place: np.ndarray, focal: np.ndarray) -> np.ndarray:
+    """(S, n, 2) u, v of points (S, n, 2) on the plane."""
+    away = np.concatenate([ground, np.zeros_like(ground[..., :1])], axis=-1) - place[:, None]
+    seen = away @ axes
+    return np.array(CAMERA.centre_px) + FOCAL_PX * focal[:, None, None] * seen[..., :2] / seen[..., 2:]
+
+
+def image_from_ground(axes: np.ndarray, place: np.ndarray, focal: np.ndarray) -> np.ndarray:
+    """(S, 3, 3) homographies from metres to pixels about the middle in focal lengths."""
+    turn = np.swapaxes(axes, 1, 2)
+    matrix = np.concatenate([turn[..., :2], -turn @ place[..., None]], axis=-1)
+    return matrix * np.stack([focal, focal, np.ones_like(focal)], axis=-1)[..., None]
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Bounds.
+
+
+def pose_bound(batch: Scenes) -> np.ndarray:
+    """(S, T, 2, 2) the smallest covariance of the targets' places, by telemetry and landmarks together.
+
+    The pose's information is the telemetry's, and of each landmark what its pixels say, blurred by its GPS. A target's
+    place then errs by its own pixels and by the pose.
+    """
+    case = batch.case
+    sigma = np.array(
+        [TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, POSITION_SIGMA_M,
+         ALTITUDE_SIGMA * case.altitude_m, FOCAL_SIGMA]
+    )  # fmt: skip
+    by_pose, by_place = _slopes(batch, batch.true_marks)
+    information = np.diag(sigma**-2.0) + _gathered(by_pose, by_place, batch.sigma_m, case.pixel_sigma)
+    by_pose, by_place = _slopes(batch, batch.true_targets)
+    return _carried(by_pose, by_place, information, case.pixel_sigma)
+
+
+def homography_bound(batch: Scenes) -> np.ndarray:
+    """(S, T, 2, 2) the same by the landmarks alone, for the eight parameters of a homography."""
+    case, matrix = batch.case, image_from_ground(batch.true_axes, batch.true_place, batch.true_focal)
+    matrix = matrix @ np.diag([RADIUS_M, RADIUS_M, 1.0])
+    matrix = matrix / matrix[:, 2:, 2:]
+
+    def slopes(ground: np.ndarray) -> np.ndarray:
+        """(S, n, 2, 8) of pixels by the elements; u = (a x + b y + r) / (p x + q y + 1)."""
+        x, y = np.moveaxis(ground / RADIUS_M, -1, 0)
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        point = np.stack([x, y, one], axis=-1) @ np.swapaxes(matrix, 1, 2)
+        u, v, w = point[..., 0] / point[..., 2], point[..., 1] / point[..., 2], point[..., 2]
+        rows = [[x, y, one, zero, zero, zero, -u * x, -u * y], [zero, zero, zero, x, y, one, -v * x, -v * y]]
+        return FOCAL_PX * np.stack([np.stack(row, axis=-1) for row in rows], axis=-2) / w[..., None, None]
+
+    information = _gathered(
+        slopes(batch.true_marks), _slopes(batch, batch.true_marks)[1], batch.sigma_m, case.pixel_sigma
+    )
+    _, by_place = _slopes(batch, batch.true_targets)
+    return _carried(slopes(batch.true_targets), by_place, information, case.pixel_sigma)
+
+
+def mean_length(covariance: np.ndarray) -> np.ndarray:
+    """Mean distance from the middle of a normal distribution in the plane, of (..., 2, 2)."""
+    small, large = np.moveaxis(np.linalg.eigvalsh(covariance), -1, 0)
+    return np.sqrt(2 * large / np.pi) * ellipe(1 - small / large)
+
+
+def _slopes(batch: Scenes, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of pixels, (S, n, 2, 7) by rotation, place and log focal length, and (S, n, 2, 2) by the points, numerically."""
+    axes, place, focal = batch.true_axes, batch.true_place, batch.true_focal
+    count = len(focal)
+
+    def moved(k: int, step: float) -> np.ndarray:
+        d = np.zeros((count, 9))
+        d[:, k] = step
+        there = ground + d[:, None, 7:]
+        return pixels(there, turned(d[:, :3]) @ axes, place + d[:, 3:6], focal * np.exp(d[:, 6]))
+
+    steps = np.array([1e-5] * 3 + [1e-3] * 3 + [1e-5] + [1e-3] * 2)
+    columns = [(moved(k, h) - moved(k, -h)) / (2 * h) for k, h in enumerate(steps)]
+    both = np.stack(columns, axis=-1)
+    return both[..., :7], both[..., 7:]
+
+
+def _gathered(by_state: np.ndarray, by_place: np.ndarray, sigma_m: np.ndarray, pixel_sigma: float) -> np.ndarray:
+    """(S, k, k) what the landmarks' pixels tell of the state."""
+    blur = pixel_sigma**2 * np.eye(2) + sigma_m[..., None, None] ** 2 * by_place @ np.swapaxes(by_place, -1, -2)
+    return np.einsum("snia,snij,snjb->sab", by_state, np.linalg.inv(blur), by_state)
+
+
+def _carried(by_state: np.ndarray, by_place: np.ndarray, information: np.ndarray, pixel_sigma: float) -> np.ndarray:
+    """(S, T, 2, 2) of places whose pixels depend on the state and on the place itself."""
+    back = np.linalg.inv(by_place)
+    scale = 1 / np.sqrt(np.einsum("saa->sa", information))
+    covariance = np.linalg.inv(information * scale[:, :, None] * scale[:, None])
+    slope = back @ by_state * scale[:, None, None]
+    return pixel_sigma**2 * back @ np.swapaxes(back, -1, -2) + slope @ covariance[:, None] @ np.swapaxes(slope, -1, -2)
+
+
+Bound = Callable[[Scenes], np.ndarray]
+BOUNDS: dict[str, Bound] = {"pose": pose_bound, "homography": homography_bound}

@@ -1,0 +1,104 @@
+"""Tables of geo_error.py, in Markdown."""
+
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+
+
+def main_table(rows: list[Row]) -> str:
+    """A row a case."""
+    ways = ["crowd (bound)", "disc (bound)", "its median", "in ellipses"]
+    ways = [f"{method}: {ways[0]}" if k == 0 else ways[k] for method in ("pose", "homography") for k in range(4)]
+    lines = heading("layout | GPS of landmarks", "n | AGL m | pixels | tilt | " + " | ".join(ways))
+    for row in rows:
+        common = " + 3.5 m common" if row["common_m"] else ""
+        cells = [row["layout"], row["gps"] + common, row["landmarks"], f"{row['altitude_m']:.0f}"]
+        cells += [f"{row['pixel_sigma']:g}", f"{row['tilt_deg']:.0f}°"]
+        for method in ("pose", "homography"):
+            crowd, disc = row[method]["crowd"], row[method]["disc"]
+            cells += [f"{metres(part['mean'])} ({metres(part['bound'])})" for part in (crowd, disc)]
+            cells += [metres(disc["median"]), percent((crowd["inside"] + disc["inside"]) / 2)]
+        lines.append(line(cells))
+    return "\n".join(lines)
+
+
+def paper_table(rows: list[Row]) -> str:
+    """What raw degrees do."""
+    lines = heading("GPS", "n | AGL m | pose | homography in metres | raw degrees: mean | median | places told")
+    for row in rows:
+        if "paper" in row:
+            raw = row["paper"]["disc"]
+            errors = [row["pose"]["disc"]["mean"], row["homography"]["disc"]["mean"], raw["mean"], raw["median"]]
+            cells = [row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}", *map(metres, errors)]
+            lines.append(line([*cells, percent(raw["answered"])]))
+    return "\n".join(lines)
+
+
+def six_table(rows: list[Row]) -> str:
+    """What six landmarks gain."""
+    few = ("four of them", "four by themselves")
+    lines = heading(
+        "layout | GPS",
+        "pose: six | four of them | six − four | four by themselves | six − four | homography's median: six of four",
+    )
+    for row in rows:
+        cells = [row["layout"], row["gps"], metres(row[f"pose, {few[0]}"]["six"])]
+        for part in (row[f"pose, {name}"] for name in few):
+            cells += [metres(part["four"]), f"{part['difference']:+.3f} ± {part['error']:.3f}"]
+        lines.append(line([*cells, f"{row[f'homography, {few[0]}']['ratio of medians']:.2f}"]))
+    return "\n".join(lines)
+
+
+def fault_table(rows: list[Row]) -> str:
+    """What tests of the landmarks find and mend."""
+    lines = heading(
+        "fault | GPS",
+        "n | AGL m | flagged | found out | homography: mean (median) | pose, untested | pose | its crowd | in ellipses",
+    )
+    for row in rows:
+        told = {"none": "–", "swap": f"{percent(row['reassigned'])} reassigned"}
+        cells = [row["fault"], row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}", percent(row["flagged"])]
+        cells.append(told.get(row["fault"], f"{percent(row['found'])} that alone"))
+        cells += [f"{row[k][0]:.2f} ({row[k][1]:.2f})" for k in ("homography", "before", "after")]
+        lines.append(line([*cells, f"{row['crowd']:.2f}", percent(row["inside"])]))
+    return "\n".join(lines)
+
+
+def time_table(rows: list[Row]) -> str:
+    """What memory of earlier frames gains."""
+    lines = heading(
+        "GPS",
+        "n | AGL m | single frames: mean (median) | in ellipses | over time: first tenth | second half: mean (median) "
+        "| in ellipses",
+    )
+    for row in rows:
+        one, many = row["single frames"], row["over time"]
+        cells = [row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}"]
+        cells += [f"{metres(one['mean'])} ({metres(one['median'])})", percent(one["inside"]), metres(many["begin"])]
+        lines.append(line([*cells, f"{metres(many['mean'])} ({metres(many['median'])})", percent(many["inside"])]))
+    return "\n".join(lines)
+
+
+def heading(words: str, numbers: str) -> list[str]:
+    """The first two lines: columns of words to the left, of numbers to the right."""
+    left, right = words.count("|") + 1, numbers.count("|") + 1
+    return [f"| {words} | {numbers} |", "|" + " --- |" * left + " ---: |" * right]
+
+
+def line(cells: list[object]) -> str:
+    """A row."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def percent(share: float) -> str:
+    """With a digit."""
+    return "–" if np.isnan(share) else f"{100 * share:.1f} %"
+
+
+def metres(value: float) -> str:
+    """No more digits than are worth telling."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.3f}" if value < 0.3 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
