@@ -4,10 +4,17 @@ import re
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.telemetry.klv import KEY
+from torchvision_dddas.sources.telemetry.misb import read_misb
+from torchvision_dddas.sources.telemetry.nmea import read_nmea
 from torchvision_dddas.sources.telemetry.srt import read_subtitles
 from torchvision_dddas.sources.telemetry.table import read_table
+from torchvision_dddas.sources.telemetry.tlog import looks_like_tlog, read_tlog
+from torchvision_dddas.sources.telemetry.transport import spacing
+from torchvision_dddas.sources.telemetry.ulog import MAGIC, read_ulog
 from torchvision_dddas.types import Telemetry
 
+_SENTENCE = re.compile(r"\$[A-Z]{2}[A-Z]{3},")
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
 
@@ -28,7 +35,18 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_table(path, clock_offset_s, clip)
     if not head.strip():
         raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
+    if head.startswith(MAGIC):
+        return read_ulog(path, clock_offset_s)
+    if head.startswith(KEY):
+        return read_misb(path, None, clock_offset_s)
+    if (layout := spacing(head)) is not None:
+        return read_misb(path, layout, clock_offset_s)
+    if looks_like_tlog(head):
+        return read_tlog(path, clock_offset_s)
     text = _text(head)
+    if text is not None and _SENTENCE.search(text):
+        whole = path.read_bytes()
+        return read_nmea(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)
     if text is not None and re.search(r"-->|\bGPS\s*\(|\[\s*latitude", text):
         whole = path.read_bytes()
         return read_subtitles(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)

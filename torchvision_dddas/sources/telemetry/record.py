@@ -115,7 +115,7 @@ def _in_order(log: Log, rows: np.ndarray) -> np.ndarray:
             int(rows[i + 1, 2]),
         )
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return rows[np.append(np.diff(rows[:, 0]) > 0, True)]
+    return rows[np.append(np.diff(rows[:, 0]) > 0, True)] if len(rows) else rows
 
 
 def _places_on_the_globe(log: Log, said: dict[str, np.ndarray]) -> None:
