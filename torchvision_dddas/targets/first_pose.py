@@ -1,6 +1,9 @@
 """Poses to begin with, where telemetry does not tell all: from what it tells of the tilt, or from a homography."""
 
+from dataclasses import fields, replace
+
 import numpy as np
+from jaxtyping import Bool
 
 from torchvision_dddas.targets.pose import HEADING, Expected, Solution, fit_pose, moved
 from torchvision_dddas.targets.projection import lifted, rays
@@ -8,18 +11,30 @@ from torchvision_dddas.targets.rotation import turned
 from torchvision_dddas.types import Camera, CameraPose, Marks
 
 
-def find_pose(marks: Marks, camera: Camera, expected: Expected) -> Solution | None:
-    """The likeliest of the poses that the starts at hand lead to; None where none does."""
+def find_pose(
+    marks: Marks, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
+) -> Solution | None:
+    """The likeliest of the poses that the starts at hand lead to; None where none does.
+
+    used: the landmarks whose pixels count; all without it.
+    """
+    used = np.ones(len(marks), bool) if used is None else used
     known = expected.known
     if known.all():
-        first = fit_pose(marks, camera, expected)
+        first = fit_pose(marks, camera, expected, used=used)
         if first is not None:
             return first
-    starts = [] if known.all() else _turned_about_up(marks, camera, expected)
-    if len(marks) >= 4 and not (starts and known[:2].all() and known[5]):
-        starts += of_homography(_plain(marks, camera), camera, marks.east_north_m, marks.up_m)
-    found = [one for start in starts if (one := fit_pose(marks, camera, expected, start)) is not None]
+    seen = rows(marks, used)
+    starts = [] if known.all() else _turned_about_up(seen, camera, expected)
+    if len(seen) >= 4 and not (starts and known[:2].all() and known[5]):
+        starts += of_homography(_plain(seen, camera), camera, seen.east_north_m, seen.up_m)
+    found = [one for start in starts if (one := fit_pose(marks, camera, expected, start, used)) is not None]
     return min(found, key=lambda one: one.cost) if found else None
+
+
+def rows(marks: Marks, which: np.ndarray) -> Marks:
+    """Some of the landmarks of a frame: by their numbers or a (n,) bool."""
+    return replace(marks, **{column.name: getattr(marks, column.name)[which] for column in fields(marks)})
 
 
 def _turned_about_up(marks: Marks, camera: Camera, expected: Expected) -> list[CameraPose]:

@@ -54,12 +54,8 @@ def homography_fix(
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=too_few(frame, n))
     if paper:
         return _as_printed(frame, marks, solver, degrees)
-    wide = spread(marks.east_north_m)
-    if wide < least_spread:
-        cause = (
-            f"the {n} landmarks of frame {frame} stand on one line: {wide:.3f} wide of 1 long, below "
-            f"aerial.least_spread = {least_spread:g}; a homography needs them spread, a pose needs telemetry"
-        )
+    cause = on_one_line(frame, marks, least_spread)
+    if cause:
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
     # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
     middle = marks.east_north_m.mean(axis=0)
@@ -94,7 +90,18 @@ def homography_fix(
 def too_few(frame: int, n: int, without: str = "") -> str:
     """The cause of a refusal, in words: how many landmarks are missing in which frame."""
     has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
-    return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that it needs"
+    return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that are needed"
+
+
+def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
+    """The cause of a refusal where landmarks stand on one line; empty where they do not."""
+    wide = spread(marks.east_north_m)
+    if wide >= least_spread:
+        return ""
+    return (
+        f"the {len(marks)} landmarks of frame {frame} stand on one line: {wide:.3f} wide of 1 long, below "
+        f"aerial.least_spread = {least_spread:g}; a homography needs them spread, a pose needs telemetry"
+    )
 
 
 def spread(east_north_m: Float[np.ndarray, "n 2"]) -> float:

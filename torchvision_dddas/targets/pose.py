@@ -23,8 +23,8 @@ EXACT_M = 1e-3
 """A landmark is never known better than this: the curvature would be too steep to invert."""
 
 STEPS = 30
-ENOUGH = 1e-7
-"""A step this small, squared and in standard deviations, is the last."""
+ENOUGH = 1e-6
+"""A step this small, squared and in standard deviations, is the last: a thousandth."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,15 @@ class Expected:
 class Solution:
     """The likeliest pose. places: (n, 2) of the landmarks. covariance: (7 + 2n, 7 + 2n) of pose and places.
 
-    correction: (7 + 2n,) what was added to what telemetry and the landmarks report. cost: the least sum of squares, in
-    standard deviations; chi-square of `freedom` degrees where all is as expected.
+    correction: (7 + 2n,) what was added to what telemetry and the landmarks report, with correction_covariance.
+    cost: the least sum of squares, in standard deviations; chi-square of `freedom` degrees where all is as expected.
     """
 
     pose: CameraPose
     places: np.ndarray
     covariance: np.ndarray
     correction: np.ndarray
+    correction_covariance: np.ndarray
     cost: float
     freedom: int
 
@@ -122,13 +123,20 @@ def expected_of(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
     return Expected(prior.pose, np.zeros(7 + 2 * n), information, prior.known)
 
 
-def fit_pose(marks: Marks, camera: Camera, expected: Expected, start: CameraPose | None = None) -> Solution | None:
-    """The likeliest pose and landmarks' places; None where no start puts all landmarks before the camera.
+def fit_pose(
+    marks: Marks,
+    camera: Camera,
+    expected: Expected,
+    start: CameraPose | None = None,
+    used: Bool[np.ndarray, "n"] | None = None,
+) -> Solution | None:
+    """The likeliest pose and landmarks' places; None where the start has a landmark that the camera cannot show.
 
-    marks: none may lack its pixel or its place. start: where to begin; the expected pose without one.
+    marks: none may lack its pixel or its place. start: where to begin; the expected pose without one. used: the
+    landmarks whose pixels count; all without it.
     """
     n = len(marks)
-    problem = _Problem(marks, camera, expected)
+    problem = _Problem(marks, camera, expected, np.ones(n, bool) if used is None else used)
     if start is None:
         start = moved(expected.reference, expected.mean[:7])
     state = problem.at(start, marks.east_north_m + expected.mean[7:].reshape(n, 2))
@@ -158,8 +166,12 @@ def fit_pose(marks: Marks, camera: Camera, expected: Expected, start: CameraPose
         return None
     if not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
         return None
-    freedom = 2 * n + int(expected.known.sum()) - 7
-    return Solution(state.pose, state.places, covariance, state.correction, state.cost, freedom)
+    freedom = 2 * int(problem.used.sum()) + int(expected.known.sum()) - 7
+    by_turn = slope_of_turn(state.correction[:3])
+    corrected = covariance.copy()
+    corrected[:3] = by_turn @ corrected[:3]
+    corrected[:, :3] = corrected[:, :3] @ by_turn.T
+    return Solution(state.pose, state.places, covariance, state.correction, corrected, state.cost, freedom)
 
 
 def moved(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
@@ -187,14 +199,17 @@ class _State:
 class _Problem:
     """The sum of squares: what is expected of pose and places, and where the picture shows the landmarks."""
 
-    def __init__(self, marks: Marks, camera: Camera, expected: Expected) -> None:
-        self.marks, self.camera, self.expected = marks, camera, expected
-        self.weight = 1 / np.repeat(marks.pixel_sigma, 2) ** 2
+    def __init__(self, marks: Marks, camera: Camera, expected: Expected, used: np.ndarray) -> None:
+        self.marks, self.camera, self.expected, self.used = marks, camera, expected, used
+        self.rows = np.arange(2 * int(used.sum()))[:, None]
+        self.columns = 7 + 2 * np.repeat(np.flatnonzero(used), 2)[:, None] + [0, 1]
+        self.image = marks.image_px[used].ravel()
+        self.weight = 1 / np.repeat(marks.pixel_sigma[used], 2) ** 2
         self.free_heading = not expected.known[HEADING]
 
     def at(self, pose: CameraPose, places: np.ndarray) -> _State | None:
-        n = len(self.marks)
-        seen, by_pose, by_point = project_with_slopes(np.c_[places, self.marks.up_m], pose, self.camera)
+        points = np.column_stack([places, self.marks.up_m])[self.used]
+        seen, by_pose, by_point = project_with_slopes(points, pose, self.camera)
         if not np.isfinite(seen).all():
             return None
         reference = self.expected.reference
@@ -212,11 +227,10 @@ class _Problem:
             ]
         )
         apart = correction - self.expected.mean
-        slopes = np.zeros((2 * n, 7 + 2 * n))
-        slopes[:, :7] = by_pose.reshape(2 * n, 7)
-        rows, columns = _blocks(n)
-        slopes[rows, columns] = by_point[:, :, :2].ravel()
-        missing = (self.marks.image_px - seen).ravel()
+        slopes = np.zeros((len(self.rows), len(self.expected.mean)))
+        slopes[:, :7] = by_pose.reshape(-1, 7)
+        slopes[self.rows, self.columns] = by_point[:, :, :2].reshape(-1, 2)
+        missing = self.image - seen.ravel()
         information, by_turn = self.expected.information, slope_of_turn(turn_rad)
         pull = information @ apart
         cost = float(apart @ pull + missing @ (self.weight * missing))
@@ -226,13 +240,6 @@ class _Problem:
         pull[:3] = by_turn.T @ pull[:3]
         weighed = slopes.T * self.weight
         return _State(pose, places, cost, weighed @ missing - pull, weighed @ slopes + bent, correction)
-
-
-def _blocks(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the (2, 2) derivatives of n landmarks by their own places stand."""
-    own = np.arange(n)
-    rows = np.repeat(2 * own, 4) + np.tile([0, 0, 1, 1], n)
-    return rows, 7 + np.repeat(2 * own, 4) + np.tile([0, 1, 0, 1], n)
 
 
 def _focal_of(hfov_rad: float, camera: Camera, knobs: AerialKnobs, known: bool) -> tuple[float, float]:

@@ -9,7 +9,6 @@ clockwise about forward. The lens bends a radius r to r (1 + k1 r² + k2 r⁴), 
 import numpy as np
 from jaxtyping import Float
 
-from torchvision_dddas.targets.rotation import cross
 from torchvision_dddas.types import Camera, CameraPose
 
 NEAREST = 1e-6
@@ -87,8 +86,9 @@ def project_with_slopes(
         by_seen = by_flat @ by_seen
     by_point = (scale[:, None] * by_seen) @ pose.axes.T
     by_pose = np.empty((len(seen), 2, 7))
-    # A rotation w of the camera moves a point by -w x apart, seen from it.
-    by_pose[:, :, :3] = by_point @ cross(apart)
+    # A rotation w of the camera moves a point by -w x apart, seen from it: gradient . (apart x w).
+    (gx, gy, gz), (x, y, z) = np.moveaxis(by_point, 2, 0), apart.T[:, :, None]
+    by_pose[:, :, 0], by_pose[:, :, 1], by_pose[:, :, 2] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
     by_pose[:, :, 3:6] = -by_point
     by_pose[:, :, 6] = scale * flat
     return flat * scale + camera.centre_px, by_pose, by_point

@@ -1,18 +1,38 @@
-"""How the pictures of a clip lie on the ground, frame by frame."""
+"""How the pictures of a clip lie on the ground, frame by frame, by what all frames so far have told of the errors."""
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.targets.first_pose import find_pose
-from torchvision_dddas.targets.plane import Solver, homography_fix, too_few
-from torchvision_dddas.targets.pose import bare_prior, expected_of, prior_of
+from torchvision_dddas.targets.first_pose import find_pose, rows
+from torchvision_dddas.targets.integrity import Verdict, judge, passes, reordered
+from torchvision_dddas.targets.memory import Memory, places_of
+from torchvision_dddas.targets.plane import LEAST, Solver, homography_fix, on_one_line, too_few
+from torchvision_dddas.targets.pose import Prior, bare_prior, expected_of, prior_of
 from torchvision_dddas.types import Camera, Fix, Flight, Marks
+
+Degrees = tuple[np.ndarray, tuple[float, float]]
+"""Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
+
+OF_POSE = ("heading", "heading", "heading", "place", "place", "altitude", "focal length")
+
+
+@dataclass(frozen=True)
+class _Habit:
+    """The repair of the frame before: whose pixels landmarks had, and which were left out."""
+
+    pixels_of: dict[int, int]
+    without: frozenset[int]
 
 
 class Registrar:
-    """Lays the frames of one clip on the ground; told of them in order."""
+    """Lays the frames of one clip on the ground; told of them in order.
+
+    solver: of a back end, for the bare homography. focal_known: the camera's focal length is given, not guessed.
+    names: of the landmarks, for the words. ground_up_m: height of the ground that altitudes are measured from.
+    """
 
     def __init__(
         self,
@@ -25,48 +45,170 @@ class Registrar:
     ) -> None:
         self.camera, self.settings, self.solver = camera, settings, solver
         self.focal_known, self.names, self.ground_up_m = focal_known, names, ground_up_m
+        self.memory = Memory()
+        self.habit = _Habit({}, frozenset())
 
     def step(
-        self,
-        frame: int,
-        time_s: float,
-        flight: Flight | None,
-        marks: Marks,
-        degrees: tuple[np.ndarray, tuple[float, float]] | None = None,
+        self, frame: int, time_s: float, flight: Flight | None, marks: Marks, degrees: Degrees | None = None
     ) -> Fix:
-        """How one frame lies on the ground.
+        """How one frame lies on the ground; by = "" and a cause where nothing tells it.
 
         flight: what telemetry says then, its place in local metres; None without telemetry. marks: the landmarks,
-        places in local metres. degrees, for aerial.mode = paper: longitudes and latitudes of the marks (n, 2) and the
-        origin of the local metres.
+        places in local metres; rows without pixel or place do not count. degrees, for aerial.mode = paper.
         """
         knobs = self.settings.aerial
-        usable = np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1)
-        marks = _rows(marks, usable)
-        if knobs.mode != "pose":
-            degrees = None if degrees is None else (np.asarray(degrees[0])[usable], degrees[1])
-            return homography_fix(frame, marks, self.solver, knobs.least_spread, degrees, paper=knobs.mode == "paper")
+        usable, changes = self._usable(marks)
+        if degrees is not None:
+            degrees = (np.asarray(degrees[0], float)[usable], degrees[1])
+        seen = rows(marks, usable)
         prior = prior_of(flight, self.camera, knobs, self.ground_up_m, self.focal_known)
-        n = len(marks)
-        if prior is None:
-            if n < 4:
-                return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * n, cause=too_few(frame, n))
-            prior = bare_prior(self.camera, knobs, self.focal_known)
-        solution = find_pose(marks, self.camera, expected_of(prior, marks.sigma_m))
+        if knobs.mode == "pose":
+            fix = self._by_pose(frame, time_s, prior, seen)
+        else:
+            fix = self._by_homography(frame, prior, seen, degrees)
+        return _with_unusable(fix, marks, usable, changes)
+
+    def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: Marks) -> Fix:
+        knobs, n = self.settings.aerial, len(marks)
+        cause = _refused(frame, prior, marks, knobs.least_spread)
+        bare = bare_prior(self.camera, knobs, self.focal_known)
+        before = self.memory.at(time_s, prior or bare, marks, knobs.correlation_s)
+        if cause:
+            self.memory = before
+            return _nothing(frame, marks, cause)
+        verdict, before = self._judged(before, prior or bare, marks, None if prior is None else bare)
+        solution = verdict.solution
         if solution is None:
+            self.memory = before
             cause = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
-            return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * n, cause=cause)
+            return _nothing(frame, marks, cause)
+        told = bare if verdict.alone else prior or bare
+        self.memory = before.after(told, marks, verdict.used, solution) if verdict.passed else before
+        count = int(verdict.used.sum())
+        cause = verdict.cause
+        if not cause and count < LEAST:
+            cause = f"frame {frame} has no landmark: by telemetry alone" if count == 0 else too_few(frame, count)
         return Fix(
             frame,
-            "pose" if n else "telemetry",
+            "pose" if count else "telemetry",
             solution.pose,
             solution.covariance[:7, :7],
             landmark=marks.landmark,
-            state=("used",) * n,
-            chi2=solution.cost,
-            freedom=solution.freedom,
+            state=verdict.state,
+            chi2=solution.cost if n else float("nan"),
+            freedom=solution.freedom if n else 0,
+            changes=verdict.changes,
+            cause=cause,
         )
 
+    def _judged(self, before: Memory, prior: Prior, marks: Marks, bare: Prior | None) -> tuple[Verdict, Memory]:
+        """The landmarks tested against what is remembered, and what is to be remembered of the past then."""
+        gate, n = self.settings.aerial.gate_probability, len(marks)
+        everyone, itself = np.ones(n, bool), np.arange(n)
+        solution = find_pose(marks, self.camera, before.expected(prior, marks))
+        if passes(solution, gate):
+            self.habit = _Habit({}, frozenset())
+            return Verdict(solution, itself, everyone), before
+        alone = None if bare is None else expected_of(bare, marks.sigma_m)
+        names = tuple(self._name(identity) for identity in marks.landmark.tolist())
+        known = self._as_before(marks)
+        for memory in self._less_and_less(before, prior, marks):
+            expected = memory.expected(prior, marks)
+            solution = find_pose(marks, self.camera, expected)
+            if passes(solution, gate):
+                return Verdict(solution, itself, everyone), memory
+        for memory in (before, before.anew(np.arange(len(before.mean)))):
+            verdict = judge(marks, self.camera, memory.expected(prior, marks), gate, names, alone, known)
+            if verdict.passed:
+                break
+        identities = marks.landmark.tolist()
+        self.habit = _Habit(
+            {a: identities[b] for a, b in zip(identities, verdict.order.tolist(), strict=True) if a != identities[b]},
+            frozenset(marks.landmark[~verdict.used].tolist()),
+        )
+        return verdict, memory
 
-def _rows(marks: Marks, which: np.ndarray) -> Marks:
-    return replace(marks, **{name: getattr(marks, name)[which] for name in marks.__dataclass_fields__})
+    def _less_and_less(self, before: Memory, prior: Prior, marks: Marks) -> Iterator[Memory]:
+        """What else to remember where all of it does not fit: a report may jump within its errors."""
+        if not before.told:
+            return
+        yield before.anew(np.arange(7))
+        for identity in marks.landmark:
+            yield before.anew(places_of(before.ids, np.array([identity])))
+        yield before.anew(np.arange(len(before.mean)))
+
+    def _by_homography(self, frame: int, prior: Prior | None, marks: Marks, degrees: Degrees | None) -> Fix:
+        """By landmarks alone; telemetry, where there is any, only tells whether they are what they are said to be."""
+        knobs, n = self.settings.aerial, len(marks)
+        paper = knobs.mode == "paper"
+        if paper or prior is None or not prior.known.all() or n == 0:
+            return homography_fix(frame, marks, self.solver, knobs.least_spread, degrees, paper)
+        names = tuple(self._name(identity) for identity in marks.landmark.tolist())
+        expected = expected_of(prior, marks.sigma_m)
+        verdict = judge(marks, self.camera, expected, knobs.gate_probability, names)
+        kept = rows(reordered(marks, verdict.order), verdict.used)
+        fix = homography_fix(frame, kept, self.solver, knobs.least_spread)
+        solution = verdict.solution
+        return replace(
+            fix,
+            landmark=marks.landmark,
+            state=verdict.state if fix.by else ("excluded",) * n,
+            chi2=float("nan") if solution is None else solution.cost,
+            freedom=0 if solution is None else solution.freedom,
+            changes=verdict.changes,
+            cause=fix.cause or verdict.cause,
+        )
+
+    def _usable(self, marks: Marks) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Which rows count: those with pixel and place, each landmark once; and of those that do not, why."""
+        in_picture = np.isfinite(marks.image_px).all(axis=1)
+        placed = np.isfinite(marks.east_north_m).all(axis=1) & np.isfinite(marks.sigma_m)
+        usable, unplaced = in_picture & placed, marks.landmark[in_picture & ~placed].tolist()
+        changes = [f"{self._name(identity)} left out: its place is not known" for identity in unplaced]
+        first: set[int] = set()
+        for row in np.flatnonzero(usable):
+            identity = int(marks.landmark[row])
+            if identity in first:
+                usable[row] = False
+                changes.append(f"{self._name(identity)} left out where it is seen a second time")
+            first.add(identity)
+        return usable, tuple(changes)
+
+    def _as_before(self, marks: Marks) -> tuple[np.ndarray, np.ndarray] | None:
+        """The repair of the frame before, for this frame's rows; None where there was none or it does not apply."""
+        row = {identity: k for k, identity in enumerate(marks.landmark.tolist())}
+        if not (self.habit.pixels_of or self.habit.without):
+            return None
+        order = [row.get(self.habit.pixels_of.get(identity, identity), -1) for identity in row]
+        if sorted(order) != list(range(len(row))):
+            return None
+        return np.array(order), ~np.isin(marks.landmark, list(self.habit.without))
+
+    def _name(self, identity: int) -> str:
+        return self.names[identity] if 0 <= identity < len(self.names) else f"landmark {identity}"
+
+
+def _refused(frame: int, prior: Prior | None, marks: Marks, least_spread: float) -> str:
+    """Why nothing can tell where the camera is; empty where something can."""
+    n = len(marks)
+    if prior is None:
+        if n < LEAST:
+            return too_few(frame, n, " and no telemetry")
+        return on_one_line(frame, marks, least_spread)
+    if 2 * n < int((~prior.known).sum()) or (n < 2 and not prior.known[2]):
+        lacking = " and ".join(dict.fromkeys(np.array(OF_POSE)[~prior.known].tolist()))
+        has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
+        return f"frame {frame} has {has}, too few where the telemetry does not say {lacking}"
+    return ""
+
+
+def _nothing(frame: int, marks: Marks, cause: str) -> Fix:
+    return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * len(marks), cause=cause)
+
+
+def _with_unusable(fix: Fix, marks: Marks, usable: np.ndarray, changes: tuple[str, ...]) -> Fix:
+    """With the landmarks that are in the picture but could not be used."""
+    seen = np.flatnonzero(usable | np.isfinite(marks.image_px).all(axis=1))
+    told = dict(zip(np.flatnonzero(usable).tolist(), fix.state, strict=True))
+    state = tuple(told.get(row, "excluded") for row in seen.tolist())
+    return replace(fix, landmark=marks.landmark[seen], state=state, changes=changes + fix.changes)
