@@ -1,145 +1,88 @@
-"""Targets located from the air: tables of places and of the camera's poses, and the folder of a run that gives them."""
+"""The folder of a run that locates targets from the air: tables, maps, a report, and the record."""
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from torchvision_dddas.sinks.cot import cot
+from torchvision_dddas.sinks.ellipses import semi_axes
+from torchvision_dddas.sinks.geojson import encoded, geojson
+from torchvision_dddas.sinks.ground_tracks import Gathered, GroundTracks, iso_utc
+from torchvision_dddas.sinks.grounded_tables import GroundedTables
 from torchvision_dddas.sinks.journal import NAME, Record
+from torchvision_dddas.sinks.kml import kml
+from torchvision_dddas.sinks.map_picture import CameraPath, map_picture, view_of
 from torchvision_dddas.sinks.output import RunFolder
-from torchvision_dddas.sinks.positions import COLUMNS, DEGREES
-from torchvision_dddas.sinks.tables import TextFiles
-from torchvision_dddas.types import CameraPose, Grounded
+from torchvision_dddas.sinks.report import Story, Table, report, span
+from torchvision_dddas.sinks.timeline import USED, Timeline
+from torchvision_dddas.sinks.whole import remove, temporary, write_whole
+from torchvision_dddas.types import Camera, Fix, Grounded, Ortho, Positions
 
 SAVED = ("cot", "map", "report")
-"""What --save may name. The tables, the maps for other tools and run.json are always written."""
+"""What --save may name. The tables, tracks.geojson, tracks.kml and run.json are always written."""
 
-MORE = ("score", "time_s", "relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s", "by", "landmarks")
-FIXES = (
-    *("frame", "time_s", "by", "landmarks_seen", "landmarks_used", "chi2", "freedom", "east_m", "north_m", "up_m"),
-    *("heading_deg", "pitch_deg", "roll_deg", "focal", "cause", "changes"),
-)
+GEOJSON, KML, COT, MAP, REPORT = "tracks.geojson", "tracks.kml", "tracks.cot.xml", "map.png", "report.html"
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
-
-def position_lines(grounded: Grounded) -> str:
-    """One line a target in the order of COLUMNS, DEGREES where they are known, and MORE; unknown cells are empty.
-
-    relative_sigma_m is the root of the covariance's trace; landmarks, how many were used.
-    """
-    at, fix = grounded.positions, grounded.fix
-    n, covariance = len(at), at.covariance_m2
-    columns: list[tuple[np.ndarray, str]] = [
-        (at.east_north_m, ",%.4f,%.4f"),
-        (np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=1), ",%.4f,%.4f,%.4f"),
-    ]
-    if at.lonlat_deg is not None:
-        columns.append((at.lonlat_deg, ",%.9f,%.9f"))
-    relative = np.sqrt(np.trace(grounded.relative_m2, axis1=1, axis2=2))[:, None]
-    columns += [
-        (at.score[:, None], ",%.6g"),
-        (np.full((n, 1), grounded.time_s), ",%.4f"),
-        (relative, ",%.4f"),
-        (grounded.velocity_m_s, ",%.4f,%.4f"),
-    ]
-    values = np.concatenate([column for column, _ in columns], axis=1)
-    values[~np.isfinite(values)] = np.nan
-    pattern = (
-        "%d,%d" + "".join(text for _, text in columns) + f",{fix.by},{fix.state.count('used') + _moved(grounded)}\n"
-    )
-    rows = zip(at.frame.tolist(), at.target.tolist(), values.tolist(), strict=True)
-    return "".join(pattern % (frame, target, *row) for frame, target, row in rows).replace(",nan", ",")
+Degrees = Callable[[np.ndarray], np.ndarray]
+"""(N, 2) local metres to longitudes and latitudes."""
 
 
-def _moved(grounded: Grounded) -> int:
-    # A landmark that was given another's place is used all the same.
-    return grounded.fix.state.count("reassigned")
+class Spans:
+    """What was said of frames; the same of successive ones is said once, also where its numbers differ: the first's."""
 
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._open: dict[str, dict[str, Any]] = {}
 
-def fix_line(grounded: Grounded) -> str:
-    """The line of a frame in the order of FIXES; a cell is empty where a value is unknown."""
-    fix = grounded.fix
-    used = fix.state.count("used") + _moved(grounded)
-    pose = [math.nan] * 7 if fix.pose is None else [*fix.pose.place_m, *angles_deg(fix.pose), fix.pose.focal]
-    cells = [
-        f"{grounded.frame}",
-        _cell(grounded.time_s, 4),
-        fix.by,
-        f"{len(fix.landmark)}",
-        f"{used}",
-        _cell(fix.chi2, 3),
-        f"{fix.freedom}",
-        *(_cell(value, 4) for value in pose[:6]),
-        _cell(pose[6], 6),
-        _text(fix.cause),
-        _text("; ".join(fix.changes)),
-    ]
-    return ",".join(cells) + "\n"
-
-
-def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
-    """Heading in [0, 360), pitch below the horizon, roll clockwise; straight down the upper edge gives the heading."""
-    right, down, forward = np.asarray(pose.axes, float).T
-    level = math.hypot(forward[0], forward[1])
-    pitch = math.atan2(-forward[2], level)
-    if level > 1e-6:
-        heading, roll = math.atan2(forward[0], forward[1]), math.atan2(-right[2], -down[2])
-    else:
-        upper = -down if pitch > 0 else down
-        heading, roll = math.atan2(upper[0], upper[1]), 0.0
-    return round(math.degrees(heading), 6) % 360, math.degrees(pitch), math.degrees(roll)
-
-
-def _cell(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else ""
-
-
-def _text(words: str) -> str:
-    """Words as a cell of a CSV, on one line."""
-    words = " ".join(words.split())
-    return '"' + words.replace('"', '""') + '"' if set(words) & set(',"') else words
-
-
-class GroundedTables:
-    """positions.csv and fixes.csv, written as the frames go by."""
-
-    def __init__(self, folder: Path, geographic: bool) -> None:
-        header = [*COLUMNS, *(DEGREES if geographic else ()), *MORE]
-        content = {folder / "positions.csv": header, folder / "fixes.csv": FIXES}
-        self._files = TextFiles({path: ",".join(names) + "\n" for path, names in content.items()})
-
-    def write(self, grounded: Grounded) -> None:
-        """Add the targets of a frame."""
-        self._files.write(position_lines(grounded), fix_line(grounded))
-
-    def close(self, complete: bool) -> None:
-        """Put the tables in their places. Raises OSError if the last lines cannot be written."""
-        self._files.close()
-
-    def discard(self) -> None:
-        """Remove what was begun."""
-        self._files.discard()
+    def add(self, frame: int, before: int, words: str, **more: Any) -> None:
+        """Say words of a frame; before: the number of the frame that came before it."""
+        kind = _NUMBER.sub("0", f"{words} {more}")
+        row = self._open.get(kind)
+        if row is not None and row["last"] in (before, frame):
+            row["last"] = frame
+        else:
+            self._open[kind] = row = {"first": frame, "last": frame, **more, "cause": words}
+            self.rows.append(row)
 
 
 class GroundedJournal(Record):
     """The record of a run that locates targets from the air.
 
-    positions: rows of positions.csv. by: frames by what told where the camera was, `nothing` for the gaps.
-    weak: spans of frames that were located, but with something amiss, and what. landmarks: of each, the frames in which
-    it was seen and used, and spans of those where it was reassigned or excluded.
+    positions: rows of positions.csv. by: frames by what told where the camera was, `nothing` for those that could not
+    be located. weak: spans of frames that were located, but with something amiss. repairs: what was changed and why.
+    landmarks: of each, in how many frames it was seen and used, and the spans where it was reassigned or excluded.
     """
+
+    made = ("positions.csv", "fixes.csv", GEOJSON, KML, COT, MAP, REPORT)
+    """Files that a run may leave beside run.json."""
 
     def __init__(self, folder: Path, facts: dict[str, Any], names: Sequence[str]) -> None:
         super().__init__(folder, facts)
-        self.positions = 0
+        self.facts = facts
         self.names = tuple(names)
+        self.positions = 0
         self.by = dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0)
-        self.weak: list[dict[str, Any]] = []
+        self.weak, self.repairs = Spans(), Spans()
         self.landmarks: dict[str, dict[str, Any]] = {
             name: {"seen": 0, "used": 0, "reassigned": [], "excluded": []} for name in names
         }
         self._before = 0
+
+    @property
+    def gaps(self) -> list[dict[str, Any]]:
+        """Spans of frames that could not be located: first, last, cause."""
+        return self._unreliable
+
+    @property
+    def moves(self) -> list[dict[str, Any]]:
+        """The adjustments of the feedback loop."""
+        return self._adjustments
 
     def write(self, grounded: Grounded) -> None:
         """Take note of a frame."""
@@ -149,36 +92,112 @@ class GroundedJournal(Record):
         for which, state in zip(fix.landmark.tolist(), fix.state, strict=True):
             kept = self.landmarks[self.names[which]]
             kept["seen"] += 1
-            kept["used"] += state in ("used", "reassigned")
+            kept["used"] += state in USED
             if state in ("reassigned", "excluded"):
-                self._extend(kept[state], frame)
+                spans = kept[state]
+                if spans and spans[-1][1] == self._before:
+                    spans[-1][1] = frame
+                else:
+                    spans.append([frame, frame])
         if fix.by and fix.cause:
-            last = self.weak[-1] if self.weak else None
-            if last and last["last"] == self._before and last["cause"] == fix.cause:
-                last["last"] = frame
-            else:
-                self.weak.append({"first": frame, "last": frame, "cause": fix.cause})
+            self.weak.add(frame, self._before, fix.cause, by=fix.by)
+        for change in fix.changes:
+            self.repairs.add(frame, self._before, change)
         self.counts = {
             "positions": self.positions,
             "by": self.by,
             "landmarks": self.landmarks,
-            "weak": self.weak,
+            "weak": self.weak.rows,
+            "repairs": self.repairs.rows,
         }
         gap = None if fix.by else fix.cause or "nothing told where the camera was"
         self.note(frame, len(grounded.box_px), grounded.seconds, grounded.adjustments, gap)
         self._before = frame
 
-    def _extend(self, spans: list[list[int]], frame: int) -> None:
-        if spans and spans[-1][1] == self._before:
-            spans[-1][1] = frame
-        else:
-            spans.append([frame, frame])
+
+class Maps:
+    """The files that need all frames, written at the end. Memory grows with what they show, and with nothing else.
+
+    That is at most 360 bytes a place of a target and a place of a landmark, and 264 a frame.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        kept: GroundedJournal,
+        save: Sequence[str],
+        geographic: bool,
+        start_utc_s: float,
+        photo: Ortho | None,
+        camera: Camera | None,
+        degrees: Degrees | None,
+    ) -> None:
+        self._folder, self._kept, self._save = folder, kept, save
+        self._geographic, self._start_utc_s, self._photo = geographic, start_utc_s, photo
+        self._camera, self._degrees = camera, degrees
+        self._name = Path(str(kept.facts.get("input", ""))).name
+        self._targets, self._marks, self._timeline = Gathered(), Gathered(), Timeline()
+        self._way: list[tuple[float, float]] = []
+        self._last: Fix | None = None
+        self.written: set[str] = set()
+
+    def write(self, grounded: Grounded) -> None:
+        """Keep what the maps will show of a frame."""
+        self._targets.add(grounded.positions, grounded.time_s, grounded.velocity_m_s)
+        self._timeline.add(grounded)
+        marks, fix = grounded.marks, grounded.fix
+        at = np.flatnonzero(np.isfinite(marks.east_north_m).all(axis=1))
+        own = np.eye(2) * marks.sigma_m[at, None, None] ** 2
+        number = np.full(len(at), grounded.frame)
+        self._marks.add(
+            Positions(number, marks.landmark[at], marks.east_north_m[at], own, np.ones(len(at))), grounded.time_s
+        )
+        if fix.pose is not None:
+            self._way.append((float(fix.pose.place_m[0]), float(fix.pose.place_m[1])))
+        if fix.pose is not None or fix.image_from_ground is not None:
+            self._last = fix
+
+    def close(self, complete: bool) -> None:
+        """Write them all. Raises OSError if one cannot be written."""
+        targets = self._targets.tracks(self._geographic, self._start_utc_s)
+        marks = self._marks.tracks(self._geographic and self._degrees is not None, self._start_utc_s)
+        if marks.lonlat_deg is not None and self._degrees is not None and len(marks):
+            marks.lonlat_deg[:] = self._degrees(marks.east_north_m)
+        names = self._kept.names
+        if self._geographic:
+            self._put(GEOJSON, encoded(geojson(targets, True, marks, names)))
+            self._put(KML, kml(targets, self._name or "tracks", marks, names).encode())
+            if "cot" in self._save and targets.times_utc is not None:
+                self._put(COT, cot(targets).encode())
+        if "map" in self._save or "report" in self._save:
+            picture = self._map(targets, marks)
+            if "map" in self._save:
+                self._put(MAP, picture)
+            if "report" in self._save:
+                story = _story(self._kept, targets, complete, picture)
+                self._put(REPORT, report(story, self._timeline).encode())
+
+    def discard(self) -> None:
+        """Remove what was begun."""
+        for name in (GEOJSON, KML, COT, MAP, REPORT):
+            remove(temporary(self._folder / name))
+
+    def _put(self, name: str, content: bytes) -> None:
+        write_whole(self._folder / name, content)
+        self.written.add(name)
+
+    def _map(self, targets: GroundTracks, marks: GroundTracks) -> bytes:
+        seen = view_of(self._last, self._camera) if self._last is not None and self._camera is not None else None
+        way = np.array(self._way).reshape(-1, 2)
+        camera = CameraPath(way, np.zeros((0, 2)) if seen is None else seen)
+        picture = map_picture(targets, marks, self._kept.names, camera, self._photo, self._name)
+        return cv2.imencode(".png", picture)[1].tobytes()
 
 
 class GroundedOutput(RunFolder[Grounded]):
     """Everything that `dddas locate aerial` writes. Raises InputError as RunFolder does."""
 
-    files = ("positions.csv", "fixes.csv", "tracks.geojson", NAME)
+    files = (*GroundedJournal.made, NAME)
 
     def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
         """Claim a folder, as in RunFolder."""
@@ -189,14 +208,89 @@ class GroundedOutput(RunFolder[Grounded]):
         facts: dict[str, Any],
         names: Sequence[str],
         origin_deg: tuple[float, float] | None,
-        start_utc_s: float = float("nan"),
+        start_utc_s: float = math.nan,
         rate_hz: float | None = None,
-        background: Any = None,
+        background: Ortho | None = None,
+        camera: Camera | None = None,
+        degrees: Degrees | None = None,
     ) -> GroundedJournal:
         """Say what the run is, for run.json, and the landmarks' names.
 
         origin_deg: longitude and latitude of the local metres, None where there are none. start_utc_s: as in Telemetry.
+        background: under the map. camera: so that the map shows what it saw. degrees: so that maps for other tools show
+        the landmarks.
         """
-        self.journal = kept = GroundedJournal(self.folder, facts, names)
-        self._sinks = [kept, GroundedTables(self.folder, origin_deg is not None)]
+        known = math.isfinite(start_utc_s)
+        began = iso_utc(np.array([start_utc_s]))[0] if known else None
+        about = {"origin_deg": origin_deg, "start_utc": began, "rate_hz": rate_hz}
+        self.journal = kept = GroundedJournal(self.folder, {**about, **facts}, names)
+        if origin_deg is None:
+            kept.notes.append("no longitude and latitude are known: no maps for other tools, but local metres")
+        elif not known and "cot" in self._save:
+            kept.notes.append(f"no clock is known: no {COT}, and times are seconds since the first frame")
+        geographic = origin_deg is not None
+        self._maps = Maps(self.folder, kept, self._save, geographic, start_utc_s, background, camera, degrees)
+        self._sinks = [kept, self._maps, GroundedTables(self.folder, geographic)]
         return kept
+
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, as in RunFolder; maps of an earlier run here go if this one makes none."""
+        super().close(complete)
+        for name in {GEOJSON, KML, COT, MAP, REPORT} - self._maps.written:
+            remove(self.folder / name)
+
+
+def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png: bytes) -> Story:
+    """What the report tells of a run."""
+    located = kept.frames - kept.by["nothing"]
+    axes, _ = semi_axes(targets.covariance_m2)
+    axes = axes[np.isfinite(axes).all(axis=1)]
+    figures = [
+        ("frames", f"{kept.frames}"),
+        ("located", f"{located}"),
+        ("targets", f"{len(targets.of)}"),
+        ("positions", f"{kept.positions}"),
+    ]
+    figures += [(f"frames by {name}", f"{count}") for name, count in kept.by.items() if count and name != "nothing"]
+    if len(axes):
+        longer, shorter = np.median(axes, axis=0)
+        figures.append(("95 % ellipse, median semi-axes", f"{longer:.2f} × {shorter:.2f} m"))
+    tables: list[Table] = [
+        (
+            "Frames that could not be located",
+            ("frames", "cause"),
+            [(span(g["first"], g["last"]), g["cause"]) for g in kept.gaps],
+            "none",
+        ),
+        (
+            "Frames located with something amiss",
+            ("frames", "by", "cause"),
+            [(span(w["first"], w["last"]), w["by"], w["cause"]) for w in kept.weak.rows],
+            "none",
+        ),
+        (
+            "Repairs and exclusions",
+            ("frames", "what and why"),
+            [(span(r["first"], r["last"]), r["cause"]) for r in kept.repairs.rows],
+            "none",
+        ),
+        (
+            "Adjustments of the feedback loop",
+            ("frame", "knob", "from", "to", "cause"),
+            [(m["frame"], m["knob"], m["old"], m["new"], m["cause"]) for m in kept.moves],
+            "none",
+        ),
+        (
+            "Landmarks",
+            ("name", "frames seen", "used", "reassigned in frames", "excluded in frames"),
+            [
+                (name, k["seen"], k["used"], [span(*s) for s in k["reassigned"]], [span(*s) for s in k["excluded"]])
+                for name, k in kept.landmarks.items()
+            ],
+            "none",
+        ),
+    ]
+    state = "complete" if complete else "interrupted: up to the last whole frame"
+    name = Path(str(kept.facts.get("input", ""))).name
+    title = f"Located from the air: {name}" if name else "Located from the air"
+    return Story(title, state, figures, kept.facts, tables, [*kept.notes, *kept.problems], map_png)

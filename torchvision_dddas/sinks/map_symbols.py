@@ -29,7 +29,11 @@ def dashes(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, 
 
 def line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, halo: bool = False) -> None:
     """A line through (N, 2) pixels of the enlarged picture, so thick in the finished one."""
-    ways = [fixed(points)]
+    # A long way jitters within a pixel from frame to frame: what nobody can see costs most of the time.
+    simple = (
+        cv2.approxPolyDP(points.astype(np.float32)[:, None], 0.4 * FINE, False)[:, 0] if len(points) > 99 else points
+    )
+    ways = [fixed(simple)]
     if halo:
         cv2.polylines(picture, ways, False, PAPER, (thick + 2) * FINE, cv2.LINE_AA, _SUB)
     cv2.polylines(picture, ways, False, colour, thick * FINE, cv2.LINE_AA, _SUB)

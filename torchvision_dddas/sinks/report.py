@@ -1,0 +1,111 @@
+"""report.html: what a run did, in one file that asks no other host for anything."""
+
+import base64
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+from torchvision_dddas.sinks.journal import finite
+from torchvision_dddas.sinks.timeline import Timeline, plots
+
+MOST_ROWS = 200
+"""A table shows so many rows; run.json has them all."""
+
+Table = tuple[str, Sequence[str], Sequence[Sequence[Any]], str]
+"""A title, the columns' names, rows of cells, and what to say where there are none."""
+
+_STYLE = """
+:root{color-scheme:light}
+body{font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif;color:#222;background:#fff;
+ max-width:1160px;margin:0 auto;padding:24px}
+h1{font-size:24px;margin:0 0 4px}h2{font-size:18px;margin:36px 0 10px;border-bottom:1px solid #ddd;padding-bottom:4px}
+.state{color:#666;margin:0 0 20px}.state b{color:#a33}
+dl.figures{display:flex;flex-wrap:wrap;gap:12px;margin:0}
+dl.figures div{border:1px solid #ddd;border-radius:6px;padding:8px 14px;min-width:110px}
+dl.figures dt{color:#666;font-size:13px}dl.figures dd{margin:0;font-size:21px;font-variant-numeric:tabular-nums}
+table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
+th,td{text-align:left;padding:4px 12px 4px 0;border-bottom:1px solid #eee;vertical-align:top;overflow-wrap:anywhere}
+th{color:#666;font-weight:600;white-space:nowrap}td:first-child{white-space:nowrap}
+img,svg{width:100%;height:auto;display:block}
+svg text{font-size:12px;fill:#555}svg .title{font-size:13px;font-weight:600;fill:#222}
+svg .grid{stroke:#eee}svg .tick{stroke:#888;fill:none}svg .gap{fill:#c0392b;opacity:.15}
+svg .curve{fill:none;stroke-width:1.6;stroke-linejoin:round}
+.note{color:#666}ul{padding-left:20px}pre{background:#f6f6f6;padding:12px;overflow:auto;font-size:13px}
+"""
+
+
+@dataclass(frozen=True)
+class Story:
+    """What a report tells. All words are escaped when it is written.
+
+    figures: names and values. facts: what was run; `settings` among them is folded away. notes: in words.
+    """
+
+    title: str
+    state: str
+    figures: Sequence[tuple[str, str]]
+    facts: Mapping[str, Any]
+    tables: Sequence[Table]
+    notes: Sequence[str] = field(default_factory=tuple)
+    map_png: bytes | None = None
+
+
+def report(story: Story, timeline: Timeline) -> str:
+    """The HTML: figures, map, plots over time, tables, and what was run."""
+    parts = [
+        f"<h1>{escape(story.title)}</h1>",
+        f'<p class="state">{escape(story.state)}</p>',
+        '<dl class="figures">',
+        *(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in story.figures),
+        "</dl>",
+    ]
+    if story.notes:
+        parts += ["<h2>Notes</h2>", "<ul>", *(f"<li>{escape(note)}</li>" for note in story.notes), "</ul>"]
+    if story.map_png is not None:
+        picture = base64.b64encode(story.map_png).decode()
+        parts += ["<h2>Map</h2>", f'<img alt="map of the tracks" src="data:image/png;base64,{picture}">']
+    if drawn := plots(timeline):
+        parts += ["<h2>Over time</h2>", drawn, '<p class="note">Shaded: frames in which nothing could be located.</p>']
+    for title, names, rows, empty in story.tables:
+        parts += [f"<h2>{escape(title)}</h2>", table(names, rows) if rows else f'<p class="note">{escape(empty)}</p>']
+    facts = {name: value for name, value in story.facts.items() if name != "settings"}
+    parts += ["<h2>What was run</h2>", table(("what", "value"), [(name, _words(v)) for name, v in facts.items()])]
+    if "settings" in story.facts:
+        text = json.dumps(finite(story.facts["settings"]), indent=2)
+        parts.append(f"<details><summary>settings</summary><pre>{escape(text)}</pre></details>")
+    body = "\n".join(parts)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(story.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """An HTML table of the first MOST_ROWS rows, which says how many more there are."""
+    head = "".join(f"<th>{escape(name)}</th>" for name in names)
+    body = [f"<tr>{''.join(f'<td>{escape(_words(cell))}</td>' for cell in row)}</tr>" for row in rows[:MOST_ROWS]]
+    more = len(rows) - MOST_ROWS
+    rest = f'<p class="note">and {more} more, in run.json</p>' if more > 0 else ""
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{rest}"
+
+
+def span(first: int, last: int) -> str:
+    """Frames in words."""
+    return f"{first}" if first == last else f"{first} to {last}"
+
+
+def _words(value: Any) -> str:
+    """A value for a reader."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "unknown"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_words(v)}" for name, v in value.items())
+    if isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
+        return ", ".join(_words(v) for v in value)
+    return str(value)
