@@ -555,3 +555,17 @@ class Followed:
         """The rows of the detections that have no identity."""
         tracked = set(self.tracks.row.tolist())
         return [row for row in range(len(self.detections)) if row not in tracked]
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """All that is known of one frame at the end of the whole path. grounded: None where nothing lays it on the ground.
+
+    followed: its targets, without the landmarks. sighted_by: (n,) what showed each of the landmarks of grounded.marks:
+    motion, colour or table. mark_lonlat_deg: (n, 2) where they were; None where there is no geographic origin.
+    """
+
+    followed: Followed
+    grounded: Grounded | None = None
+    sighted_by: tuple[str, ...] = ()
+    mark_lonlat_deg: np.ndarray | None = None

@@ -15,6 +15,7 @@ from torchvision_dddas.cli.evaluate import evaluate
 from torchvision_dddas.cli.locate import locate
 from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.people import people
+from torchvision_dddas.cli.run import run
 from torchvision_dddas.cli.settings import settings
 from torchvision_dddas.cli.track import track
 
@@ -25,7 +26,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (detect, people, track, confirm, calibrate, evaluate, demo, settings):
+for command in (run, detect, people, track, confirm, calibrate, evaluate, demo, settings):
     app.command()(command)
 app.add_typer(locate, name="locate")
 

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.geolocating import Locator
     from torchvision_dddas.settings import Settings
     from torchvision_dddas.sinks.grounded import GroundedJournal
-    from torchvision_dddas.types import Camera
+    from torchvision_dddas.sinks.journal import Record
+    from torchvision_dddas.types import Camera, Colours
 
 Marked = Annotated[
     Path, typer.Option("--landmarks", metavar="FILE", help="A CSV of landmarks: where they were, and where they show.")
@@ -83,11 +84,12 @@ class AerialInput:
     camera: Path | None = None
     dem: Path | None = None
     background: Path | None = None
+    colours: Path | None = None
 
     @property
     def files(self) -> list[Path]:
         """All that are given."""
-        named = (self.landmarks, self.telemetry, self.camera, self.dem, self.background)
+        named = (self.landmarks, self.telemetry, self.camera, self.dem, self.background, self.colours)
         return [file for file in named if file is not None]
 
     @property
@@ -99,6 +101,7 @@ class AerialInput:
             "camera": self.camera,
             "dem": self.dem,
             "background": self.background,
+            "colours": self.colours,
         }
 
 
@@ -131,16 +134,12 @@ def aerial_into(
         last = source.count if source is not None else read.last
         locator, notes = locator_for(given, settings, source.size if source else None, rate, backend, last or read.last)
         check_table(read, locator)
-        facts = {"input": table, **given.facts, "rows": len(read), **_about(locator), "settings": settings.model_dump()}
-        site = locator.site
-        start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
-        journal = output.begin(
-            facts, site.landmarks.names, site.origin_deg, start_utc_s, locator.rate_hz, given.background
-        )
+        facts = {"input": table, **given.facts, "rows": len(read), **about(locator), "settings": settings.model_dump()}
+        journal = output.begin(facts, **ground_facts(locator, given))
         journal.notes += notes
         if not len(read):
             journal.notes.append("the table has no rows: nothing to locate")
-        with progress("locate", len(frames_of(read, site.landmarks)), quiet) as tick:
+        with progress("locate", len(frames_of(read, locator.site.landmarks)), quiet) as tick:
             for grounded in locate(read, locator):
                 output.write(grounded)
                 tick()
@@ -153,16 +152,18 @@ def locator_for(
     size: tuple[int, int] | None,
     rate_hz: float | None,
     backend: str,
-    last: int,
+    last: int | None,
+    colours: "Colours | None" = None,
 ) -> "tuple[Locator, list[str]]":
     """What lays pictures on the ground, from the files; and what the user should know of it.
 
-    size: (width, height) of the pictures and rate_hz, None where unknown. last: number of the last frame.
+    size: (width, height) of the pictures, rate_hz, last: number of the last frame; None where unknown.
+    colours: where they tell where pictures show the landmarks, whatever the table says.
     Raises InputError for bad input.
     """
     from dataclasses import replace
 
-    from torchvision_dddas.geolocating import Locator, camera_of, site_of
+    from torchvision_dddas.geolocating import Locator, camera_of, site_of, unpictured
     from torchvision_dddas.sources.landmarks import read_landmarks
     from torchvision_dddas.sources.telemetry import check_overlap, read_telemetry
     from torchvision_dddas.vision import load_solver
@@ -176,11 +177,12 @@ def locator_for(
             raise InputError(
                 "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
             )
-        check_overlap(telemetry, (last - 1) / rate_hz)
+        if last:
+            check_overlap(telemetry, (last - 1) / rate_hz)
         notes += telemetry.notes
     if rate_hz is None:
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
-    site = site_of(landmarks, telemetry)
+    site = site_of(landmarks if colours is None else unpictured(landmarks), telemetry)
     if given.dem is not None:
         from torchvision_dddas.sources.elevation import read_elevation
 
@@ -196,7 +198,7 @@ def _camera(given: AerialInput) -> "Camera | None":
     return read_camera(given.camera) if given.camera is not None else None
 
 
-def _about(locator: "Locator") -> dict[str, Any]:
+def about(locator: "Locator") -> dict[str, Any]:
     """What run.json says of how pictures were laid on the ground."""
     camera = locator.camera
     return {
@@ -206,13 +208,31 @@ def _about(locator: "Locator") -> dict[str, Any]:
     }
 
 
+def ground_facts(locator: "Locator", given: AerialInput) -> dict[str, Any]:
+    """What GroundedOutput.begin wants to know."""
+    site = locator.site
+    return {
+        "names": site.landmarks.names,
+        "origin_deg": site.origin_deg,
+        "start_utc_s": site.telemetry.start_utc_s if site.telemetry is not None else math.nan,
+        "rate_hz": locator.rate_hz,
+        "background": given.background,
+    }
+
+
 def summary(journal: "GroundedJournal", folder: Path) -> list[str]:
     """What to tell the user at the end."""
-    by = ", ".join(f"{count} by {name}" for name, count in journal.by.items() if count and name != "nothing")
-    lines = [
-        f"{journal.frames} frames ({by or 'none located'}), {journal.targets} targets, {journal.positions} positions"
-    ]
-    if gaps := journal.by["nothing"]:
-        lines.append(f"note: {gaps} frames could not be located: no positions there (why: run.json)")
-    made = [name for name in type(journal).made if (folder / name).exists()] if hasattr(journal, "made") else []
-    return [*lines, *(f"note: {note}" for note in journal.notes), f"{folder}: {', '.join([*made, 'run.json'])}"]
+    made = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    first = f"{journal.frames} frames, {journal.targets} targets"
+    notes = [f"note: {note}" for note in journal.notes]
+    return [first, *ground_lines(journal), *notes, f"{folder}: {', '.join(made)}"]
+
+
+def ground_lines(journal: "Record") -> list[str]:
+    """How many positions there are, by what, and how many frames could not be located."""
+    counts: dict[str, Any] = {"positions": 0, "by": {}, **journal.counts}
+    by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")
+    lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
+    if gaps := counts["by"].get("nothing", 0):
+        lines.append(f"note: {gaps} frames could not be located and have no positions; run.json says why")
+    return lines

@@ -3,5 +3,18 @@
 from torchvision_dddas.geolocating.locator import Locator, Targets
 from torchvision_dddas.geolocating.site import Site, camera_of, site_of
 from torchvision_dddas.geolocating.table import check_table, locate
+from torchvision_dddas.geolocating.watch import Watch, Watched, check_colours, unpictured
 
-__all__ = ["Locator", "Site", "Targets", "camera_of", "check_table", "locate", "site_of"]
+__all__ = [
+    "Locator",
+    "Site",
+    "Targets",
+    "Watch",
+    "Watched",
+    "camera_of",
+    "check_colours",
+    "check_table",
+    "locate",
+    "site_of",
+    "unpictured",
+]

@@ -1,9 +1,11 @@
 """The clip with its tracks drawn in: a colour and a number an identity, and the way that it came."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
-from torchvision_dddas.sinks.drawing import colour_picture, label, line_width, rectangle, whole
+from torchvision_dddas.sinks.drawing import Colour, colour_picture, label, line_width, rectangle, whole
 from torchvision_dddas.sinks.overlay import TEXT, WARNING, caption
 from torchvision_dddas.sinks.trails import Trails
 from torchvision_dddas.types import Followed
@@ -30,8 +32,11 @@ class TrackPictures:
         self.size = size
         self._trails = Trails(LENGTH)
 
-    def __call__(self, followed: Followed) -> np.ndarray:
-        """The frame with boxes, numbers and trails, (H, W, 3) uint8 BGR; black where it could not be read."""
+    def __call__(self, followed: Followed, more: Sequence[tuple[str, Colour]] = ()) -> np.ndarray:
+        """The frame with boxes, numbers and trails, (H, W, 3) uint8 BGR; black where it could not be read.
+
+        more: further lines of the caption, each with its colour.
+        """
         self._trails.add(followed)
         picture = _picture(followed, self.size)
         thick = line_width(picture)
@@ -47,7 +52,7 @@ class TrackPictures:
         lines = [(f"frame {followed.number}  identities {len(tracks)}  detections {len(given)}", TEXT)]
         if followed.cause:
             lines.append((followed.cause, WARNING))
-        caption(picture, lines)
+        caption(picture, [*lines, *more])
         return picture
 
 

@@ -1,0 +1,229 @@
+"""`dddas run`: the whole path, from a clip to places on the ground."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.aerial import (
+    AerialInput,
+    Flown,
+    Heights,
+    Lens,
+    Ortho,
+    about,
+    ground_facts,
+    ground_lines,
+    locator_for,
+)
+from torchvision_dddas.cli.clips import clip_facts, last_lines
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.geolocating import Locator, Watch, Watched
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.sinks.journal import Record
+    from torchvision_dddas.sources import Source
+    from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
+    from torchvision_dddas.vision import Vision
+
+
+@explained
+def run(
+    clip: Annotated[
+        str, typer.Argument(metavar="CLIP", help="A video file, a folder or glob of images, camera:0 or rtsp://...")
+    ],
+    landmarks: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A CSV of landmarks: where they were. [default: none located]")
+    ] = None,
+    telemetry: Flown = None,
+    colours: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The TOML of the landmarks' colours, by `dddas colours`.")
+    ] = None,
+    camera: Lens = None,
+    dem: Heights = None,
+    background: Ortho = None,
+    interval: Annotated[int, typer.Option(metavar="D", help="Follow targets at every D-th frame: 1, 1+D, ...")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-run"),
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Engine = Backend.auto,
+    save: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="overlay,cot,map,report, all or none; tables are always written."),
+    ] = None,
+    rate: Rate = None,
+    quiet: Quiet = False,
+) -> None:
+    """Find what moves in a clip from the air, give it lasting identities, and locate it by landmarks of known place.
+
+    Writes the tables of `dddas detect`, `dddas track` and `dddas locate aerial`, landmarks.csv (where they were seen),
+    overlay.mp4, maps, a report and run.json under --out.
+    """
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.sinks.survey_output import SAVED
+
+    if interval < 1:
+        raise InputError(f"--interval is {interval}; wanted 1 or more frames")
+    others = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
+    if landmarks is None and (useless := [name for name, given in others.items() if given is not None]):
+        raise InputError(f"{useless[0]} is of no use without --landmarks FILE: nothing would be located")
+    given = None if landmarks is None else AerialInput(landmarks, telemetry, camera, dem, background, colours)
+    settings, names = load(config, set_ or []), saved(save, SAVED)
+    journal = run_into(out, clip, given, telemetry, interval, settings, backend.value, names, rate, quiet)
+    if not quiet:
+        for line in summary(journal, out, given is not None):
+            typer.echo(line)
+
+
+def run_into(
+    folder: Path,
+    clip: str,
+    given: AerialInput | None,
+    telemetry: Path | None,
+    interval: int,
+    settings: "Settings",
+    backend: str = "auto",
+    save: Sequence[str] = (),
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> "Record":
+    """The whole path, written under a folder; returns the record of the run. given: None where nothing is located.
+
+    Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
+    """
+    from torchvision_dddas.sinks.survey_output import FoundOutput, SurveyOutput
+    from torchvision_dddas.sinks.whole import refuse_own_input
+
+    kind = FoundOutput if given is None else SurveyOutput
+    files = given.files if given is not None else [telemetry] if telemetry is not None else []
+    refuse_own_input([Path(clip), *files], [folder / name for name in kind.files], "folder with --out")
+    with kind(folder, save) as output:
+        from torchvision_dddas.sources import open_source
+        from torchvision_dddas.sources.telemetry import read_telemetry
+        from torchvision_dddas.vision import load
+
+        source = open_source(clip, rate_hz=rate_hz)
+        watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
+        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s) if telemetry is not None else None
+        vision = load(backend, settings)
+        facts: dict[str, Any] = {
+            "input": clip,
+            "telemetry": telemetry,
+            "clip": clip_facts(source),
+            "interval_frames": interval,
+            "backend": vision.name,
+        }
+        journal: Record
+        rate = source.rate_hz / interval
+        if isinstance(output, SurveyOutput):
+            assert given is not None
+            assert watch is not None
+            site = watch.locator.site
+            facts |= {**given.facts, **about(watch.locator), "settings": settings.model_dump()}
+            journal = output.begin(facts, **ground_facts(watch.locator, given))
+            output.also(journal, rate, source.size, site.landmarks.names, site.origin_deg is not None)
+            write = output.survey
+        else:
+            journal = output.begin({**facts, "settings": settings.model_dump()}, rate, source.size)
+            write = output.write
+            notes.append("no --landmarks was given: nothing was located")
+        journal.notes += notes
+        try:
+            count = None if source.count is None else -(-source.count // interval)
+            with progress(source.name, count, quiet) as tick:
+                for surveyed in surveyed_clip(source, vision, settings, flight, watch, interval):
+                    write(surveyed)
+                    tick()
+        finally:
+            journal.problems += [str(problem) for problem in source.problems]
+    return journal
+
+
+def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: str) -> "tuple[Watch, list[str]]":
+    from torchvision_dddas.geolocating import Watch, check_colours
+    from torchvision_dddas.sources.colours import read_colours
+    from torchvision_dddas.vision import load_colours
+
+    colours = read_colours(given.colours) if given.colours is not None else None
+    locator, notes = locator_for(given, settings, source.size, source.rate_hz, backend, source.count, colours)
+    helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
+    check_colours(locator.site.landmarks, colours, helped)
+    if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
+        notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
+    return Watch(locator, colours, load_colours(backend) if colours is not None else None), notes
+
+
+def surveyed_clip(
+    source: "Source",
+    vision: "Vision",
+    settings: "Settings",
+    telemetry: "Telemetry | None",
+    watch: "Watch | None",
+    interval: int,
+) -> "Iterator[Surveyed]":
+    """Everything of each frame that is followed, in order.
+
+    Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
+    target is located by the picture in which it was seen.
+    """
+    from torchvision_dddas.following import follow_scenes
+    from torchvision_dddas.run import run as scenes_of
+    from torchvision_dddas.types import Surveyed
+
+    waiting: dict[int, Watched] = {}
+
+    def scenes() -> "Iterator[Scene]":
+        for scene in scenes_of(source, vision, settings, telemetry):
+            if watch is None:
+                yield scene
+                continue
+            watched = watch.step(scene)
+            waiting[scene.frame.number] = watched
+            yield watched.scene
+
+    for followed in follow_scenes(scenes(), settings, interval, source.size):
+        if watch is None:
+            yield Surveyed(followed)
+            continue
+        past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
+        yield _located(followed, past, watch.locator)
+
+
+def _located(followed: "Followed", past: "Sequence[Watched]", locator: "Locator") -> "Surveyed":
+    """A followed frame on the ground. past: what was seen since the one before, it at the end."""
+    from dataclasses import replace
+
+    from torchvision_dddas.geolocating import Targets
+    from torchvision_dddas.targets import geodesy
+    from torchvision_dddas.types import Surveyed
+
+    here, tracks = past[-1], followed.tracks
+    # A box that bridges a gap was not seen: it has an identity, and no place.
+    seen = tracks.row >= 0
+    targets = Targets(
+        tracks.box_px[seen], tracks.identity[seen], seen[seen], tracks.score[seen].clip(0, 1), bodies=True
+    )
+    earlier = tuple(a for watched in past[:-1] for a in watched.look.adjustments)
+    seconds = dict(followed.seconds)
+    for watched in past:
+        for stage, spent in watched.look.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent
+    grounded = locator.ground(replace(here.look, seconds={}), targets, (*followed.adjustments, *earlier), seconds)
+    origin = locator.site.origin_deg
+    degrees = None if origin is None else geodesy.lonlat(grounded.marks.east_north_m, origin)
+    return Surveyed(followed, grounded, here.sighted_by, degrees)
+
+
+def summary(journal: "Record", folder: Path, located: bool) -> list[str]:
+    """What to tell the user at the end."""
+    made = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    counts = journal.counts
+    found = f"{journal.frames} frames, {journal.targets} targets, {counts.get('identities', 0)} identities"
+    lines = [found, *(ground_lines(journal) if located else [])]
+    return [lines[0], *lines[1:], *last_lines("", journal, folder, made, journal.notes)[1:]]

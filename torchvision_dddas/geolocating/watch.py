@@ -1,0 +1,148 @@
+"""Landmarks in the pictures of a clip: found by their colours or by the table's own word, and kept from the targets."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geolocating.locator import Locator, Look
+from torchvision_dddas.targets.landmarks import LandmarkFollower
+from torchvision_dddas.targets.plane import LEAST
+from torchvision_dddas.targets.projection import project
+from torchvision_dddas.targets.projective import transfer
+from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
+from torchvision_dddas.vision.protocol import ColourFinder
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A scene without the landmarks, how it lies on the ground, and by what each of its landmarks was seen."""
+
+    scene: Scene
+    look: Look
+    sighted_by: tuple[str, ...]
+
+
+def unpictured(landmarks: Landmarks) -> Landmarks:
+    """Without what the table says of places in pictures: colours tell them."""
+    return replace(landmarks, image_px=np.full_like(landmarks.image_px, np.nan))
+
+
+def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -> None:
+    """Raises InputError where no picture could be laid on the ground by what is given.
+
+    helped: whether telemetry says where the camera is.
+    """
+    if colours is None:
+        if not np.isfinite(landmarks.image_px).all(axis=1).any():
+            raise InputError(
+                f"landmarks {landmarks.path} say no places in pictures (u_px,v_px); give --colours FILE, the colours "
+                "that they wear, as `dddas colours` writes it"
+            )
+        return
+    if strange := [name for name in colours.names if name not in landmarks.names]:
+        raise InputError(
+            f"the colours name {', '.join(strange)}, the landmarks {landmarks.path} {', '.join(landmarks.names)}; "
+            "wanted the same names in both"
+        )
+    if len(colours) < LEAST and not helped:
+        raise InputError(
+            f"locating needs {LEAST} landmarks; colours are given for {len(colours)}: {LEAST - len(colours)} missing. "
+            "Give --telemetry, or more landmarks"
+        )
+
+
+class Watch:
+    """Takes the scenes of a clip in order, and keeps their landmarks from their targets."""
+
+    def __init__(self, locator: Locator, colours: Colours | None, finder: ColourFinder | None) -> None:
+        """colours, finder: None where the table of landmarks says where pictures show them."""
+        self.locator, self._colours, self._finder = locator, colours, finder
+        names = locator.site.landmarks.names
+        self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
+        self._follower = LandmarkFollower(colours.names, locator.settings.landmarks) if colours else None
+        self._fix: Fix | None = None
+
+    def step(self, scene: Scene) -> Watched:
+        """The next scene."""
+        start = time.perf_counter()
+        frame = scene.frame.number
+        marks = self.locator.marks(frame)
+        if self._follower is not None:
+            marks, rows, by = self._found(scene, marks)
+        else:
+            rows, by = _holding(scene.detections.box_px, marks.image_px), ("table",) * len(marks)
+        spent = time.perf_counter() - start
+        look = self.locator.look(frame, marks)
+        self._fix = look.fix
+        used = dict(zip(marks.landmark.tolist(), by, strict=True))
+        return Watched(
+            _without(scene, rows),
+            replace(look, seconds={"landmarks": spent, **look.seconds}),
+            tuple(used[which] for which in look.marks.landmark.tolist()),
+        )
+
+    def _found(self, scene: Scene, marks: Marks) -> tuple[Marks, np.ndarray, tuple[str, ...]]:
+        """The landmarks with their places in the picture, which detections are landmarks, and by what each was seen."""
+        assert self._follower is not None
+        assert self._finder is not None
+        assert self._colours is not None
+        image = scene.frame.image
+        if image.ndim == 2:
+            raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
+        step = scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None
+        place = {which: k for k, which in enumerate(self._which.tolist())}
+        expected = np.full((len(self._colours), 2), np.nan)
+        for which, pixel in zip(marks.landmark.tolist(), self._expected(marks, step), strict=True):
+            if which in place:
+                expected[place[which]] = pixel
+        masks = self._finder.masks(image, self._colours.low, self._colours.high)
+        seen = self._follower.step(scene.frame.number, masks, scene.detections, step, scene.mask, expected)
+        pixels = np.full((len(marks), 2), np.nan)
+        by = [""] * len(marks)
+        for row, which in enumerate(marks.landmark.tolist()):
+            if which in place:
+                pixels[row], by[row] = seen.image_px[place[which]], seen.by[place[which]]
+        return replace(marks, image_px=pixels), seen.rows, tuple(by)
+
+    def _expected(self, marks: Marks, step: np.ndarray | None) -> np.ndarray:
+        """(n, 2) where the landmarks should be, by how the frame before lay on the ground; NaN where unknown."""
+        fix = self._fix
+        if fix is None or step is None:
+            return np.full((len(marks), 2), np.nan)
+        if fix.pose is not None:
+            before = project(np.c_[marks.east_north_m, marks.up_m], fix.pose, self.locator.camera)
+        elif fix.image_from_ground is not None:
+            before = transfer(fix.image_from_ground, marks.east_north_m)
+        else:
+            return np.full((len(marks), 2), np.nan)
+        return transfer(step, before)
+
+
+def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether a box is the smallest that holds one of the points."""
+    held = np.zeros(len(box_px), bool)
+    for point in points_px[np.isfinite(points_px).all(axis=1)]:
+        inside = ((point >= box_px[:, :2] - 0.5) & (point <= box_px[:, :2] + box_px[:, 2:] - 0.5)).all(axis=1)
+        if inside.any():
+            held[np.where(inside, box_px[:, 2] * box_px[:, 3], np.inf).argmin()] = True
+    return held
+
+
+def _without(scene: Scene, rows: np.ndarray) -> Scene:
+    """A scene without some of its detections."""
+    if not rows.any():
+        return scene
+    kept, found = ~rows, scene.detections
+    value = np.zeros(len(rows) + 1, np.uint16)
+    value[1:][kept] = np.arange(1, kept.sum() + 1)
+    detections = Detections(
+        found.box_px[kept],
+        found.score[kept],
+        found.area_px[kept],
+        found.heading_rad[kept],
+        found.speed_px[kept],
+        found.kind,
+    )
+    return replace(scene, detections=detections, mask=value[scene.mask])
