@@ -11,33 +11,34 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.settings import LandmarkKnobs
-from torchvision_dddas.targets.colours import Patches, patches_of
+from torchvision_dddas.targets.candidates import Candidates
+from torchvision_dddas.targets.colours import patches_of
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.targets.ranging import touches_border
-from torchvision_dddas.targets.touching import centres_of, covering, inside
+from torchvision_dddas.targets.touching import beside, centres_of, covering, inside
 from torchvision_dddas.types import Detections
 
-# What speaks for a patch of a colour, in the logarithm of its area: a blob at it; being where the landmark is
-# predicted, by whether the landmark was ever seen to move; and, at most, against it: being far from where it should be.
-_BLOB, _LOCK_MOVED, _LOCK, _FAR = 3.0, 3.0, 1.0, 4.0
 # A blob that is this many times larger for its colour than usual holds something beside the landmark.
 _SHARED = 1.8
-# Blobs and areas of the last so many frames say what is usual; fewer than the second number say nothing.
+# Blobs of the last so many frames say what is usual; fewer than the second number say nothing.
 _MEMORY, _ENOUGH = 25, 3
-# How much a new frame changes the velocity.
-_GAIN = 0.3
 
 
-def separate(colour_px: np.ndarray, blob_px: np.ndarray, knobs: LandmarkKnobs) -> np.ndarray:
+def separate(
+    colour_px: np.ndarray, blob_px: np.ndarray, knobs: LandmarkKnobs, allowed: np.ndarray | None = None
+) -> np.ndarray:
     """(n,) int64, which of the m blobs is each landmark's, -1 for none; no blob is of two.
 
-    colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of what moves.
+    colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of what moves. allowed: (n, m) bool,
+    pairs that may be; None: all.
     exact: as many matches as there can be within reach_px, then the least distance in all. The source asks for one blob
     for each landmark, which is infeasible where one has none in reach; its text says "if any". greedy: its heuristic,
     row by row, each landmark the nearest blob that is left.
     """
     distance = np.linalg.norm(colour_px[:, None] - blob_px[None], axis=2)
     within = distance <= knobs.reach_px  # False for NaN
+    if allowed is not None:
+        within &= allowed
     match = np.full(len(colour_px), -1, np.int64)
     if not within.any():
         return match
@@ -75,16 +76,11 @@ class Sighted:
 
 
 @dataclass
-class _State:
-    """What is known of one landmark: places in the picture of the frame before, NaN where unknown."""
+class _Coupling:
+    """What is known of a landmark's blob: its place in the picture of the frame before, NaN where there was none."""
 
-    colour_px: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
     blob_px: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
-    velocity_px: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    missed: int = 0
     coupled: bool = False
-    moved: bool = False
-    areas: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
     ratios: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
 
 
@@ -97,7 +93,8 @@ class LandmarkFollower:
 
     def __init__(self, names: tuple[str, ...], knobs: LandmarkKnobs) -> None:
         self.names, self._knobs = names, knobs
-        self._states = [_State() for _ in names]
+        self._colours = [Candidates(knobs) for _ in names]
+        self._blobs = [_Coupling() for _ in names]
         self._next = 0
 
     def step(
@@ -120,76 +117,82 @@ class LandmarkFollower:
         anew = frame >= self._next
         if anew:
             self._next = frame + self._knobs.interval_frames
-        for state in self._states:
-            _advance(state, now_from_before)
         boxes = detections.box_px
         blobs = centres_of(boxes, foreground)
-        expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
-        patches = [patches_of(mask, self._knobs.least_area_px) for mask in masks]
-        picked = [
-            self._pick(state, found, boxes, where, anew)
-            for state, found, where in zip(self._states, patches, expected, strict=True)
-        ]
-        chosen = [found.box_px[i] if i >= 0 else None for found, i in zip(patches, picked, strict=True)]
-        colour = np.array(
-            [found.centre_px[i] if i >= 0 else (np.nan, np.nan) for found, i in zip(patches, picked, strict=True)]
-        ).reshape(-1, 2)
-        match = self._couple(colour, blobs, anew)
-        area = np.array([found.area_px[i] if i >= 0 else np.nan for found, i in zip(patches, picked, strict=True)])
-        touching = np.array([covering(box, boxes, foreground) for box in chosen], bool).reshape(len(masks), len(boxes))
-        touching[match >= 0, match[match >= 0]] = True
         blob_area = detections.area_px if len(detections.area_px) else boxes[:, 2:].prod(axis=1)
+        chosen, colour, area = self._find(masks, boxes, now_from_before, expected_px, anew)
+        shape = len(masks), len(boxes)
+        near = np.array([beside(box, boxes) for box in chosen], bool).reshape(shape)
+        match = self._couple(colour, blobs, near, now_from_before, anew)
+        touching = np.array([covering(box, boxes, blob_area, foreground) for box in chosen], bool).reshape(shape)
+        # A blob that is not at the colour is a part of the vehicle; its centre is not the vehicle's.
+        whole = touching.sum(axis=0) == 1
+        touching[match >= 0, match[match >= 0]] = True
         shared = self._shared(match, touching, area, blob_area)
-        # The centre of a blob is a landmark's if it holds this one whole, and nothing else.
-        clean = ~shared & (touching.sum(axis=0) == 1) & ~touches_border(boxes, size)
+        clean = whole & ~shared & (touching.sum(axis=0) == 1) & ~touches_border(boxes, size)
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
-        for k, (state, box) in enumerate(zip(self._states, chosen, strict=True)):
+        for k, (coupling, box) in enumerate(zip(self._blobs, chosen, strict=True)):
             own = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
             if own is not None and self._knobs.centre == "motion":
                 image[k], by[k] = own, "motion"
             elif box is not None and not touches_border(box[None], size)[0]:
                 image[k], by[k] = colour[k], "colour"
-            _remember(state, colour[k], own, area[k], self._knobs)
+            if own is not None:
+                coupling.blob_px = own
         return Sighted(image, tuple(by), colour, match, touching.any(axis=0) & ~shared, shared)
 
-    def _pick(self, state: _State, found: Patches, boxes: np.ndarray, expected: np.ndarray, anew: bool) -> int:
-        """Which of its colour's patches is the landmark; -1 for none."""
-        if not len(found):
-            return -1
-        reach = self._knobs.reach_px
-        followed = np.isfinite(state.colour_px[0]) and state.missed <= self._knobs.interval_frames
-        score = np.log(found.area_px)
-        if state.areas:
-            # Beyond its usual size more area says nothing for it.
-            score = np.minimum(score, np.log(2 * float(np.median(state.areas))))
-        if followed:
-            near = np.linalg.norm(found.centre_px - state.colour_px, axis=1) / (reach * (1 + 0.2 * state.missed))
-            score += np.where(near <= 1, (_LOCK_MOVED if state.moved else _LOCK) * (1 - near**2), 0)
-            if not anew:
-                score = np.where(near <= 1, score, -np.inf)
-        elif np.isfinite(expected).all():
-            away = np.linalg.norm(found.centre_px - expected, axis=1) / (2 * reach)
-            score -= np.minimum(away**2 / 2, _FAR)
-        if anew or not followed:
-            score += _BLOB * inside(found.centre_px, boxes).any(axis=1)
-        best = int(score.argmax())
-        return best if np.isfinite(score[best]) else -1
+    def _find(
+        self,
+        masks: np.ndarray,
+        boxes: np.ndarray,
+        now_from_before: np.ndarray | None,
+        expected_px: np.ndarray | None,
+        anew: bool,
+    ) -> tuple[list[np.ndarray | None], np.ndarray, np.ndarray]:
+        """Boxes, centres (K, 2) and areas (K,) of the landmarks' colours; None and NaN where not seen."""
+        expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
+        for mask, colour in zip(masks, self._colours, strict=True):
+            found = patches_of(mask, self._knobs.least_area_px)
+            colour.advance(now_from_before)
+            colour.see(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)))
+        # Vehicles of one team wear plates of like size: what others wear says what to look for.
+        usual = np.inf
+        for _ in range(2):
+            for colour, where in zip(self._colours, expected, strict=True):
+                colour.decide(where, usual, anew)
+            areas = [colour.lock.area_px for colour in self._colours if colour.lock is not None]
+            usual = float(np.median(areas)) if len(areas) >= _ENOUGH else np.inf
+        locks = [c.lock if c.lock is not None and c.sure and c.lock.row >= 0 else None for c in self._colours]
+        centre = np.array([(np.nan, np.nan) if one is None else one.centre_px for one in locks]).reshape(-1, 2)
+        area = np.array([np.nan if one is None else one.area_px for one in locks])
+        return [None if one is None else one.box_px for one in locks], centre, area
 
-    def _couple(self, colour: np.ndarray, blobs: np.ndarray, anew: bool) -> np.ndarray:
-        """Which blob is each landmark's."""
+    def _couple(
+        self, colour: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
+    ) -> np.ndarray:
+        """Which blob is each landmark's: told anew, or the one where it is predicted.
+
+        near: (K, N) bool, the blobs at or beside its colour: others are people who walk near a vehicle that is not
+        seen to move. Where the colour is hidden any will do.
+        """
         if anew:
-            match = separate(colour, blobs, self._knobs)
-            for state, blob in zip(self._states, match, strict=True):
-                state.coupled = blob >= 0
+            match = separate(colour, blobs, self._knobs, near)
+            for coupling, blob in zip(self._blobs, match, strict=True):
+                coupling.coupled = bool(blob >= 0)
             return match
-        predicted = np.array([s.blob_px if s.coupled else (np.nan, np.nan) for s in self._states]).reshape(-1, 2)
-        # A blob that was lost out of sight, as when the vehicle stopped, comes back at its colour.
-        predicted = np.where(np.isnan(predicted) & [[s.coupled] for s in self._states], colour, predicted)
-        match = separate(predicted, blobs, self._knobs)
-        for k in np.flatnonzero(match >= 0):
-            if np.linalg.norm(blobs[match[k]] - colour[k]) > self._knobs.reach_px:
-                match[k] = -1
-        return match
+        predicted = np.full((len(colour), 2), np.nan)
+        for k, (coupling, candidates) in enumerate(zip(self._blobs, self._colours, strict=True)):
+            if not coupling.coupled:
+                continue
+            # A blob that was lost, as when the vehicle stood still, comes back at the colour.
+            predicted[k] = colour[k]
+            if np.isfinite(coupling.blob_px).all():
+                moved = coupling.blob_px
+                if now_from_before is not None:
+                    moved = transfer(now_from_before, moved)[0]
+                velocity = 0.0 if candidates.lock is None else candidates.lock.velocity_px
+                predicted[k] = coupling.blob_px = moved + velocity
+        return separate(predicted, blobs, self._knobs, near | np.isnan(colour[:, :1]))
 
     def _shared(self, match: np.ndarray, touching: np.ndarray, area: np.ndarray, blob_area: np.ndarray) -> np.ndarray:
         """(N,) bool: the blobs that are much larger than the landmarks at them explain; takes note of what is usual.
@@ -202,50 +205,13 @@ class LandmarkFollower:
         peers = ratio[np.isfinite(ratio) & alone]
         others = float(np.median(peers)) if len(peers) >= _ENOUGH else np.inf
         explained = np.zeros(len(match))
-        for k, state in enumerate(self._states):
-            usual = float(np.median(state.ratios)) if len(state.ratios) >= _ENOUGH else others
-            # Where the colour is hidden, its usual area stands for it.
-            seen = area[k] if np.isfinite(area[k]) else float(np.median(state.areas or [np.inf]))
-            explained[k] = usual * seen
+        for k, (coupling, candidates) in enumerate(zip(self._blobs, self._colours, strict=True)):
+            usual = float(np.median(coupling.ratios)) if len(coupling.ratios) >= _ENOUGH else others
+            # Where the colour is hidden, the area that it had stands for it.
+            explained[k] = usual * (candidates.lock.area_px if candidates.lock is not None else np.inf)
         limit = np.where(touching, explained[:, None], 0).sum(axis=0)
         shared = touching.any(axis=0) & (blob_area > _SHARED * limit)
-        for k, state in enumerate(self._states):
+        for k, coupling in enumerate(self._blobs):
             if match[k] >= 0 and not shared[match[k]] and touching[:, match[k]].sum() == 1 and np.isfinite(ratio[k]):
-                state.ratios.append(float(ratio[k]))
+                coupling.ratios.append(float(ratio[k]))
         return shared
-
-
-def _advance(state: _State, now_from_before: np.ndarray | None) -> None:
-    """Where everything is predicted to be in the next picture."""
-    for name in ("colour_px", "blob_px"):
-        place = getattr(state, name)
-        if np.isfinite(place).all():
-            moved = place if now_from_before is None else transfer(now_from_before, place)[0]
-            setattr(state, name, moved + state.velocity_px)
-
-
-def _remember(
-    state: _State, colour_px: np.ndarray, blob_px: np.ndarray | None, area_px: float, knobs: LandmarkKnobs
-) -> None:
-    """Take note of a frame. The state's places are those that were predicted for it."""
-    seen = np.isfinite(colour_px[0])
-    now, predicted = (colour_px, state.colour_px) if seen or blob_px is None else (blob_px, state.blob_px)
-    missed_by = now - predicted
-    if np.linalg.norm(missed_by) <= knobs.reach_px:
-        state.velocity_px = state.velocity_px + _GAIN * missed_by
-    elif seen:
-        state.velocity_px = np.zeros(2)
-    if blob_px is not None:
-        state.blob_px = blob_px
-        state.moved = state.moved or len(state.ratios) >= _ENOUGH
-    if seen:
-        state.colour_px, state.missed = colour_px, 0
-        state.areas.append(area_px)
-        return
-    state.missed += 1
-    if blob_px is not None:
-        # What hides the colour from the follower, such as a shadow, does not hide the vehicle.
-        state.colour_px = state.colour_px + missed_by
-    elif state.missed > knobs.interval_frames:
-        state.colour_px, state.blob_px = np.full(2, np.nan), np.full(2, np.nan)
-        state.velocity_px, state.coupled = np.zeros(2), False

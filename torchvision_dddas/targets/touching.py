@@ -4,6 +4,9 @@ import numpy as np
 
 from torchvision_dddas.targets.boxes import shared_px
 
+_NEAR_PX = 2.0
+"""Boxes that are no further apart than this are beside each other."""
+
 
 def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
     """(N, 2) of the blobs' mass where the foreground is given, else of their boxes."""
@@ -17,17 +20,26 @@ def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
     return centres
 
 
-def covering(box: np.ndarray | None, boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
-    """(N,) bool: the blobs that cover a good part of a patch, or are covered by it."""
+def covering(
+    box: np.ndarray | None, boxes: np.ndarray, area_px: np.ndarray, foreground: np.ndarray | None
+) -> np.ndarray:
+    """(N,) bool: the blobs, of areas (N,), that cover a good part of a patch's box, or are covered by it."""
     if box is None or not len(boxes):
         return np.zeros(len(boxes), bool)
     if foreground is not None:
         left, top, right, bottom = _pixels(box, foreground.shape)
         part = foreground[top:bottom, left:right]
         count = np.bincount(part.ravel(), minlength=len(boxes) + 1)[1 : len(boxes) + 1]
-        return count > 0.3 * part.size
-    common = shared_px(box[None], boxes)[0]
+        return count > np.minimum(0.3 * part.size, 0.5 * area_px)
+    common = shared_px(box, boxes)
     return common > 0.5 * np.minimum(box[2:].prod(), boxes[:, 2:].prod(axis=1))
+
+
+def beside(box: np.ndarray | None, boxes: np.ndarray) -> np.ndarray:
+    """(N,) bool: the blobs whose boxes overlap a patch's or nearly do."""
+    if box is None:
+        return np.zeros(len(boxes), bool)
+    return shared_px(box + _NEAR_PX * np.array([-1, -1, 2, 2]), boxes) > 0
 
 
 def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
