@@ -31,7 +31,7 @@ Lens = Annotated[Path | None, typer.Option("--camera", metavar="FILE", help="The
 Heights = Annotated[
     Path | None, typer.Option("--dem", metavar="FILE", help="Heights of the ground, a GeoTIFF. [default: it is level]")
 ]
-Ortho = Annotated[
+Background = Annotated[
     Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo under the map, a GeoTIFF.")
 ]
 
@@ -48,7 +48,7 @@ def aerial(
     clip: Annotated[
         str | None, typer.Option(metavar="CLIP", help="The clip itself: for its rate and the size of its pictures.")
     ] = None,
-    background: Ortho = None,
+    background: Background = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-positions"),
     config: Config = None,
     set_: Overrides = None,
@@ -163,7 +163,7 @@ def locator_for(
     """
     from dataclasses import replace
 
-    from torchvision_dddas.geolocating import Locator, camera_of, site_of, unpictured
+    from torchvision_dddas.geolocating import Locator, camera_of, site_of, unknown_below, unpictured
     from torchvision_dddas.sources.landmarks import read_landmarks
     from torchvision_dddas.sources.telemetry import check_overlap, read_telemetry
     from torchvision_dddas.vision import load_solver
@@ -187,6 +187,7 @@ def locator_for(
         from torchvision_dddas.sources.elevation import read_elevation
 
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
+        notes += unknown_below(site)
     camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings)
     locator = Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
     return locator, [*notes, *more]
@@ -209,14 +210,22 @@ def about(locator: "Locator") -> dict[str, Any]:
 
 
 def ground_facts(locator: "Locator", given: AerialInput) -> dict[str, Any]:
-    """What GroundedOutput.begin wants to know."""
-    site = locator.site
+    """What GroundedOutput.begin wants to know. Raises InputError for a background that cannot be read."""
+    from functools import partial
+
+    from torchvision_dddas.sources.elevation import read_ortho
+    from torchvision_dddas.targets import geodesy
+
+    site, background = locator.site, given.background
+    start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
     return {
         "names": site.landmarks.names,
         "origin_deg": site.origin_deg,
-        "start_utc_s": site.telemetry.start_utc_s if site.telemetry is not None else math.nan,
+        "start_utc_s": start_utc_s,
         "rate_hz": locator.rate_hz,
-        "background": given.background,
+        "background": None if background is None else read_ortho(background, site.places, site.origin_deg),
+        "camera": locator.camera,
+        "degrees": None if site.origin_deg is None else partial(geodesy.lonlat, origin_deg=site.origin_deg),
     }
 
 

@@ -8,10 +8,10 @@ import typer
 
 from torchvision_dddas.cli.aerial import (
     AerialInput,
+    Background,
     Flown,
     Heights,
     Lens,
-    Ortho,
     about,
     ground_facts,
     ground_lines,
@@ -46,7 +46,7 @@ def run(
     ] = None,
     camera: Lens = None,
     dem: Heights = None,
-    background: Ortho = None,
+    background: Background = None,
     interval: Annotated[int, typer.Option(metavar="D", help="Follow targets at every D-th frame: 1, 1+D, ...")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-run"),
     config: Config = None,
@@ -111,6 +111,9 @@ def run_into(
         source = open_source(clip, rate_hz=rate_hz)
         watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s) if telemetry is not None else None
+        if watch is not None:
+            settings, more = _sized(settings, watch.locator)
+            notes += more
         vision = load(backend, settings)
         facts: dict[str, Any] = {
             "input": clip,
@@ -157,6 +160,17 @@ def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: 
     if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
         notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
     return Watch(locator, colours, load_colours(backend) if colours is not None else None), notes
+
+
+def _sized(settings: "Settings", locator: "Locator") -> "tuple[Settings, list[str]]":
+    """With the camera's own focal length where targets' sizes are told from the altitude, unless another is set."""
+    from torchvision_dddas.settings import Settings, with_knobs
+
+    focal = locator.camera.focal_px[0]
+    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
+        return settings, []
+    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    return with_knobs(settings, {"gates.focal_px": focal}), [note]
 
 
 def surveyed_clip(

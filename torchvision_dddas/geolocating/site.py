@@ -9,6 +9,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.sources.landmarks import looks_swapped
 from torchvision_dddas.targets import geodesy
+from torchvision_dddas.targets.elevation import up
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 
@@ -72,6 +73,24 @@ def _above_ground(telemetry: Telemetry) -> None:
             f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
             "wanted metres above ground"
         )
+
+
+def unknown_below(site: Site) -> list[str]:
+    """What the user should know where the raster has no height below the vehicle or at landmarks."""
+    assert site.elevation is not None
+    notes = []
+    for places, what in (
+        (site.landmarks.place, "at {} of {} places of landmarks: they are not used there"),
+        (
+            np.zeros((0, 2)) if site.telemetry is None else site.telemetry.place,
+            "below the vehicle in {} of {} samples: its altitude is not used there",
+        ),
+    ):
+        known = places[np.isfinite(places).all(axis=1)]
+        missing = int(np.isnan(up(site.elevation, known)).sum())
+        if missing:
+            notes.append("the elevation has no height " + what.format(missing, len(known)))
+    return notes
 
 
 def camera_of(
