@@ -91,10 +91,9 @@ def _say(log: Log, times: np.ndarray, whole: list[LocalSet]) -> None:
     sensor = [column(18, 0, 360), column(19, -180, 180, True), np.where(np.isfinite(roll), roll, 0.0)]
     heading, pitch, rolled = angles(_turned(platform) @ _turned(sensor))
     longitude, latitude = column(14, -180, 180, True), column(13, -90, 90, True)
-    nowhere = (longitude == 0) & (latitude == 0)
     said = {
-        "longitude_deg": np.where(nowhere, np.nan, longitude),
-        "latitude_deg": np.where(nowhere, np.nan, latitude),
+        "longitude_deg": longitude,
+        "latitude_deg": latitude,
         "above_sea_m": above_sea,
         "altitude_m": np.where(np.isfinite(agl), agl, above_sea - ground),
         "speed_m_s": column(56, 0, 255),

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Flight, Telemetry
 
@@ -14,54 +16,47 @@ def at(telemetry: Telemetry, time_s: float, tolerance_s: float = 1.0) -> Flight 
     What either sample beside it does not say is NaN. Up to tolerance_s outside the span the nearest sample holds;
     beyond it nothing is known: None.
     """
-    times = telemetry.time_s
+    times, time_s = telemetry.time_s, float(time_s)
     count = len(times)
-    if count == 0 or not times[0] - tolerance_s <= time_s <= times[-1] + tolerance_s:
+    if count == 0 or not times.item(0) - tolerance_s <= time_s <= times.item(count - 1) + tolerance_s:
         return None
-    after = int(times.searchsorted(time_s))
-    if after in (0, count):  # outside the span, or on the first sample
-        before = after = min(after, count - 1)
-        share = 0.0
-    else:
+    after = min(int(times.searchsorted(time_s)), count - 1)
+    end_s = times.item(after)
+    before, share = after, 0.0
+    if after > 0 and time_s < end_s:  # else outside the span, or on a sample, which then counts alone
         before = after - 1
-        # The sample that was asked for counts alone, whatever stands before it.
-        share = float((time_s - times[before]) / (times[after] - times[before]))
-        before = after if share == 1.0 else before
+        share = (time_s - times.item(before)) / (end_s - times.item(before))
 
-    def between(column: str) -> float:
-        values = getattr(telemetry, column)
-        low = float(values[before])
-        return low + share * (float(values[after]) - low) if before != after else low
+    def between(values: np.ndarray, full: float = math.inf) -> float:
+        low = values.item(before)
+        return low + share * _way(low, values.item(after), full)
 
-    def turned(column: str, full: float = _TURN) -> float:
-        values = getattr(telemetry, column)
-        return _turned(float(values[before]), float(values[after]), share, full)
-
-    place = telemetry.place
-    east, north = (float(place[before, 0]), float(place[after, 0])), (float(place[before, 1]), float(place[after, 1]))
-    if telemetry.geographic:
-        first = _turned(*east, share, 360.0)
-        first = first if -180 <= first <= 180 else (first + 180) % 360 - 180
-    else:
-        first = east[0] + share * (east[1] - east[0])
-    roll = turned("roll_rad")
+    first, second = telemetry.place[before].tolist(), telemetry.place[after].tolist()
+    around = 360.0 if telemetry.geographic else math.inf
+    east = first[0] + share * _way(first[0], second[0], around)
+    roll = between(telemetry.roll_rad, _TURN)
     return Flight(
-        between("altitude_m"),
-        between("speed_m_s"),
-        (first, north[0] + share * (north[1] - north[0])),
-        between("above_sea_m"),
-        turned("heading_rad") % _TURN,
-        between("pitch_rad"),
-        roll if -math.pi <= roll <= math.pi else (roll + math.pi) % _TURN - math.pi,
-        between("hfov_rad"),
-        turned("vehicle_heading_rad") % _TURN,
+        between(telemetry.altitude_m),
+        between(telemetry.speed_m_s),
+        (_wrapped(east, around), first[1] + share * (second[1] - first[1])),
+        between(telemetry.above_sea_m),
+        between(telemetry.heading_rad, _TURN) % _TURN,
+        between(telemetry.pitch_rad),
+        _wrapped(roll, _TURN),
+        between(telemetry.hfov_rad),
+        between(telemetry.vehicle_heading_rad, _TURN) % _TURN,
     )
 
 
-def _turned(low: float, high: float, share: float, full: float) -> float:
-    """Part of the way from one angle to another, the short way round."""
-    way = (high - low + full / 2) % full - full / 2
-    return low + share * way
+def _way(low: float, high: float, full: float) -> float:
+    """From one value to another; on a circle the short way round."""
+    way = high - low
+    return way if abs(way) <= full / 2 or full == math.inf else (way + full / 2) % full - full / 2
+
+
+def _wrapped(value: float, full: float) -> float:
+    """A value on a circle, from minus half of it to half."""
+    return value if abs(value) <= full / 2 or full == math.inf else (value + full / 2) % full - full / 2
 
 
 def check_overlap(telemetry: Telemetry, last_s: float) -> None:

@@ -3,6 +3,7 @@
 import math
 import re
 from datetime import UTC, datetime, timedelta
+from functools import cache
 
 _KEYS = {
     "latitude_deg": "latitude lat gpslatitude gpslat",
@@ -35,15 +36,21 @@ _DATE = re.compile(
 _HALF_WIDTH_MM = 18.0
 
 
+@cache
+def quantity_of(key: str) -> str | None:
+    """What a key tells, however it is written; None for one that tells nothing of the flight."""
+    return QUANTITY.get(re.sub(r"[\s_-]", "", key.lower()))
+
+
 def understood(key: str, value: float, unit: str = "") -> tuple[str, float] | None:
-    """The quantity and its value in the record's units and signs; None for a key that says nothing of the flight."""
-    plain = re.sub(r"[\s_-]", "", key.lower())
-    quantity = QUANTITY.get(plain)
+    """The quantity and its value in the record's units and signs; None for a key that tells none."""
+    quantity = quantity_of(key)
     if quantity is None:
         return None
-    value *= _UNITS.get(unit.lower(), 1.0)
+    unit = unit.lower()
+    value *= _UNITS.get(unit, 1.0)
     if quantity.endswith("_rad"):
-        value = value if unit.lower() in _RADIANS else math.radians(value)
+        value = value if unit in _RADIANS else math.radians(value)
         # A gimbal's pitch is counted up from the horizon, the record's down.
         value = 0.0 - value if quantity == "pitch_rad" else value
     return quantity, value

@@ -14,6 +14,10 @@ from torchvision_dddas.sources.telemetry.transport import spacing
 from torchvision_dddas.sources.telemetry.ulog import MAGIC, read_ulog
 from torchvision_dddas.types import Telemetry
 
+_OTHERS = {
+    b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
+    b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
+}
 _SENTENCE = re.compile(r"\$[A-Z]{2}[A-Z]{3},")
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
@@ -52,6 +56,9 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_subtitles(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)
     if text is not None and "," in text:
         return read_table(path, clock_offset_s, clip)
+    for mark, words in _OTHERS.items():
+        if mark in head[:12]:
+            raise InputError(f"telemetry {path} {words}")
     raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
 
 

@@ -25,12 +25,17 @@ QUANTITIES = (
 )
 """What a log may say; all but the place are columns of the record."""
 
+OWN = "table"
+"""The kind of our own tables, which may leave out what they like."""
+
 # A barometer's zero drifts by metres in a flight; below this the altitude is none above ground.
 _DEEP_M = -5.0
-# Clocks of messages jitter by less than this; more is another recording, or a damaged file.
-_JITTER_S = 1.0
+# What lies beyond these is damage, not flight.
+_SANE = {"altitude_m": (-1e4, 1e5), "above_sea_m": (-1e4, 1e5), "speed_m_s": (0.0, 1e3), "hfov_rad": (1e-3, np.pi)}
 # No sample for so many times the usual while, and for so long at least, is a gap: nothing is known within it.
 _GAP_SHARE, _GAP_S = 10.0, 5.0
+# With these alone nothing can be done.
+_NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad"}
 _TURNING = ("heading_rad", "roll_rad", "vehicle_heading_rad")
 _FULL = {"longitude_deg": 360.0} | dict.fromkeys(_TURNING, 2 * np.pi)
 
@@ -40,21 +45,28 @@ class Log:
     """What was read so far. path: of the file. kind: in words, for messages. where: what samples are counted in.
 
     bridge_s: how long a column may be silent beside others and still be taken to go on; 0 where silence means unknown.
+    jitter_s: how far time may run back; more is another recording, or damage.
     said: time, value and place in the file of what was said of each quantity. moments: time and place of the rows of
-    a log that says everything at once, whether or not there was anything to say.
+    a log that says everything at once, whether or not there was anything to say. columns: (N, 3), as in said.
     """
 
     path: Path
     kind: str
     where: str = "line"
     bridge_s: float = 0.0
+    jitter_s: float = 1.0
     notes: list[str] = field(default_factory=list)
     said: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
     moments: list[tuple[float, int]] = field(default_factory=list)
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
 
     def say(self, quantity: str, time_s: float, value: float, where: int) -> None:
         """One value at a time; NaN says that it is unknown from here on. where: the line, or what `where` names."""
         self.said.setdefault(quantity, []).append((time_s, value, where))
+
+    def say_all(self, quantity: str, times: np.ndarray, values: np.ndarray, where: np.ndarray) -> None:
+        """Many at once."""
+        self.columns[quantity] = np.stack([times, values, where], axis=1).astype(float)
 
     def note(self, text: str) -> None:
         """What the user should know, once."""
@@ -74,16 +86,22 @@ def assembled(log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float(
     Raises InputError where neither altitude, place nor attitude is known, where a place is off the globe, and where
     time runs back.
     """
-    said = {name: np.array(rows, float).reshape(-1, 3) for name, rows in log.said.items() if rows}
-    said = {name: _in_order(log, rows) for name, rows in said.items()}
+    rows_of = {name: np.array(rows, float).reshape(-1, 3) for name, rows in log.said.items()} | log.columns
+    said = {name: _in_order(log, rows) for name, rows in rows_of.items()}
     moments = _in_order(log, np.insert(np.array(log.moments, float).reshape(-1, 2), 1, 0.0, axis=1))
-    _places_on_the_globe(log, said)
+    _sane(log, said)
+    _on_the_globe(log, said)
     said = {name: rows for name, rows in said.items() if np.isfinite(rows[:, 1]).any()}
-    if not set(said) - {"speed_m_s", "hfov_rad"}:
-        raise log.refuse(f"this {log.kind} says neither place nor altitude nor attitude anywhere; nothing can be used")
-    _below_ground(log, said)
+    if not set(said) - _NOT_ALONE:
+        raise log.refuse(f"this {log.kind} says neither place nor altitude nor how a camera looks; it is of no use")
+    _note_lacks(log, said)
+    _note_silence(log, said)
     times = _with_gaps(log, np.unique(np.concatenate([moments[:, 0], *(rows[:, 0] for rows in said.values())])))
     columns = {name: _column(times, rows, log.bridge_s, _FULL.get(name)) for name, rows in said.items()}
+    for name in _TURNING:
+        if name in columns:
+            around = np.pi if name == "roll_rad" else 0.0
+            columns[name] = (columns[name] + around) % (2 * np.pi) - around
     unknown = np.full(len(times), np.nan)
     geographic = "longitude_deg" in said or "east_m" not in said
     pair = ("longitude_deg", "latitude_deg") if geographic else ("east_m", "north_m")
@@ -91,7 +109,8 @@ def assembled(log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float(
     place[~np.isfinite(place).all(axis=1)] = np.nan
     if "speed_m_s" not in columns and np.isfinite(place).all(axis=1).sum() > 2:
         columns["speed_m_s"], span_s = speed_from_places(times, place, geographic)
-        log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
+        if np.isfinite(columns["speed_m_s"]).any():
+            log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
     return Telemetry(
         times + clock_offset_s,
         columns.get("altitude_m", unknown),
@@ -106,19 +125,50 @@ def assembled(log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float(
 
 
 def _in_order(log: Log, rows: np.ndarray) -> np.ndarray:
-    """Sorted by time; of samples at the same time the last."""
+    """Sorted by time; of samples at the same time the last. A single time that no other goes with is left out."""
+    rows = rows[np.isfinite(rows[:, 0])]
+    rows = rows[~_stray(rows[:, 0], log.jitter_s)]
     back = np.diff(rows[:, 0])
-    if len(back) and back.min() < -_JITTER_S:
-        i = int(np.argmax(back < -_JITTER_S))
+    if len(back) and back.min() < -log.jitter_s:
+        i = int(np.argmax(back < -log.jitter_s))
         raise log.refuse(
-            f"time runs back from {rows[i, 0]:.3f} to {rows[i + 1, 0]:.3f} s; is this two recordings in one file?",
+            f"time runs back from {rows[i, 0]:.3f} to {rows[i + 1, 0]:.3f} s; are these two recordings in one file?",
             int(rows[i + 1, 2]),
         )
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     return rows[np.append(np.diff(rows[:, 0]) > 0, True)] if len(rows) else rows
 
 
-def _places_on_the_globe(log: Log, said: dict[str, np.ndarray]) -> None:
+def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
+    """Which times are out of order though those around them are not: a damaged one, not another recording."""
+    stray = np.zeros(len(times), bool)
+    if len(times) < 3 or not np.isfinite(jitter_s):
+        return stray
+    before, after = times[:-2], times[2:]
+    around = (before <= after) & ((times[1:-1] < before - jitter_s) | (times[1:-1] > after + jitter_s))
+    stray[1:-1] = around
+    stray[0] = times[0] > times[1] + jitter_s and times[1] <= times[2]
+    stray[-1] = times[-1] < times[-2] - jitter_s and times[-3] <= times[-2]
+    # A day without a sample, then one: its time is damaged.
+    stray[-1] |= times[-1] > times[-2] + 86_400
+    return stray
+
+
+def _sane(log: Log, said: dict[str, np.ndarray]) -> None:
+    """What cannot be is unknown."""
+    for name, (least, most) in _SANE.items():
+        if name in said:
+            rows = said[name]
+            with np.errstate(invalid="ignore"):
+                wrong = ~((rows[:, 1] >= least) & (rows[:, 1] <= most)) & ~np.isnan(rows[:, 1])
+            if wrong.any():
+                _, value, where = rows[np.argmax(wrong)]
+                log.note(f"{log.where} {int(where)}: {name} is {value:g}, which cannot be; {wrong.sum()} left out")
+                rows[wrong, 1] = np.nan
+
+
+def _on_the_globe(log: Log, said: dict[str, np.ndarray]) -> None:
+    """Raises InputError for degrees that are none; longitude and latitude 0 stand for no fix."""
     for name, most in (("latitude_deg", 90.0), ("longitude_deg", 180.0)):
         if name not in said:
             continue
@@ -127,17 +177,27 @@ def _places_on_the_globe(log: Log, said: dict[str, np.ndarray]) -> None:
             _, value, where = said[name][np.argmax(wrong)]
             hint = "; are longitude and latitude swapped?" if name == "latitude_deg" and abs(value) <= 180 else ""
             raise log.refuse(f"{name} is {value:g}; wanted -{most:g} to {most:g}{hint}", int(where))
+    if {"longitude_deg", "latitude_deg"} <= set(said):
+        longitude, latitude = said["longitude_deg"], said["latitude_deg"]
+        if len(longitude) == len(latitude):
+            nowhere = (longitude[:, 1] == 0) & (latitude[:, 1] == 0)
+            longitude[nowhere, 1] = latitude[nowhere, 1] = np.nan
+            if nowhere.any():
+                log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
 
 
-def _below_ground(log: Log, said: dict[str, np.ndarray]) -> None:
+def _note_lacks(log: Log, said: dict[str, np.ndarray]) -> None:
+    if not {"latitude_deg", "east_m"} & set(said) and log.kind != OWN:
+        log.note("no place is told anywhere")
     if "altitude_m" not in said:
+        log.note("no altitude above ground is told anywhere")
         return
     deep = said["altitude_m"][:, 1] < _DEEP_M
     if deep.any():
         _, value, where = said["altitude_m"][np.argmax(deep)]
         log.note(
             f"{log.where} {int(where)}: the altitude above ground is {value:g} m, below the ground; "
-            f"{int(deep.sum())} of {len(deep)} are; is it counted from another place?"
+            f"{deep.sum()} of {len(deep)} are below {_DEEP_M:g} m; is it counted from another place?"
         )
 
 
@@ -157,6 +217,25 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
     return np.sort(np.concatenate([times, (times[gaps] + times[gaps + 1]) / 2]))
 
 
+def _most_s(known: np.ndarray, bridge_s: float) -> float:
+    """How long a quantity may be silent and still be taken to go on evenly."""
+    return max(1.5 * float(np.median(np.diff(known))), bridge_s) if len(known) > 1 else bridge_s
+
+
+def _note_silence(log: Log, said: dict[str, np.ndarray]) -> None:
+    """Where the place is unknown for a while between its samples."""
+    for name in ("latitude_deg", "east_m"):
+        known = said[name][np.isfinite(said[name][:, 1]), 0] if name in said else np.zeros(0)
+        steps = np.diff(known)
+        gaps = np.flatnonzero(steps > _most_s(said[name][:, 0], log.bridge_s)) if len(steps) else steps
+        if len(gaps):
+            longest = gaps[np.argmax(steps[gaps])]
+            log.note(
+                f"the place is unknown for a while {len(gaps)} time{'s' * (len(gaps) > 1)}, the longest for "
+                f"{steps[longest]:.1f} s after {known[longest]:.1f} s"
+            )
+
+
 def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | None) -> np.ndarray:
     """What was said of one quantity, at all times: linear between two samples that are near each other, else unknown.
 
@@ -168,7 +247,7 @@ def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | 
     steps = np.diff(known)
     if len(steps) == 0:
         return np.where(times == known[0], values[0], np.nan)
-    most = max(1.5 * float(np.median(steps)), bridge_s)
+    most = _most_s(known, bridge_s)
     after = np.searchsorted(known, times).clip(1, len(known) - 1)
     before = after - 1
     share = (times - known[before]) / steps[before]

@@ -4,11 +4,12 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.sources.telemetry.names import dated, hfov_of_focal, understood
+from torchvision_dddas.sources.telemetry.names import dated, hfov_of_focal, quantity_of, understood
 from torchvision_dddas.sources.telemetry.record import Log, assembled
 from torchvision_dddas.types import Telemetry
 
@@ -21,6 +22,7 @@ _PAIR = re.compile(
     re.IGNORECASE,
 )
 _LETTERED = re.compile(rf"([NSEWnsew])\s*:?\s*({_NUMBER})|({_NUMBER})\s*°?\s*([NSEWnsew])\b")
+_OPTICS = ("focal_len", "fnum", "dzoom_ratio")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 
 
@@ -32,15 +34,16 @@ class Subtitle:
     time_s: float = math.nan
     lines: list[str] = field(default_factory=list)
 
-    @property
+    @cached_property
     def text(self) -> str:
         """All of it, without markup."""
-        return _MARKUP.sub(" ", "\n".join(self.lines))
+        text = "\n".join(self.lines)
+        return _MARKUP.sub(" ", text) if "<" in text else text
 
 
 def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     """Raises InputError where no subtitle says a place, a height or an attitude, or times run back."""
-    log = Log(path, "DJI subtitles")
+    log = Log(path, "DJI subtitles", bridge_s=2.0)
     subtitles = list(_subtitles(text))
     parts = [_tuples(subtitle.text) for subtitle in subtitles]
     swapped = _latitude_first(log, [t["gps"] for t in parts if "gps" in t], [t["home"] for t in parts if "home" in t])
@@ -59,8 +62,9 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
             log.say(quantity, time_s, value, subtitle.line)
         for name in said_so_far - set(said):
             lacking.setdefault(name, []).append(subtitle.line)
+            log.say(name, time_s, math.nan, subtitle.line)
         said_so_far |= set(said)
-    _note_lacking(log, lacking, len(subtitles))
+    _note_lacking(log, lacking, subtitles)
     zoned = next((date for date in dates if date), (math.nan, False))
     if not zoned[1] and math.isfinite(zoned[0]):
         log.note("the dates are in an unknown zone of time, so the clock is not known")
@@ -75,7 +79,7 @@ def _subtitles(text: str) -> Iterator[Subtitle]:
     now: Subtitle | None = None
     for number, line in enumerate(lines, 1):
         bare = line.strip()
-        timing = _TIMING.match(bare)
+        timing = _TIMING.match(bare) if ">" in bare else None
         if timing:
             if now is not None:
                 yield now
@@ -96,7 +100,9 @@ def _subtitles(text: str) -> Iterator[Subtitle]:
 
 def _tuples(text: str) -> dict[str, list[tuple[float, str]]]:
     """What stands in brackets behind a name: numbers, each with the letters beside it."""
-    found = {}
+    found: dict[str, list[tuple[float, str]]] = {}
+    if "(" not in text:
+        return found
     for name, inside in _TUPLE.findall(text):
         cells = re.split(r"[;,]\s+|;", inside) if re.search(r"[;,]\s|;", inside) else inside.split(",")
         if "." not in inside and len(cells) >= 4 and "," in inside and len(cells) == inside.count(",") + 1:
@@ -106,7 +112,7 @@ def _tuples(text: str) -> dict[str, list[tuple[float, str]]]:
             match = re.search(_NUMBER, cell)
             value = float(match[0].replace(",", ".")) if match else math.nan
             numbers.append((value, re.sub(rf"{_NUMBER}|[\s:°]", "", cell, count=0).upper()))
-        found[name.lower()] = numbers
+        found["gps" if name.lower() == "rtk" else name.lower()] = numbers
     return found
 
 
@@ -138,19 +144,25 @@ def _said(log: Log, text: str, tuples: dict[str, list[tuple[float, str]]], swapp
         for key, (value, _) in zip(keys, tuples.get(name, ()), strict=False):
             if found := understood(key, value):
                 said[found[0]] = found[1]
-    bare = _TUPLE.sub(" ", text)
     plain: dict[str, str] = {}
-    for key, number, unit in _PAIR.findall(bare):
-        plain.setdefault(key.lower(), number)
+    for key, number, unit in _PAIR.findall(_TUPLE.sub(" ", text) if tuples else text):
+        if key in _OPTICS:
+            plain[key] = number
+        if quantity_of(key) is None:
+            continue
+        if key.lower() == "h" and not unit:  # a letter may be anything; with metres it is the height
+            continue
         if (found := understood(key, float(number.replace(",", ".")), unit)) and found[0] not in said:
             said[found[0]] = found[1]
+            if key.lower() in ("altitude", "alt"):
+                log.note("from where the altitude is counted is not told; it is taken as above the sea")
     if "focal_len" in plain:
         other = [float(plain[k].replace(",", ".")) if k in plain else math.nan for k in ("fnum", "dzoom_ratio")]
         if (hfov := hfov_of_focal(plain["focal_len"], *other)) is not None:
             said["hfov_rad"] = hfov
             log.note("the field of view is that of a focal length for a picture 36 mm wide")
-    if said.get("longitude_deg") == said.get("latitude_deg") == 0.0:
-        said["longitude_deg"] = said["latitude_deg"] = math.nan
+    if said.get("longitude_deg") == said.get("latitude_deg") == said.get("above_sea_m") == 0.0:
+        said["above_sea_m"] = math.nan  # no fix
     return said
 
 
@@ -169,14 +181,19 @@ def _place(gps: list[tuple[float, str]], swapped: bool) -> dict[str, float]:
     return said
 
 
-def _note_lacking(log: Log, lacking: dict[str, list[int]], count: int) -> None:
-    """What some subtitles do not say though others do."""
-    by_lines: dict[tuple[int, ...], list[str]] = {}
+def _note_lacking(log: Log, lacking: dict[str, list[int]], subtitles: list[Subtitle]) -> None:
+    """What some subtitles do not say though others before them do."""
+    together: dict[tuple[int, ...], list[str]] = {}
     for name, lines in lacking.items():
-        by_lines.setdefault(tuple(lines), []).append(name)
-    for at_lines, names in by_lines.items():
-        where = f"line {at_lines[0]}"
-        if len(at_lines) > 1:
-            where = f"{len(at_lines)} of {count} subtitles, the first in line {at_lines[0]}"
-        words = sorted({name.rsplit("_", 1)[0] if name != "speed_m_s" else "speed" for name in names})
-        log.note(f"{where}: {', '.join(words)} missing; unknown there")
+        together.setdefault(tuple(lines), []).append(name)
+    for at_lines, names in together.items():
+        what = ", ".join(sorted(names))
+        if at_lines == (subtitles[-1].line,):
+            log.note(f"line {at_lines[0]}: the last subtitle lacks {what}: the file is incomplete; unknown there")
+        elif len(at_lines) == 1:
+            log.note(f"line {at_lines[0]}: the subtitle lacks {what}; unknown there")
+        else:
+            log.note(
+                f"line {at_lines[0]}: the subtitle lacks {what}, as do {len(at_lines) - 1} more of {len(subtitles)}; "
+                "unknown there"
+            )

@@ -5,10 +5,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.csv_text import Line, opened
 from torchvision_dddas.sources.telemetry.names import QUANTITY, dated, hfov_of_focal, understood
-from torchvision_dddas.sources.telemetry.record import Log, assembled
+from torchvision_dddas.sources.telemetry.record import OWN, Log, assembled
 from torchvision_dddas.types import Telemetry
 
 COLUMNS = ("time_s", "altitude_m", "speed_m_s")
@@ -45,7 +47,7 @@ def read_table(path: Path, clock_offset_s: float, clip: Path | None) -> Telemetr
     """
     with opened(path, "telemetry") as (header, lines):
         if "time_s" in header or not _understood(header):
-            return _own(Log(path, "table"), header, lines, clock_offset_s)
+            return _own(Log(path, OWN), header, lines, clock_offset_s)
         return _foreign(Log(path, "flight log table"), header, lines, clock_offset_s, clip)
 
 
@@ -58,24 +60,48 @@ def _own(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s: flo
             f"wanted {','.join(COLUMNS)}"
         )
     _check_pairs(log.path, columns)
-    last = -math.inf
-    for number, cells in lines:
-        row = {name: _number(log, cells, header.index(name), name, number) for name in columns}
-        time_s = row.pop("time_s")
-        if math.isnan(time_s):
-            raise log.refuse("time_s is ''; wanted a finite number", number)
-        if time_s < last:
-            raise log.refuse(f"time_s runs back from {last:g} to {time_s:g}; sort it by time", number)
-        last = time_s
-        log.moments.append((time_s, number))
-        for name, value in row.items():
-            if math.isfinite(value):
-                turned = name.endswith("_deg") and name not in PAIRS[0]
-                name, value = (name.replace("_deg", "_rad"), math.radians(value)) if turned else (name, value)
-                log.say(name, time_s, value, number)
-    if not log.moments:
+    rows = list(lines)
+    if not rows:
         raise InputError(f"telemetry {log.path} has a header but no rows")
+    number = np.array([line for line, _ in rows], float)
+    table = _numbers(log, rows, [header.index(name) for name in columns], columns)
+    time_s = table.pop("time_s")
+    back = np.diff(time_s)
+    if (back < 0).any():
+        i = int(np.argmax(back < 0))
+        raise log.refuse(f"time_s runs back from {time_s[i]:g} to {time_s[i + 1]:g}; sort it by time", rows[i + 1][0])
+    log.moments += zip(time_s.tolist(), number.tolist(), strict=True)
+    for name, values in table.items():
+        known = np.isfinite(values)
+        turned = name.endswith("_deg") and name not in PAIRS[0]
+        values = np.radians(values) if turned else values
+        quantity = name.replace("_deg", "_rad") if turned else name
+        log.say_all(quantity, time_s[known], values[known], number[known])
     return assembled(log, clock_offset_s)
+
+
+def _numbers(log: Log, rows: list[Line], places: list[int], names: list[str]) -> dict[str, np.ndarray]:
+    """(N,) a column, NaN where a cell is empty.
+
+    Raises InputError for the first line with a cell that is missing, no finite number or out of its range.
+    """
+    try:
+        cells = [[float(row[place] or "nan") for place in places] for _, row in rows]
+    except (ValueError, IndexError):
+        cells = [[]]
+    table = np.array(cells)
+    if table.shape == (len(rows), len(places)):
+        empty = np.array([[row[place] == "" for place in places] for _, row in rows])
+        good = np.isfinite(table) | (empty & (np.array(names) != "time_s"))
+        for i, name in enumerate(names):
+            least, most, _ = LIMITS.get(name, (-math.inf, math.inf, ""))
+            good[:, i] &= empty[:, i] | ((table[:, i] >= least) & (table[:, i] <= most))
+        if good.all():
+            return dict(zip(names, table.T, strict=True))
+    for number, row in rows:
+        for place, name in zip(places, names, strict=True):
+            _check(log, row, place, name, number)
+    raise AssertionError("a cell that could not be taken passed every check")
 
 
 def _check_pairs(path: Path, columns: list[str]) -> None:
@@ -87,10 +113,10 @@ def _check_pairs(path: Path, columns: list[str]) -> None:
         raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind, leave the other out")
 
 
-def _number(log: Log, row: list[str], place: int, name: str, line: int) -> float:
-    """A cell; NaN where it is empty. A row that ends before it is cut off."""
-    if place < len(row) and row[place] == "":
-        return math.nan
+def _check(log: Log, row: list[str], place: int, name: str, line: int) -> None:
+    """Raises InputError for a cell that is no number; an empty one is unknown, but a row that ends early is cut off."""
+    if place < len(row) and row[place] == "" and name != "time_s":
+        return
     text = row[place] if place < len(row) else ""
     try:
         value = float(text)
@@ -101,13 +127,12 @@ def _number(log: Log, row: list[str], place: int, name: str, line: int) -> float
     least, most, words = LIMITS.get(name, (-math.inf, math.inf, ""))
     if not least <= value <= most:
         raise log.refuse(f"{name} is '{text}'; wanted {words}", line)
-    return value
 
 
 # -- other programs' ---------------------------------------------------------------------------------------------------
 
 _TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds"}
-_PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6, "": 1.0}
+_PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
 
 def _understood(header: list[str]) -> bool:
@@ -125,27 +150,30 @@ def _plain(name: str) -> tuple[str, str]:
 def _foreign(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s: float, clip: Path | None) -> Telemetry:
     names = [_plain(name) for name in header]
     timed = next((i for i, (name, _) in enumerate(names) if name in _TIMES), None)
-    focal, fnum, zoom = (_index(names, key) for key in ("focallen", "fnum", "dzoomratio"))
+    focal, fnum, zoom, frame = (_index(names, key) for key in ("focallen", "fnum", "dzoomratio", "frame"))
     if timed is None and clip is None:
         raise InputError(f"telemetry {log.path} counts frames and says no times; give its clip, or a column time_s")
     rate_hz = _rate(clip) if timed is None and clip is not None else math.nan
-    first, epoch = math.nan, False
+    telling = _telling(names)
+    first = begin = math.nan
+    zoned = False
     for number, cells in lines:
         cells = cells + [""] * (len(header) - len(cells))
-        if timed is None:
-            moment = _float(cells[_index(names, "frame") or 0]) / rate_hz
+        if timed is not None:
+            moment, told = _moment(cells[timed], names[timed][1])
+            zoned = zoned or told
         else:
-            date = dated(cells[timed])
-            moment = date[0] if date else _float(cells[timed]) / _PER_SECOND.get(names[timed][1], 1.0)
-            epoch = epoch or bool(date and (date[1] or names[timed][1] == "utc"))
+            count = _float(cells[frame or 0])
+            begin = min(count, 1.0) if math.isnan(begin) else begin  # frames are counted from 0 or from 1
+            moment = (count - begin) / rate_hz
         if not math.isfinite(moment):
-            text = cells[timed] if timed is not None else "frame"
+            text = cells[timed] if timed is not None else cells[frame or 0]
             raise log.refuse(f"'{text}' is no time; wanted a date with a time, or seconds", number)
-        first = moment if math.isnan(first) else first
+        first = (moment if timed is not None else 0.0) if math.isnan(first) else first
         log.moments.append((moment - first, number))
-        for (name, unit), cell in zip(names, cells, strict=False):
-            value = _float(cell)
-            if math.isfinite(value) and (said := understood(name, value, unit)):
+        for i in telling:
+            value = _float(cells[i])
+            if math.isfinite(value) and (said := understood(*names[i][:1], value, names[i][1])):
                 log.say(said[0], moment - first, said[1], number)
         if focal is not None and math.isfinite(_float(cells[focal])):
             numbers = [_float(cells[i]) if i is not None else math.nan for i in (fnum, zoom)]
@@ -154,7 +182,31 @@ def _foreign(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s:
                 log.note("the field of view is that of a focal length for a picture 36 mm wide")
     if not log.moments:
         raise InputError(f"telemetry {log.path} has a header but no rows")
-    return assembled(log, clock_offset_s, first if epoch else math.nan)
+    return assembled(log, clock_offset_s, first if zoned else math.nan)
+
+
+def _telling(names: list[tuple[str, str]]) -> list[int]:
+    """Which columns tell something: for each quantity the one whose name is the plainest."""
+    best: dict[str, tuple[int, int]] = {}
+    for i, (name, _) in enumerate(names):
+        if name in QUANTITY:
+            rank = (list(QUANTITY).index(name), i)
+            best[QUANTITY[name]] = min(best.get(QUANTITY[name], rank), rank)
+    return sorted(i for _, i in best.values())
+
+
+def _moment(text: str, unit: str) -> tuple[float, bool]:
+    """Seconds of a date, a time of day or a number, and whether they are since 1970 in UTC."""
+    if date := dated(text):
+        return date[0], date[1] or unit == "utc"
+    if clock := re.fullmatch(r"(\d+):(\d+):(\d+(?:\.\d+)?)", text):
+        return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]), False
+    value = _float(text)
+    since_1970 = value > 1e9
+    if unit in _PER_SECOND:
+        return value / _PER_SECOND[unit], since_1970 and value / _PER_SECOND[unit] > 1e9
+    # Without a unit the size tells: of times since 1970, 10 digits are seconds, 13 milli- and 16 microseconds.
+    return value / (1e6 if value > 1e14 else 1e3 if value > 1e11 else 1.0), since_1970
 
 
 def _index(names: list[tuple[str, str]], key: str) -> int | None:

@@ -69,7 +69,7 @@ def _topics(log: Log) -> dict[str, Topic]:
         log.note("the log is damaged: what could not be read is left out")
     if read.dropouts:
         lost_s = sum(part.duration for part in read.dropouts) / 1000
-        log.note(f"the logger fell behind {len(read.dropouts)} times and lost {lost_s:.1f} s in all")
+        log.note(f"the logger fell behind {len(read.dropouts)} times and lost {lost_s:.3g} s in all")
     topics: dict[str, Topic] = {}
     for topic in read.data_list:
         if topic.name not in topics and len(topic.data.get("timestamp", ())):
@@ -133,7 +133,7 @@ def _say_place(log: Log, topics: dict[str, Topic], local: Topic | None) -> None:
         known = _column(gps, "fix_type") >= 2
     else:
         return
-    known &= (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & ((latitude != 0) | (longitude != 0))
+    known &= (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
     for name, values in (("longitude_deg", longitude), ("latitude_deg", latitude), ("above_sea_m", height)):
         _say(log, name, times, np.where(known, values, np.nan))
 
