@@ -65,14 +65,17 @@ class Candidates:
 
     def advance(self, now_from_before: np.ndarray | None) -> None:
         """Go on to the next picture."""
+        if now_from_before is not None and self._all:
+            places = np.array([(one.centre_px, one.origin_px) for one in self._all])
+            places = transfer(now_from_before, places.reshape(-1, 2)).reshape(places.shape)
+            for one, (centre, origin) in zip(self._all, places, strict=True):
+                one.centre_px, one.origin_px = centre, origin
         for one in self._all:
-            if now_from_before is not None:
-                one.centre_px, one.origin_px = transfer(now_from_before, np.stack([one.centre_px, one.origin_px]))
             one.centre_px = one.centre_px + one.velocity_px
 
     def see(self, found: Patches, moving: np.ndarray) -> None:
         """Take in the patches of a frame; moving: (P,) bool, whether something moves at each."""
-        largest = np.argsort(-found.area_px * (found.area_px / found.box_px[:, 2:].prod(axis=1)) ** 2)[:_MOST]
+        largest = self._foremost(found)
         taken = self._continue(found, largest)
         for one in self._all:
             one.row = taken.get(id(one), -1)
@@ -96,6 +99,15 @@ class Candidates:
         self._all = [one for one in self._all if one.missed <= min(self._knobs.interval_frames, one.seen)] + new
         if self.lock is not None and not any(one is self.lock for one in self._all):
             self.lock, self.sure = None, False
+
+    def _foremost(self, found: Patches) -> np.ndarray:
+        """The rows of the patches worth following, however many shadows there are."""
+        area, near = found.area_px, np.zeros(len(found), bool)
+        if self.lock is not None:
+            area = np.minimum(area, _LARGE * self.lock.area_px)
+            near = np.linalg.norm(found.centre_px - self.lock.centre_px, axis=1) <= self._knobs.reach_px
+        fill = found.area_px / found.box_px[:, 2:].prod(axis=1)
+        return np.lexsort((-area * np.minimum(fill / _FILL, 1.0) ** 4, ~near))[:_MOST]
 
     def _continue(self, found: Patches, rows: np.ndarray) -> dict[int, int]:
         """Which patch goes on with which candidate, by the candidate's id."""

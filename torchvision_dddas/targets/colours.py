@@ -33,11 +33,10 @@ def patches_of(mask: np.ndarray, least_area_px: int) -> Patches:
     for left, top, wide, high in occupied(mask, 2 * _CLOSE_PX):
         part = cv2.morphologyEx(mask[top : top + high, left : left + wide], cv2.MORPH_CLOSE, ellipse(_CLOSE_PX))
         count, _, stats, middles = cv2.connectedComponentsWithStats(part, ltype=cv2.CV_32S)
-        for (x, y, width, height, area), middle in zip(stats[1:count].tolist(), middles[1:count], strict=True):
-            if area >= least_area_px:
-                centres.append((left + middle[0], top + middle[1]))
-                areas.append(float(area))
-                boxes.append((left + x, top + y, width, height))
-    return Patches(
-        np.array(centres, float).reshape(-1, 2), np.array(areas, float), np.array(boxes, float).reshape(-1, 4)
-    )
+        large = 1 + np.flatnonzero(stats[1:count, cv2.CC_STAT_AREA] >= least_area_px)
+        centres.append(middles[large] + (left, top))
+        areas.append(stats[large, cv2.CC_STAT_AREA])
+        boxes.append(stats[large, :4] + (left, top, 0, 0))
+    if not areas:
+        return Patches(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)))
+    return Patches(np.concatenate(centres), np.concatenate(areas).astype(float), np.concatenate(boxes).astype(float))
