@@ -536,6 +536,9 @@ class AerialKnobs(Group):
         1.43, "m", 0, 1000, meaning="standard deviation of the vehicle's place, east and north each: 3.5 m in 95 %"
     )
     target_sigma_px: float = knob(1.0, "px", 0, 100, meaning="standard deviation of a target's place in the picture")
+    own_sigma: float = knob(
+        0.13, "sides", 0, 2, meaning="the same of boxes that dddas found moving, beside it, in sides of the box"
+    )
     point: Literal["auto", "centre", "foot"] = knob(
         "auto",
         "-",
