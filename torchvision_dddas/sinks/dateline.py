@@ -46,13 +46,13 @@ def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
     if not reach <= to_pole_m / 10:
         return []
     degrees = (longitude, latitude) + ring_m * degrees_per_metre(latitude)
-    rings = []
-    for west in (-540.0, -180.0, 180.0):
-        inside = _clip(_clip(degrees, west, 1.0), west + 360, -1.0)
-        if len(inside) >= 3:
-            places = rounded(np.clip(inside - (west + 180, 0.0), (-180, -90), (180, 90)))
-            rings.append([*places, places[0]])
-    return rings
+    if np.abs(degrees[:, 0]).max() <= 180:
+        parts = [degrees]
+    else:
+        edges = (-540.0, -180.0, 180.0)
+        parts = [_clip(_clip(degrees, west, 1.0), west + 360, -1.0) - (west + 180, 0.0) for west in edges]
+    rings = [rounded(part) for part in parts if len(part) >= 3]
+    return [[*ring, ring[0]] for ring in rings]
 
 
 def degrees_per_metre(latitude_deg: float) -> np.ndarray:
