@@ -315,6 +315,32 @@ def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
     assert [a.frame for a in gates] == [1, 9]
 
 
+@pytest.mark.parametrize(("altitude_m", "speed_m_s"), [(np.nan, 5.0), (60.0, np.nan), (np.nan, np.nan)])
+def test_where_telemetry_lacks_altitude_or_speed_the_interval_follows_the_flow(altitude_m, speed_m_s, film):
+    settings = with_knobs(load("fast"), {"interval.minimum_frames": 3, "interval.maximum_frames": 9})
+    vision = load_vision("onboard", settings)
+    time_s = np.arange(16) / 10
+    silent = Telemetry(time_s, np.full(16, altitude_m), np.full(16, speed_m_s))
+    told = list(run(Film(film.images), vision, settings, silent))
+    alone = list(run(Film(film.images), vision, settings))
+    assert [s.interval_frames for s in told] == [s.interval_frames for s in alone]
+    causes = {a.cause for s in told for a in s.adjustments if a.knob == "interval.frames"}
+    assert all("background flow" in cause for cause in causes)
+    assert any(a.knob.startswith("gates.") for s in told for a in s.adjustments) == np.isfinite(altitude_m)
+
+
+def test_telemetry_that_falls_silent_in_flight_gives_the_steering_back_to_the_flow(film):
+    settings = with_knobs(load(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6})
+    altitude = np.where(np.arange(16) < 8, 100.0, np.nan)
+    told = list(
+        run(Film(film.images), load_vision("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
+    )
+    first = next(a for s in told for a in s.adjustments if a.knob == "interval.frames")
+    assert "altitude 100.0 m" in first.cause
+    after = [a.cause for s in told[8:] for a in s.adjustments]
+    assert after and not any("altitude" in cause or "nan" in cause for cause in after)
+
+
 def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left_out(noise):
     images = pan(noise, 12, car=5.0)
     base = {"gates.focal_px": 1000.0, "gates.min_size_m": 0.2, "gates.max_size_m": 25.0, "gates.max_speed_m_s": 60.0}

@@ -201,7 +201,8 @@ class Loop:
         """The feedback rule for the detection interval."""
         knobs = self.settings.interval
         flight = self._flight(slot)
-        altitude = flight.altitude_m if flight else None
+        # A log may tell one of them and not the other, or fall silent for a while.
+        altitude = flight.altitude_m if flight is not None and np.isfinite(flight.altitude_m) else None
         number = slot.frame.number
         self.regime, slot.adjustments = control.steered(number, self.regime, altitude, self.rate_hz, self.settings)
         slot.regime = self.regime
@@ -209,9 +210,9 @@ class Loop:
             self.flows.append(slot.step.flow_px)
         if knobs.rule:
             wanted, why = None, ""
-            if flight is not None:
-                wanted = control.interval_from_telemetry(flight.altitude_m, flight.speed_m_s, self.rate_hz, knobs)
-                why = f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+            if flight is not None and altitude is not None and np.isfinite(flight.speed_m_s):
+                wanted = control.interval_from_telemetry(altitude, flight.speed_m_s, self.rate_hz, knobs)
+                why = f"altitude {altitude:.1f} m, speed {flight.speed_m_s:.1f} m/s"
             if wanted is None and self.flows:
                 wanted = control.interval_from_flow(self.flows, slot.view.size[0], knobs)
                 why = f"background flow {np.median(self.flows):.2f} px a frame"
@@ -221,7 +222,7 @@ class Loop:
         slot.interval = self.interval
 
     def _flight(self, slot: _Slot) -> Flight | None:
-        """Altitude and speed at a frame, where the telemetry tells."""
+        """What the telemetry tells at a frame; None outside its span."""
         return at(self.telemetry, slot.frame.time_s) if self.telemetry is not None else None
 
     def _observe(self, ready: list[int]) -> Iterator[Scene]:

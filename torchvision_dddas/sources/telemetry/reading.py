@@ -1,5 +1,6 @@
 """Which kind of log a file is, by what is in it, then by its name."""
 
+import codecs
 import re
 from pathlib import Path
 
@@ -49,11 +50,9 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_tlog(path, clock_offset_s)
     text = _text(head)
     if text is not None and _SENTENCE.search(text):
-        whole = path.read_bytes()
-        return read_nmea(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)
+        return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->|\bGPS\s*\(|\[\s*latitude", text):
-        whole = path.read_bytes()
-        return read_subtitles(path, _text(whole) or whole.decode("latin-1"), clock_offset_s)
+        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and "," in text:
         return read_table(path, clock_offset_s, clip)
     for mark, words in _OTHERS.items():
@@ -63,11 +62,9 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
 
 
 def _text(content: bytes) -> str | None:
-    """The content as text; None where it is none."""
-    if b"\0" in content:
-        return None
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        # The last letter may have been cut in two.
-        return content[: error.start].decode("utf-8-sig") if error.start > len(content) - 4 else None
+    """The content as text; None where it is none. A few garbled letters do not make it something else."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    text = content.decode("utf-8-sig", errors="replace")
+    strange = sum(letter == "\ufffd" or (letter < " " and letter not in "\r\n\t") for letter in text[:4096])
+    return text if strange <= 0.1 * min(len(text), 4096) else None

@@ -123,7 +123,8 @@ def _check(log: Log, row: list[str], place: int, name: str, line: int) -> None:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise log.refuse(f"{name} is '{text}'; wanted a finite number", line)
+        short = "; the line ends before it" if place >= len(row) else ""
+        raise log.refuse(f"{name} is '{text}'; wanted a finite number{short}", line)
     least, most, words = LIMITS.get(name, (-math.inf, math.inf, ""))
     if not least <= value <= most:
         raise log.refuse(f"{name} is '{text}'; wanted {words}", line)

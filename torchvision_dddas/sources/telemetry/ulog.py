@@ -61,12 +61,15 @@ def _topics(log: Log) -> dict[str, Topic]:
             f"telemetry {log.path} is a PX4 log, which needs pyulog: pip install 'torchvision-dddas[telemetry]'"
         ) from None
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it finds damaged
-            read = ULog(str(log.path), list(_TOPICS))
+        # It prints what it finds damaged.
+        with contextlib.redirect_stdout(io.StringIO()), log.path.open("rb") as file:
+            read = ULog(file, list(_TOPICS))
     except Exception as error:
         raise log.refuse(f"the PX4 log is damaged from its beginning and cannot be read ({error})") from None
     if read.file_corruption:
         log.note("the log is damaged: what could not be read is left out")
+    elif (byte := _cut(log.path.read_bytes())) is not None:
+        log.note(f"byte {byte}: the file ends within a message; it was cut off")
     if read.dropouts:
         lost_s = sum(part.duration for part in read.dropouts) / 1000
         log.note(f"the logger fell behind {len(read.dropouts)} times and lost {lost_s:.3g} s in all")
@@ -77,6 +80,17 @@ def _topics(log: Log) -> dict[str, Topic]:
     if not topics:
         raise log.refuse("the PX4 log tells no place, height or attitude")
     return topics
+
+
+def _cut(content: bytes) -> int | None:
+    """Where the last message begins if it does not end; messages follow a header of 16 bytes, length first."""
+    place = 16
+    while place < len(content):
+        end = place + 3 + int.from_bytes(content[place : place + 2], "little")
+        if end > len(content) or place + 3 > len(content):
+            return place
+        place = end
+    return None
 
 
 def _seconds(topic: Topic) -> np.ndarray:
