@@ -78,13 +78,13 @@ class Graph:
         """A stretch of one axis."""
         return self("Slice", name, self.whole(begin), self.whole(end), self.whole(axis))
 
-    def model(self, inputs: dict, outputs: dict, properties: dict[str, str]) -> bytes:
+    def model(self, inputs: dict, outputs: dict, properties: dict[str, str], name: str = "people") -> bytes:
         """The file's content. inputs, outputs: {name: (type, shape)}."""
         values = [
-            [helper.make_tensor_value_info(name, kind, shape) for name, (kind, shape) in held.items()]
+            [helper.make_tensor_value_info(value, kind, shape) for value, (kind, shape) in held.items()]
             for held in (inputs, outputs)
         ]
-        graph = helper.make_graph(self.nodes, "people", *values, initializer=list(self.constants.values()))
+        graph = helper.make_graph(self.nodes, name, *values, initializer=list(self.constants.values()))
         made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
         helper.set_model_props(made, properties)
         onnx.checker.check_model(made, full_check=True)
@@ -286,8 +286,8 @@ def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
     return worst
 
 
-def manifest(files: dict[str, bytes], layout: hog.Layout) -> bytes:
-    """What the files are, as JSON."""
+def described(files: dict[str, bytes]) -> dict[str, dict]:
+    """Of each file the hash, inputs and outputs with their shapes."""
     listed = {}
     for name, content in files.items():
         graph = onnx.load_from_string(content).graph
@@ -300,11 +300,16 @@ def manifest(files: dict[str, bytes], layout: hog.Layout) -> bytes:
                 for side, held in (("inputs", graph.input), ("outputs", graph.output))
             },
         }
+    return listed
+
+
+def manifest(files: dict[str, bytes], layout: hog.Layout) -> bytes:
+    """What the files are, as JSON."""
     content = {
         "origin": "made by export/people_graph.py from torchvision_dddas/ops/hog.py",
         "versions": {"onnx": onnx.__version__, "opset": OPSET},
         "layout": baked(layout),
-        "graphs": listed,
+        "graphs": described(files),
     }
     return (json.dumps(content, indent=1) + "\n").encode()
 

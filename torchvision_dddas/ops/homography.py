@@ -25,6 +25,8 @@ __all__ = [
 ]
 
 SAMPLE_SIZE = 4
+# Depth of a point, as a share of the depth of the middle of all, from which on it is on the horizon.
+HORIZON = 1e-6
 
 
 def four_point(
@@ -60,8 +62,12 @@ def fit(
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
     """Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination.
 
-    valid is False with fewer than four pairs of positive weight or when they do not fix eight parameters (collinear).
+    A pair of weight 0 is as if it were not there, whatever it holds; four pairs are met exactly. valid is False with
+    fewer than four pairs of positive weight, when they do not fix eight parameters (collinear), and when one of them
+    would lie on or behind the horizon: so it is with three of four points on one line and noise in their partners.
     """
+    used = weight > 0
+    p, q = (torch.where(used[..., None], points, torch.zeros_like(points)) for points in (p, q))
     # In float64: the normal equations square the condition, and float32 leaves pixels of error outside the points.
     wide = _wide(p)
     p_unit, p_mean, p_scale = _hartley(p.to(wide), weight.to(wide))
@@ -74,9 +80,11 @@ def fit(
     share = weight.to(wide) / weight.to(wide).sum(1, keepdim=True).clamp(min=1e-12)
     normal = rows.mT @ (rows * share.repeat(1, 2)[..., None])
     solution, valid = linear.solve(normal[:, :8, :8], normal[:, :8, 8:], tolerance=1e-10)
+    depth = (p_unit @ solution[:, 6:])[..., 0] + 1
+    valid = valid & ((depth > HORIZON) | ~used).all(1)
     matrix = torch.cat([solution[..., 0], torch.ones_like(solution[:, :1, 0])], 1).reshape(-1, 3, 3)
     matrix = _shifted(matrix, p_mean, p_scale, q_mean, q_scale)
-    valid = valid & ((weight > 0).sum(1) >= SAMPLE_SIZE) & (matrix[:, 2, 2].abs() > 1e-9)
+    valid = valid & (used.sum(1) >= SAMPLE_SIZE) & (matrix[:, 2, 2].abs() > 1e-9)
     matrix = torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=wide, device=p.device))
     return normalised(matrix).to(p.dtype), valid
 
@@ -86,7 +94,8 @@ def fit_raw(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> tuple[Float
 
     No weights and no normalisation: in degrees cond(A) is about 1e13, that of AᵀA beyond float64, and what comes out
     of more than four pairs is wrong by decimetres or more even if the pairs are perfect. It is kept to show just that.
-    Therefore a pivot counts as zero only if it is zero; valid is False then, or with fewer than four pairs.
+    Therefore a pivot counts as zero only if it is zero: any larger tolerance would refuse degrees altogether. valid is
+    False then, or with fewer than four pairs; that landmarks lie on one line must be seen elsewhere.
     """
     (x, y), (u, v) = p.unbind(-1), q.unbind(-1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)
