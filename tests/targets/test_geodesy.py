@@ -1,6 +1,7 @@
 """Degrees to metres and back."""
 
 import numpy as np
+import pymap3d
 import pytest
 
 from torchvision_dddas.targets.geodesy import east_north, lonlat, plain_east_north, plain_lonlat
@@ -19,6 +20,20 @@ def test_a_degree_of_latitude_is_as_long_as_on_the_ellipsoid(latitude):
     degree_m = np.radians(6_378_137 * (1 - eccentric) / (1 - eccentric * np.sin(np.radians(latitude)) ** 2) ** 1.5)
     north = east_north(np.array([[10.0, latitude + 5e-4], [10.0, latitude - 5e-4]]), (10.0, latitude))[:, 1]
     assert (north[0] - north[1]) * 1000 == pytest.approx(degree_m, rel=2e-6)
+
+
+def test_many_points_are_converted_as_one_after_the_other_and_as_pymap3d_does():
+    metres = np.random.default_rng(1).uniform(-5000, 5000, (40_001, 2))
+    degrees = lonlat(metres, TUCSON)
+    latitude, longitude, _ = pymap3d.enu2geodetic(metres[:, 0], metres[:, 1], 0, TUCSON[1], TUCSON[0], 0)
+    assert np.abs(degrees - np.stack([longitude, latitude], 1)).max() < 1e-12
+    for row in (0, 16_383, 16_384, 40_000):
+        assert np.abs(lonlat(metres[row : row + 1], TUCSON)[0] - degrees[row]).max() < 1e-12
+        assert np.abs(east_north(degrees[row : row + 1], TUCSON)[0] - east_north(degrees, TUCSON)[row]).max() < 1e-6
+
+
+def test_no_points_are_no_points():
+    assert east_north(np.zeros((0, 2)), TUCSON).shape == lonlat(np.zeros((0, 2)), TUCSON).shape == (0, 2)
 
 
 def test_east_is_along_longitude_and_north_along_latitude():

@@ -4,6 +4,8 @@ All in float64: longitude in float32 is 0.7 m coarse. Local metres are those of 
 the origin: a kilometre from it they are 5 cm above the ground, and less than a millimetre off.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import pymap3d
 from jaxtyping import Float
@@ -15,18 +17,40 @@ DEGREE_M = 111_320.0
 """Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m."""
 
 
+# So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
+_PART = 1 << 14
+
+
 def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """Metres east and north of an origin, both as (longitude, latitude)."""
-    lonlat = np.asarray(lonlat_deg, float).reshape(-1, 2)
-    east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
-    return np.stack([east, north], axis=1)
+
+    def of_part(lonlat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
+        return east, north
+
+    return _by_parts(of_part, lonlat_deg)
 
 
 def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """(longitude, latitude) of local metres."""
-    metres = np.asarray(east_north_m, float).reshape(-1, 2)
-    latitude, longitude, _ = pymap3d.enu2geodetic(metres[:, 0], metres[:, 1], 0.0, origin_deg[1], origin_deg[0], 0.0)
-    return np.stack([longitude, latitude], axis=1)
+
+    def of_part(metres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        latitude, longitude, _ = pymap3d.enu2geodetic(
+            metres[:, 0], metres[:, 1], 0.0, origin_deg[1], origin_deg[0], 0.0
+        )
+        return longitude, latitude
+
+    return _by_parts(of_part, east_north_m)
+
+
+def _by_parts(of_part: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], pairs: np.ndarray) -> np.ndarray:
+    """(N, 2) of what a function makes of (n, 2) at a time."""
+    given = np.asarray(pairs, float).reshape(-1, 2)
+    found = np.empty_like(given)
+    for begin in range(0, len(given), _PART):
+        part = slice(begin, begin + _PART)
+        found[part, 0], found[part, 1] = of_part(given[part])
+    return found
 
 
 def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
