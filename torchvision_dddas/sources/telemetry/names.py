@@ -8,10 +8,10 @@ from functools import cache
 _KEYS = {
     "latitude_deg": "latitude lat gpslatitude gpslat",
     "longitude_deg": "longitude longtitude lon lng long gpslongitude gpslon",
-    "altitude_m": "relalt relativealtitude relativeheight altitudem height heightabovetakeoff heightagl agl altagl "
-    "altitudeagl barometer baro hb h",
-    "above_sea_m": "absalt absolutealtitude altitude alt altitudeabovesealevel abovesea amsl msl altmsl altitudemsl "
-    "gpsaltitude gpsalt",
+    "altitude_m": "relalt relativealtitude relativeheight heightabovetakeoff altitudeagl heightagl altagl agl "
+    "altitudem height barometer baro hb h",
+    "above_sea_m": "absalt absolutealtitude altitudeabovesealevel abovesea amsl altitudemsl altmsl msl gpsaltitude "
+    "gpsalt altitude alt",
     "speed_m_s": "h.s speed groundspeed hspeed horizontalspeed velocity",
     "heading_rad": "gbyaw gimbalyaw gimbalheading",
     "pitch_rad": "gbpitch gimbalpitch",
@@ -20,7 +20,7 @@ _KEYS = {
     "hfov_rad": "hfov horizontalfov",
 }
 QUANTITY = {key: quantity for quantity, keys in _KEYS.items() for key in keys.split()}
-"""Quantity by key, without capitals, blanks, dashes and underscores."""
+"""Quantity by key, without capitals, blanks, dashes and underscores; of several, what stands first tells it best."""
 
 _UNITS = {
     "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048, "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6,

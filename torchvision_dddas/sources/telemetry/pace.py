@@ -37,7 +37,7 @@ def speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) -
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = squares - total**2 / count
         slope = np.stack([t_east - total * east / count, t_north - total * north / count]) / spread
-    speed[known] = np.where((count > 2) & (span_s >= 0.99 * wanted_s) & (spread > 1e-6), np.hypot(*slope), np.nan)
+    speed[known] = np.where((count > 2) & (span_s >= 0.9 * wanted_s) & (spread > 1e-6), np.hypot(*slope), np.nan)
     return speed, 2 * half_s
 
 

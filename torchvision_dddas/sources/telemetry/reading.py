@@ -15,6 +15,7 @@ from torchvision_dddas.sources.telemetry.transport import spacing
 from torchvision_dddas.sources.telemetry.ulog import MAGIC, read_ulog
 from torchvision_dddas.types import Telemetry
 
+_STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 4)}
 _OTHERS = {
     b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
     b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
@@ -44,9 +45,11 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_ulog(path, clock_offset_s)
     if head.startswith(KEY):
         return read_misb(path, None, clock_offset_s)
-    if (layout := spacing(head)) is not None:
+    # What is damaged at its beginning still has its name.
+    suffix = path.suffix.lower()
+    if (layout := spacing(head) or _STREAMS.get(suffix)) is not None:
         return read_misb(path, layout, clock_offset_s)
-    if looks_like_tlog(head):
+    if looks_like_tlog(head) or suffix == ".tlog":
         return read_tlog(path, clock_offset_s)
     text = _text(head)
     if text is not None and _SENTENCE.search(text):

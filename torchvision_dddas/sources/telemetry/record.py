@@ -93,7 +93,7 @@ def assembled(log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float(
     _on_the_globe(log, said)
     said = {name: rows for name, rows in said.items() if np.isfinite(rows[:, 1]).any()}
     if not set(said) - _NOT_ALONE:
-        raise log.refuse(f"this {log.kind} says neither place nor altitude nor how a camera looks; it is of no use")
+        raise log.refuse(f"nothing in it ({log.kind}) tells a place, an altitude or how a camera looks")
     _note_lacks(log, said)
     _note_silence(log, said)
     times = _with_gaps(log, np.unique(np.concatenate([moments[:, 0], *(rows[:, 0] for rows in said.values())])))

@@ -187,7 +187,7 @@ def _foreign(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s:
 
 
 def _telling(names: list[tuple[str, str]]) -> list[int]:
-    """Which columns tell something: for each quantity the one whose name is the plainest."""
+    """Which columns tell something: for each quantity the one whose name tells it best."""
     best: dict[str, tuple[int, int]] = {}
     for i, (name, _) in enumerate(names):
         if name in QUANTITY:

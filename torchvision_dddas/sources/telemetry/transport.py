@@ -43,7 +43,7 @@ def spacing(head: bytes) -> tuple[int, int] | None:
         # A recording may begin within a packet.
         for first in range(before, min(before + size, len(head))):
             places = range(first, len(head), size)
-            if len(places) >= 3 and all(head[i] == _SYNC for i in places):
+            if len(places) >= 3 and sum(head[i] == _SYNC for i in places) >= 0.8 * len(places):
                 return size, first
     return None
 

@@ -1,0 +1,132 @@
+"""A flight written down the way that autopilots, receivers and cameras write it, for tests of reading it back."""
+
+import functools
+import struct
+from collections.abc import Iterable, Sequence
+
+KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
+
+
+# -- MISB ST 0601 in MPEG-TS -------------------------------------------------------------------------------------------
+
+
+def spread(value: float, low: float, high: float, size: int, signed: bool = False) -> bytes:
+    """A number over a range as an integer of so many bytes; signed ones over +-high, as ST 0601 has them."""
+    bits = 8 * size
+    number = (
+        round(value / high * (2 ** (bits - 1) - 1)) if signed else round((value - low) / (high - low) * (2**bits - 1))
+    )
+    return number.to_bytes(size, "big", signed=signed)
+
+
+def local_set(tags: dict[int, bytes], long_length: bool = False) -> bytes:
+    """A packet with its checksum, the last of its tags."""
+    body = b"".join(bytes([tag, len(value)]) + value for tag, value in tags.items()) + b"\x01\x02"
+    length = len(body) + 2
+    size = bytes([0x82]) + length.to_bytes(2, "big") if long_length or length > 127 else bytes([length])
+    packet = KEY + size + body
+    total = sum(byte << (8 * ((i + 1) % 2)) for i, byte in enumerate(packet)) & 0xFFFF
+    return packet + total.to_bytes(2, "big")
+
+
+def _stamp(pts: int) -> bytes:
+    parts = (pts >> 30 & 7, pts >> 22 & 0xFF, pts >> 15 & 0x7F, pts >> 7 & 0xFF, pts & 0x7F)
+    return bytes([0x21 | parts[0] << 1, parts[1], parts[2] << 1 | 1, parts[3], parts[4] << 1 | 1])
+
+
+def _pes(stream: int, payload: bytes, pts: int | None) -> bytes:
+    head = bytes([0x80, 0x80, 5]) + _stamp(pts) if pts is not None else bytes([0x80, 0x00, 0])
+    return b"\0\0\1" + bytes([stream]) + (len(head) + len(payload)).to_bytes(2, "big") + head + payload
+
+
+def _packets(pid: int, content: bytes) -> Iterable[bytes]:
+    first = True
+    while content or first:
+        part, content = content[:184], content[184:]
+        filling = 184 - len(part)
+        head = bytes([0x47, (0x40 if first else 0) | pid >> 8, pid & 0xFF, 0x30 if filling else 0x10])
+        if filling:
+            head += bytes([filling - 1]) + (b"\0" + b"\xff" * (filling - 2) if filling > 1 else b"")
+        yield head + part
+        first = False
+
+
+def transport_stream(
+    video_pts: Sequence[int], metadata: Sequence[tuple[int | None, bytes]], kind: int = 0x06, before: bytes = b""
+) -> bytes:
+    """Pictures and metadata by turns, each with its time stamp; `before`: bytes before each packet, as in .m2ts."""
+    described = b"\x05\x04KLVA"
+    pat = b"\0" + bytes([0, 0xB0, 13, 0, 1, 0xC1, 0, 0, 0, 1, 0xE1, 0x00]) + b"\0\0\0\0"
+    streams = bytes([0x1B, 0xE1, 0x01, 0xF0, 0]) + bytes([kind, 0xE1, 0x02, 0xF0, len(described)]) + described
+    pmt = b"\0" + bytes([2, 0xB0, 13 + len(streams), 0, 1, 0xC1, 0, 0, 0xE1, 0x01, 0xF0, 0]) + streams + b"\0\0\0\0"
+    parts = [*_packets(0, pat), *_packets(0x100, pmt)]
+    for i in range(max(len(video_pts), len(metadata))):
+        if i < len(video_pts):
+            parts += _packets(0x101, _pes(0xE0, bytes(300), video_pts[i]))
+        if i < len(metadata):
+            parts += _packets(0x102, _pes(0xBD, metadata[i][1], metadata[i][0]))
+    return b"".join(before + part for part in parts)
+
+
+# -- MAVLink -----------------------------------------------------------------------------------------------------------
+
+
+def tlog(messages: Iterable[tuple[float, str, dict]], system: int = 1, version: int = 2) -> bytes:
+    """Each message (seconds since 1970 at which it came, name, fields) behind its time."""
+    from pymavlink.dialects.v20 import all as dialect
+
+    sender = dialect.MAVLink(None, srcSystem=system, srcComponent=1)
+    content = b""
+    for time_s, name, fields in messages:
+        message = getattr(dialect, f"MAVLink_{name.lower()}_message")(**fields)
+        content += struct.pack(">Q", round(time_s * 1e6)) + bytes(message.pack(sender, force_mavlink1=version == 1))
+    return content
+
+
+def global_position(time_boot_ms: int, lon: float, lat: float, above_m: float = 50.0, v_m_s: float = 5.0) -> dict:
+    return {
+        "time_boot_ms": time_boot_ms,
+        "lat": round(lat * 1e7),
+        "lon": round(lon * 1e7),
+        "alt": round((above_m + 100) * 1000),
+        "relative_alt": round(above_m * 1000),
+        "vx": round(v_m_s * 100),
+        "vy": 0,
+        "vz": 0,
+        "hdg": 9000,
+    }
+
+
+# -- PX4 ---------------------------------------------------------------------------------------------------------------
+
+_LETTERS = {"uint64_t": "Q", "float": "f", "double": "d", "int32_t": "i", "uint8_t": "B", "bool": "B", "uint16_t": "H"}
+
+
+def ulog(topics: dict[str, tuple[Sequence[str], Sequence[Sequence[float]]]]) -> bytes:
+    """Topics: (type and name of the fields behind the time stamp, rows with the time in microseconds first)."""
+    content = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+
+    def message(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<H", len(body)) + kind + body
+
+    for name, (fields, _) in topics.items():
+        content += message(b"F", f"{name}:{';'.join(['uint64_t timestamp', *fields])};".encode())
+    for number, name in enumerate(topics):
+        content += message(b"A", struct.pack("<BH", 0, number) + name.encode())
+    for number, (fields, rows) in enumerate(topics.values()):
+        pattern = "<HQ"
+        for field in fields:
+            kind = field.split()[0]
+            count = int(kind[kind.index("[") + 1 : -1]) if "[" in kind else 1
+            pattern += f"{count}{_LETTERS[kind.split('[')[0]]}"
+        for row in rows:
+            content += message(b"D", struct.pack(pattern, number, *row))
+    return content
+
+
+# -- NMEA 0183 ---------------------------------------------------------------------------------------------------------
+
+
+def sentence(body: str) -> str:
+    """A sentence with its checksum."""
+    return f"${body}*{functools.reduce(lambda total, letter: total ^ ord(letter), body, 0):02X}"
