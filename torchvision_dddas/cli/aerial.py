@@ -122,6 +122,7 @@ def aerial_into(
     from torchvision_dddas.sinks.grounded import GroundedOutput
     from torchvision_dddas.sinks.whole import refuse_own_input
     from torchvision_dddas.sources import open_source
+    from torchvision_dddas.sources.agreement import within_clip
     from torchvision_dddas.sources.detections import read_detections
 
     check_rate(rate_hz)
@@ -131,8 +132,12 @@ def aerial_into(
         read = read_detections(table)
         source = open_source(clip, rate_hz=rate_hz) if clip else None
         rate = source.rate_hz if source is not None else rate_hz
-        last = source.count if source is not None else read.last
-        locator, notes = locator_for(given, settings, source.size if source else None, rate, backend, last or read.last)
+        if source is not None:
+            within_clip(read, source)
+        size = source.size if source is not None else None
+        locator, notes = locator_for(
+            given, settings, size, rate, backend, (read.first, read.last), "table", extent=read.extent
+        )
         check_table(read, locator)
         facts = {"input": table, **given.facts, "rows": len(read), **about(locator), "settings": settings.model_dump()}
         journal = output.begin(facts, **ground_facts(locator, given))
@@ -152,20 +157,23 @@ def locator_for(
     size: tuple[int, int] | None,
     rate_hz: float | None,
     backend: str,
-    last: int | None,
+    frames: tuple[int, int] | None,
+    what: str,
     colours: "Colours | None" = None,
+    extent: tuple[float, float] | None = None,
 ) -> "tuple[Locator, list[str]]":
     """What lays pictures on the ground, from the files; and what the user should know of it.
 
-    size: (width, height) of the pictures, rate_hz, last: number of the last frame; None where unknown.
-    colours: where they tell where pictures show the landmarks, whatever the table says.
+    size: (width, height) of the pictures, rate_hz, frames: numbers of the first and last; None where unknown.
+    what: whose frames these are.
+    colours: where they tell where pictures show the landmarks, whatever the table says. extent: as for camera_of.
     Raises InputError for bad input.
     """
     from dataclasses import replace
 
-    from torchvision_dddas.geolocating import Locator, camera_of, site_of, unknown_below, unpictured
+    from torchvision_dddas.geolocating import Locator, camera_of, check_span, site_of, unknown_below, unpictured
     from torchvision_dddas.sources.landmarks import read_landmarks
-    from torchvision_dddas.sources.telemetry import check_overlap, read_telemetry
+    from torchvision_dddas.sources.telemetry import read_telemetry
     from torchvision_dddas.vision import load_solver
 
     offset = settings.aerial.clock_offset_s
@@ -177,8 +185,8 @@ def locator_for(
             raise InputError(
                 "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
             )
-        if last:
-            check_overlap(telemetry, (last - 1) / rate_hz)
+        if frames is not None and frames[1] > 0:
+            check_span(telemetry, (frames[0] - 1) / rate_hz, (frames[1] - 1) / rate_hz, what)
         notes += telemetry.notes
     if rate_hz is None:
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
@@ -188,7 +196,7 @@ def locator_for(
 
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
         notes += unknown_below(site)
-    camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings)
+    camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings, extent)
     locator = Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
     return locator, [*notes, *more]
 

@@ -154,7 +154,8 @@ def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: 
     from torchvision_dddas.vision import load_colours
 
     colours = read_colours(given.colours) if given.colours is not None else None
-    locator, notes = locator_for(given, settings, source.size, source.rate_hz, backend, source.count, colours)
+    frames = None if source.count is None else (1, source.count)
+    locator, notes = locator_for(given, settings, source.size, source.rate_hz, backend, frames, "clip", colours)
     helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
     check_colours(locator.site.landmarks, colours, helped)
     if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):

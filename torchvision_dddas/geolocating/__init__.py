@@ -1,7 +1,7 @@
 """From the picture to the ground, seen from the air: landmarks and telemetry on one plane, then frame by frame."""
 
 from torchvision_dddas.geolocating.locator import Locator, Targets
-from torchvision_dddas.geolocating.site import Site, camera_of, site_of, unknown_below
+from torchvision_dddas.geolocating.site import Site, camera_of, check_span, site_of, unknown_below
 from torchvision_dddas.geolocating.table import check_table, locate
 from torchvision_dddas.geolocating.watch import Watch, Watched, check_colours, unpictured
 
@@ -13,6 +13,7 @@ __all__ = [
     "Watched",
     "camera_of",
     "check_colours",
+    "check_span",
     "check_table",
     "locate",
     "site_of",

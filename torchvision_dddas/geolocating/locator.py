@@ -143,9 +143,11 @@ class Locator:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
         knobs = self.settings.aerial
         pixels, lift = points_of(targets, knobs, fix.pose is not None)
-        place, relative = ground_points(fix, self.camera, pixels, knobs.target_sigma_px, lift, self._ground)
+        place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
         _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
-        return place, relative, relative - shared
+        variance = sigma_of(targets, knobs) ** 2
+        own = (by_pixel - shared) * variance[:, None, None]
+        return place, shared + own, own
 
     def _standing(self, marks: Marks) -> Marks:
         if self._ground is None or not len(marks):
@@ -165,6 +167,12 @@ def chosen_rows(marks: Marks, rows: np.ndarray) -> Marks:
         marks.pixel_sigma[rows],
         marks.up_m[rows],
     )
+
+
+def sigma_of(targets: Targets, knobs: AerialKnobs) -> np.ndarray:
+    """(N,) standard deviation in pixels, of u and of v each, of the points that stand for the targets."""
+    side = np.sqrt(np.maximum(targets.box_px[:, 2] * targets.box_px[:, 3], 0))
+    return np.hypot(knobs.target_sigma_px, side * (knobs.own_sigma if targets.bodies else 0.0))
 
 
 def points_of(targets: Targets, knobs: AerialKnobs, posed: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,9 @@ from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.elevation import up
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
+HOLDS_S = 1.0
+"""So long before its first and after its last sample telemetry holds."""
+
 
 @dataclass(frozen=True)
 class Site:
@@ -75,6 +78,16 @@ def _above_ground(telemetry: Telemetry) -> None:
         )
 
 
+def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> None:
+    """Raises InputError, with both spans, for telemetry that tells nothing of the time that is looked at."""
+    first, last = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
+    if last < from_s - HOLDS_S or first > to_s + HOLDS_S:
+        raise InputError(
+            f"the telemetry covers {first:.1f} to {last:.1f} s, the {what} {from_s:.1f} to {to_s:.1f} s; they do not "
+            "overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
+        )
+
+
 def unknown_below(site: Site) -> list[str]:
     """What the user should know where the raster has no height below the vehicle or at landmarks."""
     assert site.elevation is not None
@@ -94,11 +107,17 @@ def unknown_below(site: Site) -> list[str]:
 
 
 def camera_of(
-    camera: Camera | None, size: tuple[int, int] | None, telemetry: Telemetry | None, settings: Settings
+    camera: Camera | None,
+    size: tuple[int, int] | None,
+    telemetry: Telemetry | None,
+    settings: Settings,
+    extent: tuple[float, float] | None = None,
 ) -> tuple[Camera, bool, list[str]]:
     """The camera in the air, whether its focal length is given, and what the user should know of it.
 
     camera: as its file says, None without one. size: (width, height) of the pictures where the camera does not say.
+    extent: (width, height) that holds the boxes: it stands for the size where nothing depends on that, as when
+    landmarks alone lay pictures on the ground.
     Raises InputError where the size is not known, or the camera's is another than that of the pictures.
     """
     if camera is not None:
@@ -108,6 +127,8 @@ def camera_of(
                 f"{size[0]} x {size[1]}; give the camera's file for this size"
             )
         return camera, True, []
+    if size is None and settings.aerial.mode != "pose":
+        size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:
         raise InputError(
             "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "

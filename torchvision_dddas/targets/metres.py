@@ -7,8 +7,11 @@ the pixel; what the camera's pose puts on all places of a frame alike moves slow
 import numpy as np
 from jaxtyping import Float, Int
 
-ACCELERATION_M_S2 = 1.0
+ACCELERATION_M_S2 = 0.5
 """Of people and vehicles, from second to second."""
+
+KNOWN_M_S = 1.0
+"""A velocity whose standard deviation, east or north, is more is not known yet."""
 
 FASTEST_M_S = 10.0
 """Standard deviation of the velocity of a target that appears."""
@@ -30,7 +33,7 @@ class Movers:
         east_north_m: Float[np.ndarray, "N 2"],
         covariance_m2: Float[np.ndarray, "N 2 2"],
     ) -> Float[np.ndarray, "N 2"]:
-        """East and north in m/s; NaN where a target was seen once only, or has no identity (below 1).
+        """East and north in m/s; NaN where they are not known yet, or for a target without identity (below 1).
 
         covariance_m2: of what errs anew from frame to frame; where it is unknown a metre is taken.
         """
@@ -44,7 +47,8 @@ class Movers:
                 self._tracks[name] = _Track(time_s, east_north_m[row], covariance_m2[row])
                 continue
             track.step(time_s, east_north_m[row], covariance_m2[row])
-            velocity[row] = track.state[2:]
+            if track.covariance.diagonal()[2:].max() < KNOWN_M_S**2:
+                velocity[row] = track.state[2:]
         self._tracks = {name: track for name, track in self._tracks.items() if time_s - track.time_s <= FORGET_S}
         return velocity
 

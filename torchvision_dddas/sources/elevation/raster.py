@@ -140,8 +140,9 @@ def _part(raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: 
     shape = min(height, most), min(width, most)
     out = shape if isinstance(bands, int) else (len(bands), *shape)
     values = raster.read(bands, window=window, out_shape=out, masked=True, resampling=Resampling.average)
-    scale = Affine.scale(width / shape[1], height / shape[0])
-    return values.astype(np.float64).filled(np.nan), raster.window_transform(window) * scale
+    wide, high, t = width / shape[1], height / shape[0], raster.window_transform(window)
+    scaled = Affine(t.a * wide, t.b * high, t.c, t.d * wide, t.e * high, t.f)
+    return values.astype(np.float64).filled(np.nan), scaled
 
 
 def _resolution_m(raster: Any) -> float:
