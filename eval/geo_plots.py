@@ -33,7 +33,7 @@ def draw(rows: list[Row], path: Path) -> None:
                 axis.plot(x, [p["bound"] for p in parts], color=colour, lw=5, alpha=0.25, solid_capstyle="round",
                           label=f"{method}: Cramér–Rao bound")  # fmt: skip
                 axis.plot(x, [p["mean"] for p in parts], "o", color=colour, ms=5.5, label=f"{method}: measured mean")
-            axis.set_ylim(0, None)
+            axis.set_ylim(0, 1.12 * max(r["homography"]["crowd"]["mean"] for r in some))
             axis.margins(x=0.08)
             axis.set_xticks(sorted(set(x)))
         axes[0, column].set(title=title, xlabel="altitude above ground, m (4 landmarks)")

@@ -18,7 +18,8 @@ from scipy.special import ellipe
 
 from torchvision_dddas.types import Camera
 
-RADIUS_M, CROWD_M = 25.0, 10.0
+RADIUS_M, CROWD_M, MOST = 25.0, 10.0, 8
+"""Of the landmarks' and of the crowd's disc, and how many landmarks there can be."""
 SIZE_PX = (1920, 1080)
 FOCAL_PX = SIZE_PX[0] / 2 / np.tan(np.radians(35))
 CAMERA = Camera("aerial", SIZE_PX, (FOCAL_PX, FOCAL_PX), ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2))
@@ -107,17 +108,18 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     noise = crowd.normal(0, case.pixel_sigma, (count, targets, 2))
     targets_px = pixels(true_targets, true_axes, true_place, true_focal) + noise
 
-    true_marks = np.stack([layout(case.layout, case.landmarks, team) for _ in range(count)])
-    sigma_m = np.full((count, case.landmarks), GPS[case.gps])
+    # Drawn for the most there can be: what has fewer landmarks has the errors of the first of them.
+    n, shape = case.landmarks, (count, MOST, 2)
+    place_noise, pixel_noise = team.normal(0, 1, shape)[:, :n], team.normal(0, case.pixel_sigma, shape)[:, :n]
+    true_marks = np.stack([layout(case.layout, n, np.random.default_rng([seed, 3, s])) for s in range(count)])
+    sigma_m = np.full((count, n), GPS[case.gps])
     if case.gps in ("two RTK", "opposite RTK"):
         sigma_m[:] = GPS["3.5 m"]
-        other = case.landmarks // 2 if case.gps == "opposite RTK" else 1
-        sigma_m[:, [0, other]] = GPS["2 cm RTK"]
+        sigma_m[:, [0, n // 2 if case.gps == "opposite RTK" else 1]] = GPS["2 cm RTK"]
         if case.gps == "two RTK":
             sigma_m = team.permuted(sigma_m, axis=1)
-    marks = true_marks + team.normal(0, 1, true_marks.shape) * sigma_m[..., None] + common[:, None]
-    noise = team.normal(0, case.pixel_sigma, true_marks.shape)
-    marks_px = pixels(true_marks, true_axes, true_place, true_focal) + noise
+    marks = true_marks + place_noise * sigma_m[..., None] + common[:, None]
+    marks_px = pixels(true_marks, true_axes, true_place, true_focal) + pixel_noise
     return Scenes(
         case, true_axes, true_place, true_focal, true_marks, true_targets, axes, place, marks, sigma_m, common,
         marks_px, targets_px,
@@ -134,7 +136,7 @@ def chosen(batch: Scenes, rows: np.ndarray) -> Scenes:
 
 def swapped(batch: Scenes, seed: int = 0) -> Scenes:
     """The same scenes with the identities of two landmarks swapped, that of the first and of any other."""
-    other = np.random.default_rng([seed, 3]).integers(1, batch.case.landmarks, len(batch))
+    other = np.random.default_rng([seed, 6]).integers(1, batch.case.landmarks, len(batch))
     every, seen = np.arange(len(batch)), batch.marks_px.copy()
     seen[every, 0], seen[every, other] = batch.marks_px[every, other], batch.marks_px[every, 0]
     return replace(batch, marks_px=seen)
@@ -203,19 +205,21 @@ def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
     """
     turn = rng.uniform(-np.pi, np.pi)
     if name in ("ring", "small ring"):
-        angle = turn + 2 * np.pi * np.arange(n) / n + np.radians(rng.uniform(-10, 10, n))
+        angle = turn + 2 * np.pi * np.arange(n) / n + np.radians(rng.uniform(-10, 10, MOST)[:n])
         return RADIUS_M / (1 + (name != "ring")) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     if name == "disc":
-        return disc(rng, (n,))
+        return disc(rng, (MOST,))[:n]
     if name == "row":
         along = np.linspace(-RADIUS_M, RADIUS_M, n)
-        aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * _to_ends(rng.uniform(0, 1, n))
+        aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * _to_ends(rng.uniform(0, 1, MOST)[:n])
         points = np.stack([along, aside], axis=1)
     elif name == "corner":
-        points = disc(rng, (n,), 6.0) + np.array([18.0, 0.0])
+        points = disc(rng, (MOST,), 6.0)[:n] + np.array([18.0, 0.0])
     else:
         leg = 25.0 * np.linspace(-1, 1, n)
-        points = np.stack([np.maximum(leg, 0), np.maximum(-leg, 0)], axis=1) - 25 / 3 + rng.normal(0, 0.5, (n, 2))
+        points = (
+            np.stack([np.maximum(leg, 0), np.maximum(-leg, 0)], axis=1) - 25 / 3 + rng.normal(0, 0.5, (MOST, 2))[:n]
+        )
     c, s = np.cos(turn), np.sin(turn)
     return points @ np.array([[c, s], [-s, c]])
 

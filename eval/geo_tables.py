@@ -13,8 +13,7 @@ def main_table(rows: list[Row]) -> str:
     ways = [f"{method}: {ways[0]}" if k == 0 else ways[k] for method in ("pose", "homography") for k in range(4)]
     lines = heading("layout | GPS of landmarks", "n | AGL m | pixels | tilt | " + " | ".join(ways))
     for row in rows:
-        common = " + 3.5 m common" if row["common_m"] else ""
-        cells = [row["layout"], row["gps"] + common, row["landmarks"], f"{row['altitude_m']:.0f}"]
+        cells = [row["layout"], row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}"]
         cells += [f"{row['pixel_sigma']:g}", f"{row['tilt_deg']:.0f}°"]
         for method in ("pose", "homography"):
             crowd, disc = row[method]["crowd"], row[method]["disc"]
@@ -55,14 +54,26 @@ def fault_table(rows: list[Row]) -> str:
     """What tests of the landmarks find and mend."""
     lines = heading(
         "fault | GPS",
-        "n | AGL m | flagged | found out | homography: mean (median) | pose, untested | pose | its crowd | in ellipses",
+        "n | AGL m | homography, untested: mean (median) | pose, untested | flagged | found out | pose: mean (median) "
+        "| its crowd | in ellipses",
     )
     for row in rows:
         told = {"none": "–", "swap": f"{percent(row['reassigned'])} reassigned"}
-        cells = [row["fault"], row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}", percent(row["flagged"])]
-        cells.append(told.get(row["fault"], f"{percent(row['found'])} that alone"))
-        cells += [f"{row[k][0]:.2f} ({row[k][1]:.2f})" for k in ("homography", "before", "after")]
-        lines.append(line([*cells, f"{row['crowd']:.2f}", percent(row["inside"])]))
+        cells = [row["fault"], row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}"]
+        pairs = [f"{metres(row[k][0])} ({metres(row[k][1])})" for k in ("homography", "before", "after")]
+        found = told.get(row["fault"], f"{percent(row['found'])} that alone")
+        cells += [*pairs[:2], percent(row["flagged"]), found, pairs[2], metres(row["crowd"]), percent(row["inside"])]
+        lines.append(line(cells))
+    return "\n".join(lines)
+
+
+def common_table(rows: list[Row]) -> str:
+    """What is told of places on the Earth and of places relative to the team."""
+    lines = heading("GPS beside it", "n | relative to the team | in ellipses | on the Earth | in ellipses")
+    for row in rows:
+        parts = (row["relative"], row["absolute"])
+        told = [cell for part in parts for cell in (metres(part["mean"]), percent(part["inside"]))]
+        lines.append(line([row["gps"], row["landmarks"], *told]))
     return "\n".join(lines)
 
 
@@ -70,14 +81,14 @@ def time_table(rows: list[Row]) -> str:
     """What memory of earlier frames gains."""
     lines = heading(
         "GPS",
-        "n | AGL m | single frames: mean (median) | in ellipses | over time: first tenth | second half: mean (median) "
-        "| in ellipses",
+        "n | errors alike over | flights | single frames: mean (median) | in ellipses | over time: mean (median) | in ellipses "
+        "| over time − single",
     )
     for row in rows:
-        one, many = row["single frames"], row["over time"]
-        cells = [row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}"]
-        cells += [f"{metres(one['mean'])} ({metres(one['median'])})", percent(one["inside"]), metres(many["begin"])]
-        lines.append(line([*cells, f"{metres(many['mean'])} ({metres(many['median'])})", percent(many["inside"])]))
+        cells = [row["gps"], row["landmarks"], f"{row['alike_s']:g} s", row["flights"]]
+        for part in (row["single frames"], row["over time"]):
+            cells += [f"{metres(part['mean'])} ({metres(part['median'])})", percent(part["inside"])]
+        lines.append(line([*cells, f"{row['gain'][0]:+.3f} ± {row['gain'][1]:.3f}"]))
     return "\n".join(lines)
 
 
