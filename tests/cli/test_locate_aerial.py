@@ -1,0 +1,277 @@
+"""`dddas locate aerial`: what it writes, how near it comes to the truth, and one line for each mistake."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from tests.overflight import Overflight
+
+
+@pytest.fixture
+def aerial(dddas, file, tmp_path):
+    """Run the command on the files of a flight; a file given by name replaces one, None leaves it out."""
+
+    def run(flight, *more, out=tmp_path / "out", rate=True, **files):
+        given = {
+            "landmarks": flight.landmarks_csv(),
+            "telemetry": flight.telemetry_csv(),
+            "camera": flight.camera_toml(),
+            "table": flight.tracks_txt(),
+            **files,
+        }
+        names = {"landmarks": "l.csv", "telemetry": "tel.csv", "camera": "c.toml", "table": "t.txt"}
+        paths = {what: file(names[what], text) for what, text in given.items() if text is not None}
+        table = paths.pop("table")
+        words = [word for what, path in paths.items() for word in (f"--{what}", path)]
+        words += ["--rate", flight.rate_hz] if rate else []
+        return dddas("locate", "aerial", table, *words, "--out", out, "--save", "none", *more)
+
+    return run
+
+
+def rows(folder, name="positions.csv"):
+    with (folder / name).open(newline="") as text:
+        return list(csv.DictReader(text))
+
+
+def located(result, folder):
+    assert result.exit_code == 0, result.output
+    return rows(folder)
+
+
+def test_exact_input_puts_every_target_where_it_is(aerial, tmp_path):
+    flight = Overflight()
+    found = located(aerial(flight), tmp_path / "out")
+    assert len(found) == 40
+    assert flight.errors(found).max() < 0.001
+    assert {row["by"] for row in found} == {"pose"}
+    last = [row for row in found if row["frame"] == "10"]
+    way = (flight.targets(2) - flight.targets(1)) * flight.rate_hz
+    velocity = np.array([[float(row["velocity_east_m_s"]), float(row["velocity_north_m_s"])] for row in last])
+    np.testing.assert_allclose(velocity, way, atol=0.1)
+
+
+def test_longitudes_and_latitudes_are_those_of_the_metres(aerial, tmp_path):
+    from tests.overflight import ORIGIN
+    from torchvision_dddas.targets.geodesy import lonlat
+
+    flight = Overflight(frames=2)
+    found = located(aerial(flight), tmp_path / "out")
+    truth = lonlat(flight.targets(1), ORIGIN)
+    given = np.array([[float(row["longitude_deg"]), float(row["latitude_deg"])] for row in found[:4]])
+    np.testing.assert_allclose(given, truth, atol=2e-8)
+
+
+def test_landmarks_alone_will_do_and_so_will_local_metres(aerial, tmp_path):
+    flight = Overflight(geographic=False)
+    found = located(aerial(flight, telemetry=None), tmp_path / "out")
+    assert flight.errors(found).max() < 0.001
+    assert "longitude_deg" not in found[0]
+    assert not (tmp_path / "out" / "tracks.geojson").exists()
+
+
+def test_a_homography_needs_neither_camera_nor_size(aerial, tmp_path):
+    flight = Overflight()
+    found = located(
+        aerial(flight, "--set", "aerial.mode=homography", telemetry=None, camera=None, rate=False), tmp_path / "out"
+    )
+    assert flight.errors(found).max() < 0.001
+    assert {row["by"] for row in found} == {"homography"}
+    assert any("no --rate" in note for note in json.loads((tmp_path / "out" / "run.json").read_text())["notes"])
+
+
+def test_the_foot_of_a_body_is_found_below_its_middle(aerial, tmp_path):
+    flight = Overflight(pitch_deg=45, body_m=1.7)
+    foot = flight.errors(located(aerial(flight, "--set", "aerial.point=foot"), tmp_path / "out"))
+    centre = flight.errors(located(aerial(flight, "--set", "aerial.point=centre"), tmp_path / "out"))
+    assert foot.max() < 0.01
+    assert centre.min() > 0.5
+
+
+def test_feet_that_the_table_names_are_taken(aerial, tmp_path):
+    flight = Overflight(pitch_deg=45)
+    lines = ["frame,x_px,y_px,width_px,height_px,feet_u_px,feet_v_px"]
+    for frame in flight.numbers():
+        lines += [
+            f"{frame},{u - 20:.3f},{v - 90:.3f},40,60,{u:.4f},{v:.4f}"
+            for u, v in flight.shown(frame, flight.targets(frame))
+        ]
+    found = located(aerial(flight, table="\n".join(lines) + "\n"), tmp_path / "out")
+    assert flight.errors(found).max() < 0.001
+
+
+def test_the_error_that_all_receivers_share_is_in_the_absolute_covariance_alone(aerial, tmp_path):
+    flight = Overflight(frames=3)
+    alone = located(aerial(flight), tmp_path / "out")
+    shared = located(aerial(flight, "--set", "landmarks.common_sigma_m=2.0"), tmp_path / "out")
+    for key in ("var_east_m2", "var_north_m2"):
+        assert float(shared[0][key]) - float(alone[0][key]) == pytest.approx(4.0, abs=1e-3)
+    assert shared[0]["relative_sigma_m"] == alone[0]["relative_sigma_m"]
+    assert shared[0]["east_m"] == alone[0]["east_m"]
+
+
+def test_ellipses_hold_the_truth_where_receivers_err(aerial, tmp_path):
+    """Each flight has receivers of its own; in all of them together about 95 % of the ellipses hold."""
+    inside = []
+    for seed in range(12):
+        flight = Overflight(frames=1, gps_m=1.43, pixel=1.0, seed=seed)
+        for row in located(aerial(flight), tmp_path / "out"):
+            # The origin moves with the first landmark's receiver: compare on the globe.
+            away = np.array([float(row["east_m"]), float(row["north_m"])]) - flight.at_origin(1, row)
+            cov = np.array(
+                [[float(row["var_east_m2"]), float(row["cov_east_north_m2"])], [0, float(row["var_north_m2"])]]
+            )
+            cov[1, 0] = cov[0, 1]
+            inside.append(away @ np.linalg.solve(cov, away) < 5.99)
+    assert np.mean(inside) > 0.85
+
+
+def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(aerial, tmp_path):
+    flight = Overflight()
+    few = flight.landmarks_csv(keep=lambda frame, k: frame != 4 or k < 3)
+    result = aerial(flight, landmarks=few, telemetry=None)
+    found = located(result, tmp_path / "out")
+    assert {int(row["frame"]) for row in found} == set(range(1, 11)) - {4}
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    (gap,) = record["unreliable"]
+    assert (gap["first"], gap["last"]) == (4, 4)
+    assert "3 landmarks" in gap["cause"]
+    assert "1 missing" in gap["cause"]
+    assert "note: 1 frames could not be located" in result.stdout
+
+
+def test_telemetry_alone_bridges_a_frame_without_landmarks(aerial, tmp_path):
+    flight = Overflight()
+    few = flight.landmarks_csv(keep=lambda frame, k: frame != 4)
+    found = located(aerial(flight, landmarks=few), tmp_path / "out")
+    here = [row for row in found if row["frame"] == "4"]
+    assert len(here) == 4
+    assert {row["by"] for row in here} == {"telemetry"}
+    assert flight.errors(here).max() < 0.5
+
+
+def test_a_table_without_rows_gives_no_positions(aerial, tmp_path):
+    assert located(aerial(Overflight(), table=""), tmp_path / "out") == []
+
+
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_both_back_ends_agree(aerial, tmp_path, backend):
+    if backend == "torch":
+        pytest.importorskip("torch")
+    flight = Overflight(frames=2, gps_m=1.0, pixel=1.0)
+    options = ("--backend", backend, "--set", "aerial.mode=homography")
+    found = located(aerial(flight, *options, telemetry=None), tmp_path / "out")
+    reference = located(
+        aerial(Overflight(frames=2, gps_m=1.0, pixel=1.0), *options[2:], telemetry=None), tmp_path / "out"
+    )
+    for a, b in zip(found, reference, strict=True):
+        assert float(a["east_m"]) == pytest.approx(float(b["east_m"]), abs=1e-4)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Mistakes.
+
+
+def test_fewer_than_four_landmarks_everywhere(aerial):
+    flight = Overflight(landmarks=3)
+    line = bad(aerial(flight, telemetry=None))
+    assert "needs 4 landmarks" in line
+    assert "frame 1 has 3" in line
+    assert "1 missing" in line
+
+
+def test_landmarks_on_one_line(aerial):
+    flight = Overflight()
+    flight.marks = lambda frame: np.outer(np.arange(4) - 1.5, [8.0, 3.0])
+    assert "lie on one line" in bad(aerial(flight, telemetry=None))
+
+
+def test_degrees_and_metres_mixed(aerial):
+    metres, degrees = Overflight(geographic=False), Overflight()
+    line = bad(aerial(metres, telemetry=degrees.telemetry_csv()))
+    assert "landmarks are in local metres, the telemetry in longitude and latitude" in line
+
+
+def test_longitude_and_latitude_swapped(aerial):
+    flight = Overflight()
+    header, *lines = flight.landmarks_csv().splitlines()
+    names = header.split(",")
+    a, b = names.index("longitude_deg"), names.index("latitude_deg")
+    swapped = []
+    for line in lines:
+        cells = line.split(",")
+        cells[a], cells[b] = cells[b], cells[a]
+        swapped.append(",".join(cells))
+    assert "swapped" in bad(aerial(flight, landmarks="\n".join([header, *swapped])))
+
+
+def test_a_landmark_twice_in_a_frame(aerial):
+    flight = Overflight()
+    text = flight.landmarks_csv()
+    assert "ugv0 is in frame 1 already" in bad(aerial(flight, landmarks=text + text.splitlines()[1] + "\n"))
+
+
+def test_telemetry_of_another_time(aerial):
+    line = bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(shift_s=500.0)))
+    assert "500.0 to 500.9 s" in line
+    assert "0.0 to 0.9 s" in line
+
+
+def test_an_altitude_below_the_ground(aerial):
+    assert "below ground" in bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(altitude_m=-3.0)))
+
+
+def test_no_frame_in_common(aerial):
+    flight = Overflight()
+    later = "".join(
+        f"{int(line.split(',', 1)[0]) + 100},{line.split(',', 1)[1]}\n" for line in flight.tracks_txt().splitlines()
+    )
+    line = bad(aerial(flight, table=later, telemetry=None))
+    assert "frames 101 to 110" in line
+    assert "1 to 10" in line
+
+
+def test_landmarks_without_places_in_the_picture(aerial):
+    flight = Overflight()
+    assert "u_px,v_px" in bad(aerial(flight, landmarks=flight.landmarks_csv(pictured=False)))
+
+
+def test_pictures_of_unknown_size(aerial):
+    assert "--camera FILE or --clip CLIP" in bad(aerial(Overflight(), camera=None))
+
+
+def test_a_camera_of_another_size_than_the_clip(aerial, clip):
+    line = bad(aerial(Overflight(frames=5), "--clip", clip, rate=True))
+    assert "1280 x 720 px, the clip of 64 x 48" in line
+
+
+def test_telemetry_without_a_rate(aerial):
+    assert "--rate" in bad(aerial(Overflight(), rate=False))
+
+
+def test_paper_mode_of_metres(aerial):
+    flight = Overflight(geographic=False)
+    assert "works in degrees" in bad(aerial(flight, "--set", "aerial.mode=paper", telemetry=None))
+
+
+def test_an_identity_twice_in_a_frame(aerial):
+    flight = Overflight()
+    text = flight.tracks_txt()
+    assert "identity 1 is there already" in bad(aerial(flight, table=text + text.splitlines()[0] + "\n"))
+
+
+def test_a_folder_that_holds_what_is_read(dddas, file, tmp_path):
+    flight = Overflight()
+    marks = file("landmarks.csv", flight.landmarks_csv())
+    table = file("positions.csv", flight.tracks_txt())
+    result = dddas("locate", "aerial", table, "--landmarks", marks, "--rate", 10, "--out", tmp_path)
+    assert "positions.csv is a file that this run writes" in bad(result)
+    assert table.read_text() == flight.tracks_txt()
+
+
+def test_bad_input_leaves_no_folder(aerial, tmp_path):
+    bad(aerial(Overflight(landmarks=3), telemetry=None, out=tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
