@@ -147,7 +147,7 @@ class Overflight:
 COLOURS = {"ugv0": (0, 0, 220), "ugv1": (30, 200, 30), "ugv2": (220, 60, 20), "ugv3": (20, 210, 230)}
 """BGR that the first landmarks wear: hues 0, 60, 112 and 28."""
 
-SHADES = ((225, 225, 225), (55, 55, 55), (215, 215, 215), (45, 45, 45))
+SHADES = ((225, 225, 225), (245, 245, 245), (215, 215, 215), (235, 235, 235))
 
 COLOURS_TOML = """
 [ugv0]

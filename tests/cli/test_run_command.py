@@ -1,0 +1,255 @@
+"""`dddas run`: from a clip to places on the ground, and one line for each mistake."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from tests.overflight import COLOURS_TOML, Overflight, pictures
+
+FLIGHT = {"frames": 24, "size": (640, 360), "focal_px": 457.0, "height_m": 45.0, "heading_rad": 0.1}
+FLIGHT |= {"pace": 3.0, "rate_hz": 8.0}
+# The painted targets are flat: their centres are on the ground.
+FLAT = ("--set", "aerial.point=centre")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A clip of a flight and the files beside it; the folder."""
+    folder, flight = tmp_path_factory.mktemp("flown"), Overflight(**FLIGHT)
+    (folder / "clip").mkdir()
+    for k, picture in enumerate(pictures(flight), 1):
+        cv2.imwrite(str(folder / "clip" / f"{k:05d}.png"), picture)
+    (folder / "landmarks.csv").write_text(flight.landmarks_csv(pictured=False))
+    (folder / "pictured.csv").write_text(flight.landmarks_csv())
+    (folder / "telemetry.csv").write_text(flight.telemetry_csv())
+    (folder / "camera.toml").write_text(flight.camera_toml())
+    (folder / "colours.toml").write_text(COLOURS_TOML)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(flown, tmp_path_factory):
+    """The whole path, run once: the result and its folder."""
+    from typer.testing import CliRunner
+
+    from torchvision_dddas.cli import app
+
+    out = tmp_path_factory.mktemp("whole") / "out"
+    words = [*given(flown), *FLAT, "--save", "overlay,map", "--out", out]
+    return CliRunner().invoke(app, [str(word) for word in words]), out
+
+
+def given(folder, landmarks="landmarks.csv", colours="colours.toml", **files):
+    """The words of a run on the files of a folder."""
+    names = {"telemetry": "telemetry.csv", "camera": "camera.toml", **files}
+    words = ["run", folder / "clip", "--rate", FLIGHT["rate_hz"], "--landmarks", folder / landmarks]
+    words += ["--colours", folder / colours] if colours else []
+    return [*words, *(word for what, name in names.items() if name for word in (f"--{what}", folder / name))]
+
+
+def rows(path):
+    with path.open(newline="") as text:
+        return list(csv.DictReader(text))
+
+
+def missed_by(found):
+    """(N,) metres from each row of positions.csv to the nearest target in its frame, and which that is."""
+    flight = Overflight(**FLIGHT)
+    origin = flight.marks(1)[0]
+    apart, which = [], []
+    for row in found:
+        place = np.array([float(row["east_m"]), float(row["north_m"])]) + origin
+        distance = np.linalg.norm(flight.targets(int(row["frame"])) - place, axis=1)
+        apart.append(distance.min())
+        which.append(int(distance.argmin()))
+    return np.array(apart), np.array(which)
+
+
+def test_targets_are_located_to_some_decimetres(whole):
+    result, out = whole
+    assert result.exit_code == 0, result.output
+    found = rows(out / "positions.csv")
+    apart, which = missed_by(found)
+    assert len(found) > 60
+    assert np.median(apart) < 0.3
+    assert np.quantile(apart, 0.9) < 1.0
+    assert set(which.tolist()) == {0, 1, 2, 3}
+
+
+def test_a_position_is_that_of_its_own_frame(whole):
+    """Identities are settled some frames later than pictures are laid on the ground."""
+    _, out = whole
+    found = rows(out / "positions.csv")
+    flight = Overflight(**FLIGHT)
+    away = {}
+    for shift in (-4, 0, 4):
+        moved = [{**row, "frame": int(row["frame"]) + shift} for row in found]
+        away[shift] = np.median(missed_by([row for row in moved if 1 <= row["frame"] <= flight.frames])[0])
+    assert away[0] < 0.3 * min(away[-4], away[4])
+
+
+def test_landmarks_are_no_targets(whole):
+    """All but never: a blob that looks too large for its landmark alone stays among the targets."""
+    _, out = whole
+    flight = Overflight(**FLIGHT)
+    found = rows(out / "detections.csv")
+    at_landmarks = 0
+    for row in found:
+        x, y, width, height = (float(row[name]) for name in ("x_px", "y_px", "width_px", "height_px"))
+        at = flight.shown(int(row["frame"]), flight.marks(int(row["frame"])))
+        centre = np.array([x + width / 2, y + height / 2])
+        at_landmarks += np.linalg.norm(at - centre, axis=1).min() < 10
+    assert at_landmarks < 0.1 * len(found)
+
+
+def test_landmarks_are_where_they_were_seen_and_can_be_read_again(whole, dddas, flown, tmp_path):
+    _, out = whole
+    flight = Overflight(**FLIGHT)
+    seen = rows(out / "landmarks.csv")
+    assert len(seen) > 3.5 * flight.frames
+    apart = [
+        np.linalg.norm(
+            flight.shown(int(row["frame"]), flight.marks(int(row["frame"])))[int(row["landmark"][-1])]
+            - [float(row["u_px"]), float(row["v_px"])]
+        )
+        for row in seen
+    ]
+    assert np.median(apart) < 2
+    words = ("--camera", flown / "camera.toml", "--telemetry", flown / "telemetry.csv", "--rate", FLIGHT["rate_hz"])
+    result = dddas(
+        "locate", "aerial", out / "tracks.csv", "--landmarks", out / "landmarks.csv", *words, *FLAT, "--save", "none",
+        "--out", tmp_path / "again",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    again = {(row["frame"], row["target"]): row for row in rows(tmp_path / "again" / "positions.csv")}
+    for row in rows(out / "positions.csv"):
+        same = again[row["frame"], row["target"]]
+        assert float(same["east_m"]) == pytest.approx(float(row["east_m"]), abs=0.1)
+
+
+def test_everything_is_written_and_recorded(whole):
+    result, out = whole
+    names = {path.name for path in out.iterdir()}
+    assert names >= {
+        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", "positions.csv", "fixes.csv"),
+        *("landmarks.csv", "tracks.geojson", "overlay.mp4", "map.png", "run.json"),
+    }
+    record = json.loads((out / "run.json").read_text())
+    assert record["state"] == "complete"
+    assert record["frames"]["written"] == FLIGHT["frames"]
+    assert record["identities"] >= 4
+    assert {"register", "foreground", "landmarks", "track", "ground"} <= set(record["seconds"]["stages"])
+    assert "interval.frames" in {moved["knob"] for moved in record["adjustments"]}
+    assert set(record["landmarks"]) == {"ugv0", "ugv1", "ugv2", "ugv3"}
+    assert "positions; of the frames" in result.stdout
+
+
+def test_the_overlay_names_the_landmarks_frame_by_frame(whole):
+    _, out = whole
+    film = cv2.VideoCapture(str(out / "overlay.mp4"))
+    ok, first = film.read()
+    assert ok
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == FLIGHT["frames"]
+    u, v = Overflight(**FLIGHT).shown(1, Overflight(**FLIGHT).marks(1))[1].astype(int)
+    # A label lies to the right of the landmark, in the colour of those that are used.
+    patch = first[v - 20 : v + 5, u + 12 : u + 45].reshape(-1, 3).astype(int)
+    assert (np.abs(patch - [90, 230, 90]).max(axis=1) < 40).any()
+
+
+def test_the_tables_own_pixels_do_without_colours(dddas, flown, tmp_path):
+    result = dddas(*given(flown, "pictured.csv", None), *FLAT, "--save", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    apart, _ = missed_by(rows(tmp_path / "out" / "positions.csv"))
+    assert np.median(apart) < 0.3
+
+
+def test_following_every_third_frame_locates_those_alone(dddas, flown, tmp_path):
+    result = dddas(*given(flown), *FLAT, "--interval", 3, "--save", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    found = rows(tmp_path / "out" / "positions.csv")
+    assert {int(row["frame"]) % 3 for row in found} == {1}
+    assert np.median(missed_by(found)[0]) < 0.3
+
+
+def test_without_landmarks_it_says_that_nothing_is_located(dddas, clip, engine, tmp_path):
+    result = dddas("run", clip, "--save", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: no --landmarks was given: nothing was located" in result.stdout
+    assert (tmp_path / "out" / "tracks.csv").exists()
+    assert not (tmp_path / "out" / "positions.csv").exists()
+
+
+def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
+    from torchvision_dddas import following
+
+    whole_of = following.follow_scenes
+
+    def stopped(*how):
+        for count, followed in enumerate(whole_of(*how)):
+            if count == 7:
+                raise KeyboardInterrupt
+            yield followed
+
+    monkeypatch.setattr(following, "follow_scenes", stopped)
+    result = dddas(*given(flown), *FLAT, "--save", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["state"] == "interrupted"
+    assert {int(row["frame"]) for row in rows(tmp_path / "out" / "fixes.csv")} == set(range(1, 8))
+    assert max(int(row["frame"]) for row in rows(tmp_path / "out" / "positions.csv")) <= 7
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Mistakes.
+
+
+def test_landmarks_that_nothing_shows(dddas, flown, tmp_path):
+    assert "--colours FILE" in bad(dddas(*given(flown, colours=None), "--out", tmp_path / "out"))
+
+
+def test_a_colour_of_no_landmark(dddas, flown, file, tmp_path):
+    colours = file("other.toml", COLOURS_TOML.replace("[ugv2]", "[tank]"))
+    line = bad(dddas(*given(flown, colours=colours), "--out", tmp_path / "out"))
+    assert "the colours name tank" in line
+
+
+def test_too_few_colours_without_telemetry(dddas, flown, file, tmp_path):
+    colours = file("three.toml", COLOURS_TOML.split("[ugv3]")[0])
+    line = bad(dddas(*given(flown, colours=colours, telemetry=None), "--out", tmp_path / "out"))
+    assert "colours are given for 3: 1 missing" in line
+
+
+def test_a_grey_clip_has_no_colours(dddas, flown, tmp_path):
+    grey = tmp_path / "grey"
+    (grey / "clip").mkdir(parents=True)
+    for path in sorted((flown / "clip").iterdir())[:6]:
+        cv2.imwrite(str(grey / "clip" / path.name), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    words = given(flown)
+    words[1] = grey / "clip"
+    result = dddas(*words, "--out", tmp_path / "out")
+    assert result.exit_code == 0 or "grey" in bad(result)
+
+
+def test_a_file_of_no_use_without_landmarks(dddas, clip, file, tmp_path):
+    line = bad(dddas("run", clip, "--colours", file("c.toml", COLOURS_TOML), "--out", tmp_path / "out"))
+    assert "--colours is of no use without --landmarks" in line
+
+
+def test_an_interval_below_one(dddas, clip, tmp_path):
+    assert "--interval is 0" in bad(dddas("run", clip, "--interval", 0, "--out", tmp_path / "out"))
+
+
+def test_telemetry_of_another_time(dddas, flown, file, tmp_path):
+    late = file("late.csv", Overflight(**FLIGHT).telemetry_csv(shift_s=900.0))
+    line = bad(dddas(*given(flown, telemetry=late), "--out", tmp_path / "out"))
+    assert "900.0 to 902.9 s" in line
+    assert "the clip 0.0 to 2.9 s" in line
+
+
+def test_a_folder_that_holds_what_is_read(dddas, flown):
+    line = bad(dddas(*given(flown), "--out", flown))
+    assert "landmarks.csv is a file that this run writes" in line
