@@ -67,7 +67,7 @@ def test_the_keys_of_late_cameras_with_a_gimbal(tmp_path: Path) -> None:
         ("[focal_len : 240] [latitude: 41.42] [longitude: 2.23] [altitude: 117.0]", (2.23, 41.42), None, 117.0),
         ("[latitude: 53,365080] [longitude: 6,460739] [rel_alt: 5,4 abs_alt: 44,7]", (6.460739, 53.36508), 5.4, 44.7),
         ("GPS(149,0251,-20,2533,16) BAROMETER:1,9", (149.0251, -20.2533), 1.9, None),
-        ("Luma 106, Coef(1.0, 1.0), R(X:0, Y:0, W:0, H:0), GPS (-2.5, 52.0, 15), D 0.6m, H 1.50m", (-2.5, 52.0), 1.5, None),
+        ("Luma 106, Coef(1.0, 1.0), R(X:0, H:0), GPS (-2.5, 52.0, 15), D 0.6m, H 1.50m", (-2.5, 52.0), 1.5, None),
     ],
 )  # fmt: skip
 def test_a_place_is_found_in_every_dialect(

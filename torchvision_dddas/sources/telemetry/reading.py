@@ -58,6 +58,8 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and "," in text:
         return read_table(path, clock_offset_s, clip)
+    if suffix == ".ulg":
+        raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
     for mark, words in _OTHERS.items():
         if mark in head[:12]:
             raise InputError(f"telemetry {path} {words}")
@@ -68,6 +70,8 @@ def _text(content: bytes) -> str | None:
     """The content as text; None where it is none. A few garbled letters do not make it something else."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", errors="replace")
+    if content.count(b"\0") > len(content) // 1000 + 3:
+        return None
     text = content.decode("utf-8-sig", errors="replace")
     strange = sum(letter == "\ufffd" or (letter < " " and letter not in "\r\n\t") for letter in text[:4096])
     return text if strange <= 0.1 * min(len(text), 4096) else None
