@@ -5,6 +5,8 @@ import pytest
 
 from tests.sinks.ground import NAMES, ORIGIN, positions, tracks
 from torchvision_dddas.sinks.kml import kml, plain
+from torchvision_dddas.sinks.positions import PositionOutput
+from torchvision_dddas.types import Located, Sightings
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
 ORDER = ["name", "description", "TimeStamp", "styleUrl", "geometry"]
@@ -109,3 +111,22 @@ def test_no_positions_are_a_valid_document():
 def test_local_metres_are_refused():
     with pytest.raises(ValueError, match="no longitude"):
         kml(tracks(walk(origin=None)))
+
+
+def test_people_located_from_the_ground_are_written_too(tmp_path):
+    none = np.zeros(0)
+    sightings = Sightings(
+        np.zeros((0, 2)), none, none, none, np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros((0, 2, 6))
+    )
+    for geographic in (True, False):
+        with PositionOutput(tmp_path) as output:
+            output.begin({}, ("a",), geographic)
+            for frame in walk(3, origin=ORIGIN if geographic else None):
+                members = np.zeros((2, 1), int)
+                number = int(frame.frame[0])
+                output.write(Located(number, frame, members, sightings, none, none, none, none, np.zeros((0, 4))))
+        if geographic:
+            root = ElementTree.parse(tmp_path / "tracks.kml").getroot()
+            assert [m.findtext(f"{KML}name") for m in marks_of(root, "tracks")] == ["target 1", "target 2"]
+            assert not list(root.iter(f"{KML}when"))
+    assert {path.name for path in tmp_path.iterdir()} == {"positions.csv", "sightings.csv", "run.json"}

@@ -19,6 +19,9 @@ def rounded(lonlat_deg: np.ndarray) -> list[Place]:
 
 def cut_line(places: list[Place]) -> list[list[Place]]:
     """The line as lines of which none goes over 180 degrees; their ends there are no places of the line."""
+    # Most lines go nowhere near, and are long.
+    if len(places) < 2 or np.abs(np.diff([place[0] for place in places])).max() <= 180:
+        return [places]
     lines = [places[:1]]
     for before, after in pairwise(places):
         if abs(after[0] - before[0]) > 180:

@@ -50,10 +50,10 @@ class GroundTracks:
         edges = pairwise([*first.tolist(), len(self)])
         return {target: slice(*edge) for target, edge in zip(targets.tolist(), edges, strict=True)}
 
-    @property
+    @cached_property
     def sigma_m(self) -> np.ndarray:
         """(N,) how well each place is known: the root of the covariance's trace, NaN where it is not."""
-        return np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
+        return np.sqrt(self.covariance_m2[:, 0, 0] + self.covariance_m2[:, 1, 1])
 
     @cached_property
     def times_utc(self) -> list[str] | None:
