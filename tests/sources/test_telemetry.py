@@ -265,6 +265,17 @@ def test_units_in_the_names_of_columns_are_converted(tmp_path: Path) -> None:
     np.testing.assert_allclose(degrees, [90, 350, 60])
 
 
+def test_columns_with_their_groups_before_the_names_are_read(tmp_path: Path) -> None:
+    text = (
+        "OSD.flyTime [s],OSD.latitude,OSD.longitude,OSD.height [ft],OSD.hSpeed [MPH],OSD.yaw [360],GIMBAL.pitch,"
+        "GIMBAL.yaw [360]\n0.0,48.1,11.5,164.042,10,90,-60,80\n0.5,48.1,11.5,164.042,10,90,-60,80\n"
+    )
+    read = read_telemetry(write(tmp_path, text))
+    assert read.time_s.tolist() == [0, 0.5] and read.altitude_m[0] == pytest.approx(50, abs=1e-3)
+    degrees = np.degrees([read.vehicle_heading_rad[0], read.heading_rad[0], read.pitch_rad[0]])
+    np.testing.assert_allclose(degrees, [90, 80, 60])
+
+
 def test_a_table_of_other_columns_in_utc_tells_the_clock(tmp_path: Path) -> None:
     text = "timestamp,lat,lon,alt\n2021-05-01T10:00:00Z,48.1,11.5,500\n2021-05-01T10:00:01Z,48.1,11.5,500\n"
     read = read_telemetry(write(tmp_path, text), clock_offset_s=-3.0)

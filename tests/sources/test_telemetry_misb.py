@@ -163,6 +163,8 @@ def test_a_stream_out_of_step_is_read_around_the_damage(tmp_path: Path) -> None:
 def test_a_stream_without_metadata_or_with_none_whole_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="carries no KLV metadata; its streams are of the types 0x1b, 0x03"):
         read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, b"sound")] * 9, kind=0x03)))
+    with pytest.raises(InputError, match="no MISB ST 0601 packet"):
+        read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, b"other keys")] * 9)))
     wrong = packet(0)[:-1] + b"\0"
     with pytest.raises(InputError, match="none of 9 MISB ST 0601 packets is whole"):
         read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, wrong)] * 9)))

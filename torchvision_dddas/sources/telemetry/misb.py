@@ -38,6 +38,8 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
     starts = [0, *accumulate(len(piece.content) for piece in pieces)]
     found = list(local_sets(joined))
     whole = [one for one in found if one.whole]
+    if not found:
+        raise log.refuse("its metadata has no MISB ST 0601 packet, nothing begins with the key of one")
     if not whole:
         raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: their checksums are wrong")
     if len(whole) < len(found):

@@ -37,16 +37,14 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
             head = file.read(4096)
     except OSError as error:
         raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
-    if path.suffix.lower() == ".csv":
-        return read_table(path, clock_offset_s, clip)
-    if not head.strip():
+    suffix = path.suffix.lower()
+    if not head.strip() and suffix != ".csv":
         raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
     if head.startswith(MAGIC):
         return read_ulog(path, clock_offset_s)
     if head.startswith(KEY):
         return read_misb(path, None, clock_offset_s)
     # What is damaged at its beginning still has its name.
-    suffix = path.suffix.lower()
     if (layout := spacing(head) or _STREAMS.get(suffix)) is not None:
         return read_misb(path, layout, clock_offset_s)
     if looks_like_tlog(head) or suffix == ".tlog":
@@ -54,9 +52,9 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
     text = _text(head)
     if text is not None and _SENTENCE.search(text):
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
-    if text is not None and re.search(r"-->|\bGPS\s*\(|\[\s*latitude", text):
+    if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
         return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
-    if text is not None and "," in text:
+    if suffix == ".csv" or (text is not None and "," in text):
         return read_table(path, clock_offset_s, clip)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")

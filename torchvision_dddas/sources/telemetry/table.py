@@ -132,7 +132,7 @@ def _check(log: Log, row: list[str], place: int, name: str, line: int) -> None:
 
 # -- other programs' ---------------------------------------------------------------------------------------------------
 
-_TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds"}
+_TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds", "flytime", "elapsed", "elapsedtime"}
 _PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
 
@@ -142,10 +142,10 @@ def _understood(header: list[str]) -> bool:
 
 
 def _plain(name: str) -> tuple[str, str]:
-    """A column's name without blanks and capitals, and its unit: `Speed (mph)`, `height_above_takeoff(feet)`."""
+    """A column's name without blanks and capitals, and its unit: `Speed (mph)`, `OSD.height [ft]`, `GIMBAL.pitch`."""
     found = re.fullmatch(r"(.*?)\s*[(\[](.*?)[)\]]", name)
     name, unit = (found[1], found[2]) if found else (name, "")
-    return re.sub(r"[\s_-]", "", name.lower()), unit.lower()
+    return re.sub(r"[\s_-]|^osd\.|(?<=^gimbal)\.", "", name.lower()), unit.lower()
 
 
 def _foreign(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s: float, clip: Path | None) -> Telemetry:
@@ -156,6 +156,8 @@ def _foreign(log: Log, header: list[str], lines: Iterator[Line], clock_offset_s:
         raise InputError(f"telemetry {log.path} counts frames and says no times; give its clip, or a column time_s")
     rate_hz = _rate(clip) if timed is None and clip is not None else math.nan
     telling = _telling(names)
+    if {names[i][0] for i in telling} & {"altitude", "alt"}:
+        log.note("from where the altitude is counted is not told; it is taken as above the sea")
     first = begin = math.nan
     zoned = False
     for number, cells in lines:
