@@ -21,7 +21,7 @@ _GROUND = 0.05
 # Colours are further apart in hue than this.
 _APART = 10
 # From this area on size says nothing; and a clear colour has a score of at least the second.
-_AREA_PX, _CLEAR = 150.0, 0.2
+_AREA_PX, _CLEAR = 150.0, 0.24
 # Ranges go beyond what was seen by these, hue, saturation and value: the widest that marks the least else is taken.
 _MARGINS = ((8, 60, 80), (6, 40, 50), (4, 25, 30), (2, 10, 15))
 _LOWEST = (40, 30)
@@ -58,8 +58,8 @@ def marked(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 def standing_out(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[Sample]:
     """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
 
-    hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation: ground and plants, of
-    whatever hue, are in many places.
+    hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation in the picture and around
+    it: ground and plants, of whatever hue, are in many places.
     """
     found: list[Sample] = []
     counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
@@ -146,11 +146,16 @@ def named(hues: Sequence[float]) -> list[str]:
 
 def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> Sample:
     x, y, width, height = (int(v) for v in patches.box_px[k])
-    pixels = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
-    vector = np.exp(1j * np.pi * pixels[:, 0].astype(float) / 90).mean()
-    hue = float(np.angle(vector) * 90 / np.pi % 180)
-    share = min(patches.area_px[k] / total, 1.0) * min(patches.area_px[k] / _AREA_PX, 1.0) ** 0.5
-    return Sample(hue, pixels, float(share * pixels[:, 1].mean() / 255), picture, (x, y, width, height))
+    seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
+    hue = float(np.angle(np.exp(1j * np.pi * seen[:, 0].astype(float) / 90).mean()) * 90 / np.pi % 180)
+    # What is rare in the picture, and alone of its kind where it is.
+    around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
+    share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0) ** 0.5
+    # The middle of the box is all of it, also what the window of hue and saturation left out.
+    inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
+    alike = inner[(np.abs(hue_apart(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
+    pixels = np.concatenate([seen, alike])
+    return Sample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
 
 
 def _compact(patches: Patches, picture_px: int) -> np.ndarray:
