@@ -23,7 +23,8 @@ def level(east_north):
 class Overflight:
     """All in metres about ORIGIN, the ground at its height there; noise by standard deviations, 0 for none.
 
-    body_m: height of the targets, whose middle is the box's. pace: of the targets, 1 for walkers. geographic: whether files are in degrees.
+    body_m: height of the targets, whose middle is the box's. pace: of the targets, 1 for walkers. geographic: whether
+    files are in degrees.
     """
 
     landmarks: int = 4

@@ -184,9 +184,11 @@ def test_fewer_than_four_landmarks_everywhere(aerial):
 
 
 def test_landmarks_on_one_line(aerial):
-    flight = Overflight()
-    flight.marks = lambda frame: np.outer(np.arange(4) - 1.5, [8.0, 3.0])
-    assert "lie on one line" in bad(aerial(flight, telemetry=None))
+    class Row(Overflight):
+        def marks(self, frame):
+            return np.outer(np.arange(4) - 1.5, [8.0, 3.0])
+
+    assert "lie on one line" in bad(aerial(Row(), telemetry=None))
 
 
 def test_degrees_and_metres_mixed(aerial):

@@ -136,7 +136,7 @@ def aerial_into(
             within_clip(read, source)
         size = source.size if source is not None else None
         locator, notes = locator_for(
-            given, settings, size, rate, backend, (read.first, read.last), "table", extent=read.extent
+            given, settings, size, rate, backend, (read.first, read.last), "table", clip, extent=read.extent
         )
         check_table(read, locator)
         facts = {"input": table, **given.facts, "rows": len(read), **about(locator), "settings": settings.model_dump()}
@@ -144,6 +144,10 @@ def aerial_into(
         journal.notes += notes
         if not len(read):
             journal.notes.append("the table has no rows: nothing to locate")
+        elif read.identity is None or (read.identity < 1).all():
+            journal.notes.append(
+                "the table has no identities: targets are numbered anew in every frame, tracks are none"
+            )
         with progress("locate", len(frames_of(read, locator.site.landmarks)), quiet) as tick:
             for grounded in locate(read, locator):
                 output.write(grounded)
@@ -159,19 +163,20 @@ def locator_for(
     backend: str,
     frames: tuple[int, int] | None,
     what: str,
+    clip: str | None,
     colours: "Colours | None" = None,
     extent: tuple[float, float] | None = None,
 ) -> "tuple[Locator, list[str]]":
     """What lays pictures on the ground, from the files; and what the user should know of it.
 
     size: (width, height) of the pictures, rate_hz, frames: numbers of the first and last; None where unknown.
-    what: whose frames these are.
+    what: whose frames these are. clip: the video, as for read_telemetry.
     colours: where they tell where pictures show the landmarks, whatever the table says. extent: as for camera_of.
     Raises InputError for bad input.
     """
     from dataclasses import replace
 
-    from torchvision_dddas.geolocating import Locator, camera_of, check_span, site_of, unknown_below, unpictured
+    from torchvision_dddas.geolocating import Locator, camera_of, check_span, site_of, unknown_heights, unpictured
     from torchvision_dddas.sources.landmarks import read_landmarks
     from torchvision_dddas.sources.telemetry import read_telemetry
     from torchvision_dddas.vision import load_solver
@@ -179,7 +184,7 @@ def locator_for(
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
     landmarks = read_landmarks(given.landmarks, rate_hz, offset)
-    telemetry = read_telemetry(given.telemetry, offset) if given.telemetry is not None else None
+    telemetry = read_telemetry(given.telemetry, offset, clip) if given.telemetry is not None else None
     if telemetry is not None:
         if rate_hz is None:
             raise InputError(
@@ -195,7 +200,7 @@ def locator_for(
         from torchvision_dddas.sources.elevation import read_elevation
 
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
-        notes += unknown_below(site)
+    notes += unknown_heights(site)
     camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings, extent)
     locator = Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
     return locator, [*notes, *more]

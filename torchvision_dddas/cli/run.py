@@ -110,10 +110,13 @@ def run_into(
 
         source = open_source(clip, rate_hz=rate_hz)
         watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
-        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s) if telemetry is not None else None
+        flight = None
         if watch is not None:
+            flight = watch.locator.site.telemetry
             settings, more = _sized(settings, watch.locator)
             notes += more
+        elif telemetry is not None:
+            flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
         vision = load(backend, settings)
         facts: dict[str, Any] = {
             "input": clip,
@@ -155,7 +158,9 @@ def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: 
 
     colours = read_colours(given.colours) if given.colours is not None else None
     frames = None if source.count is None else (1, source.count)
-    locator, notes = locator_for(given, settings, source.size, source.rate_hz, backend, frames, "clip", colours)
+    locator, notes = locator_for(
+        given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
+    )
     helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
     check_colours(locator.site.landmarks, colours, helped)
     if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):

@@ -1,7 +1,7 @@
 """From the picture to the ground, seen from the air: landmarks and telemetry on one plane, then frame by frame."""
 
 from torchvision_dddas.geolocating.locator import Locator, Targets
-from torchvision_dddas.geolocating.site import Site, camera_of, check_span, site_of, unknown_below
+from torchvision_dddas.geolocating.site import Site, camera_of, check_span, site_of, unknown_heights
 from torchvision_dddas.geolocating.table import check_table, locate
 from torchvision_dddas.geolocating.watch import Watch, Watched, check_colours, unpictured
 
@@ -17,6 +17,6 @@ __all__ = [
     "check_table",
     "locate",
     "site_of",
-    "unknown_below",
+    "unknown_heights",
     "unpictured",
 ]

@@ -87,7 +87,7 @@ class Locator:
             degrees = geodesy.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
         when = self.time_s(frame)
         fix = self._registrar.step(frame, when, self.flight(when), used, degrees)
-        return Look(fix, used, adjustments, {"register": time.perf_counter() - start})
+        return Look(fix, used, adjustments, {"fix": time.perf_counter() - start})
 
     def flight(self, time_s: float) -> Flight | None:
         """What the telemetry says, its altitude counted from up = 0; unknown where that is below the ground."""

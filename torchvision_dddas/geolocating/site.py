@@ -88,14 +88,18 @@ def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> N
         )
 
 
-def unknown_below(site: Site) -> list[str]:
-    """What the user should know where the raster has no height below the vehicle or at landmarks."""
-    assert site.elevation is not None
-    notes = []
+def unknown_heights(site: Site) -> list[str]:
+    """What the user should know where no height is known of the vehicle, or of the ground below it or at landmarks."""
+    telemetry, notes = site.telemetry, []
+    if site.elevation is None:
+        level = telemetry is not None and not np.isfinite(telemetry.altitude_m).any()
+        if telemetry is not None and level and np.isfinite(telemetry.above_sea_m).any():
+            notes.append("the telemetry says heights above sea alone: give --dem, the ground's, or they are of no use")
+        return notes
     for places, what in (
         (site.landmarks.place, "at {} of {} places of landmarks: they are not used there"),
         (
-            np.zeros((0, 2)) if site.telemetry is None else site.telemetry.place,
+            np.zeros((0, 2)) if telemetry is None else telemetry.place,
             "below the vehicle in {} of {} samples: its altitude is not used there",
         ),
     ):
