@@ -9,7 +9,7 @@ import pytest
 from tests.sinks.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sinks.grounded import GroundedOutput
-from torchvision_dddas.sinks.grounded_tables import angles_deg
+from torchvision_dddas.sinks.grounded_tables import angles_deg, upper_edge_deg
 from torchvision_dddas.sources.positions import read_positions
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.projection import angles_of, axes_of
@@ -104,6 +104,15 @@ def test_the_angles_are_those_of_the_projection(angles):
     wanted = np.degrees(angles_of(axes))
     assert np.allclose((np.array(found) - wanted + 180) % 360, 180, atol=1e-3)
     assert 0 <= found[0] < 360
+
+
+@pytest.mark.parametrize("tilt", [(30, 90, 0), (30, 89.99, 0), (200, 89.99, 170), (0, 90, 30)])
+def test_the_bearing_of_the_upper_edge_is_steady_straight_down(tilt):
+    heading, pitch, roll = tilt
+    edge = upper_edge_deg(CameraPose(np.zeros(3), axes_of(*np.radians((heading, pitch, roll)))))
+    assert edge == pytest.approx((heading + roll) % 360, abs=0.02)
+    assert upper_edge_deg(CameraPose(np.zeros(3), axes_of(*np.radians((heading, 40, 0))))) == pytest.approx(heading)
+    assert np.isnan(upper_edge_deg(CameraPose(np.zeros(3), axes_of(0.0, 0.0, 0.0))))
 
 
 def test_all_files_are_there_and_valid(tmp_path):

@@ -15,8 +15,10 @@ MORE = ("score", "time_s", "relative_sigma_m", "velocity_east_m_s", "velocity_no
 
 FIXES = (
     *("frame", "time_s", "by", "landmarks_seen", "landmarks_used", "chi2", "freedom", "east_m", "north_m", "up_m"),
-    *("heading_deg", "pitch_deg", "roll_deg", "focal", "cause", "changes"),
+    *("heading_deg", "pitch_deg", "roll_deg", "upper_edge_deg", "focal", "cause", "changes"),
 )
+"""Columns of fixes.csv. Where the camera looks nearly straight down, heading and roll are loose, each against the
+other; the bearing of the picture's upper edge is steady there. focal: as a share of what the camera's file says."""
 
 
 def position_lines(grounded: Grounded) -> str:
@@ -48,7 +50,9 @@ def position_lines(grounded: Grounded) -> str:
 def fix_line(grounded: Grounded) -> str:
     """The line of a frame in the order of FIXES; a cell is empty where a value is unknown."""
     fix = grounded.fix
-    pose = [math.nan] * 7 if fix.pose is None else [*fix.pose.place_m, *angles_deg(fix.pose), fix.pose.focal]
+    pose = [math.nan] * 8
+    if fix.pose is not None:
+        pose = [*fix.pose.place_m, *angles_deg(fix.pose), upper_edge_deg(fix.pose), fix.pose.focal]
     cells = [
         f"{grounded.frame}",
         _cell(grounded.time_s, 4),
@@ -57,8 +61,8 @@ def fix_line(grounded: Grounded) -> str:
         f"{used(fix)}",
         _cell(fix.chi2, 3),
         f"{fix.freedom}",
-        *(_cell(value, 4) for value in pose[:6]),
-        _cell(pose[6], 6),
+        *(_cell(value, 4) for value in pose[:7]),
+        _cell(pose[7], 6),
         _text(fix.cause),
         _text("; ".join(fix.changes)),
     ]
@@ -82,6 +86,12 @@ def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
         heading, roll = math.atan2(forward[0], forward[1]), math.atan2(-right[2], -down[2])
     # Rounded first, so that a hair below north is not written as 360.
     return round(math.degrees(heading), 4) % 360, math.degrees(pitch), math.degrees(roll)
+
+
+def upper_edge_deg(pose: CameraPose) -> float:
+    """Where the picture's upper edge lies, seen from its middle: a bearing in [0, 360); NaN where it is overhead."""
+    east, north, _ = -np.asarray(pose.axes, float)[:, 1]
+    return round(math.degrees(math.atan2(east, north)), 4) % 360 if math.hypot(east, north) > 1e-9 else math.nan
 
 
 def _cell(value: float, digits: int) -> str:

@@ -56,7 +56,7 @@ def map_picture(
     many lie outside. Lines are broken where a target was not located for a while.
     """
     camera = camera or CameraPath()
-    frame = frame_around(_extent(tracks.east_north_m, landmarks.east_north_m, camera.east_north_m))
+    frame = frame_around(_extent(tracks.east_north_m, landmarks.east_north_m, camera))
     picture = blank(frame)
     plot = picture[frame.plot]
     if photo is not None:
@@ -114,21 +114,22 @@ def _seen(border: np.ndarray, fix: Fix, camera: Camera) -> np.ndarray:
     return fix.pose.place_m[:2] + rays[:, :2] * reach[:, None]
 
 
-def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Places that the map must show: the camera's too, unless it flew far away."""
+def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> np.ndarray:
+    """Places that the map must show: the camera's way and view too, unless they go far beyond all others."""
     targets = targets[np.isfinite(targets).all(axis=1)]
     if len(targets):
         low, high = np.percentile(targets, (2, 98), axis=0)
         reach = np.maximum(high - low, 20.0)
         targets = targets[((targets >= low - reach) & (targets <= high + reach)).all(axis=1)]
     shown = np.concatenate([targets, landmarks])
-    if len(camera) == 0:
-        return shown
-    if len(shown) == 0:
-        return camera
-    reach = np.maximum(np.ptp(shown, axis=0), 20.0)
-    near = np.abs(camera - (shown.min(axis=0) + shown.max(axis=0)) / 2) <= 1.2 * reach
-    return np.concatenate([shown, camera]) if near.all() else shown
+    for more in (camera.east_north_m, camera.view_m):
+        if len(shown) == 0:
+            shown = more
+        elif len(more):
+            reach = 1.5 * max(float(np.ptp(shown, axis=0).max()), 20.0)
+            if (np.abs(more - (shown.min(axis=0) + shown.max(axis=0)) / 2) <= reach).all():
+                shown = np.concatenate([shown, more])
+    return shown
 
 
 def _pieces(tracks: GroundTracks, rows: slice) -> list[slice]:
