@@ -118,6 +118,65 @@ def test_fit_gradients_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(lambda *x: homography.fit(*x)[0], (p, q, weight))
 
 
+@pytest.mark.parametrize("count", [4, 7, 16])
+def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
+    p, q, _ = pairs(count=count, noise=1.0)
+    p, q = 0.05 * p[:1].double() + 2000, q[:1].double()
+    weight = torch.linspace(0.5, 1, count, dtype=torch.float64)[None]
+    # Of pixels, as the matrix itself has entries of all sizes there.
+    there = p[:, :2] + 3
+
+    def pixels(*inputs):
+        return homography.transfer(homography.fit(*inputs)[0], there)
+
+    inputs = (p.requires_grad_(), q.requires_grad_(), weight.requires_grad_())
+    assert torch.autograd.gradcheck(pixels, inputs, eps=1e-5, atol=1e-4, rtol=1e-3)
+
+
+def test_a_pair_of_weight_zero_may_hold_no_numbers_at_all():
+    p, q, _ = pairs(count=6)
+    weight = torch.ones(2, 6)
+    weight[:, 5] = 0
+    wanted, _ = homography.fit(p[:, :5], q[:, :5], weight[:, :5])
+    p[:, 5], q[:, 5] = torch.nan, torch.inf
+    found, valid = homography.fit(p, q, weight)
+    assert valid.all()
+    torch.testing.assert_close(found, wanted)
+
+
+def test_fit_with_a_point_behind_the_horizon_is_marked():
+    p = torch.tensor([[[0.0, 0], [1, 0], [1, 1], [0, 1]]], dtype=torch.float64)
+    for tilt, seen in ((-0.999, True), (-1.001, False)):
+        depth = 1 + tilt * p[..., :1]
+        assert homography.fit(p, p / depth, torch.ones(1, 4, dtype=torch.float64))[1].item() is seen
+
+
+def test_the_source_as_printed_agrees_with_least_squares_about_the_origin_and_not_far_from_it():
+    p, q, _ = pairs(count=6)
+    p, q = p[:1].double() / 100, homography.transfer(TRUE[:1].double(), p[:1].double()) / 100
+    near, valid = homography.fit_raw(p, q)
+    assert valid.all()
+    assert homography.transfer_error(near, p, q).max() < 1e-8
+    for count, low, high in ((6, 1e-3, torch.inf), (4, 0, 1e-3)):
+        far, valid = homography.fit_raw(p[:, :count] / 1e4 + 100, q[:, :count])
+        assert valid.all()
+        assert low <= homography.transfer_error(far, p[:, :count] / 1e4 + 100, q[:, :count]).max() < high
+
+
+def test_the_source_as_printed_refuses_only_what_is_exactly_singular():
+    same = torch.ones(1, 4, 2, dtype=torch.float64)
+    found, valid = homography.fit_raw(same, same)
+    assert not valid.any() and torch.equal(found[0], torch.eye(3, dtype=torch.float64))
+    assert not homography.fit_raw(same[:, :3], same[:, :3])[1].any()
+
+
+@pytest.mark.parametrize("count", [4, 6])
+def test_the_source_as_printed_has_the_gradients_of_finite_differences(count):
+    p, q, _ = pairs(count=count)
+    p, q = (p[:1].double() / 300).requires_grad_(), (q[:1].double() / 300).requires_grad_()
+    assert torch.autograd.gradcheck(lambda *x: homography.fit_raw(*x)[0], (p, q))
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_fit_of_fewer_than_four_points_is_marked(count):
     p, q, _ = pairs()
