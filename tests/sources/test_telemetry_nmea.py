@@ -30,13 +30,14 @@ def rmc(clock: str, knots: float = 10.0, date: str = "230394") -> str:
 def test_places_heights_speeds_and_headings(tmp_path: Path) -> None:
     lines = []
     for i in range(5):
-        lines += [gga(f"12351{i}.50"), rmc(f"12351{i}.50"), sentence("HEHDT,274.0,T"), sentence("GPGSV,1,1,00")]
+        lines += [gga(f"12351{i}.50"), rmc(f"12351{i}.50"), sentence("HEHDT,274.0,T"), sentence("PUBX,00,1,2"), "noise"]
     found = read_telemetry(written(tmp_path, lines), clock_offset_s=1.0)
     assert found.time_s.tolist() == [1, 2, 3, 4, 5]
     np.testing.assert_allclose(found.place, [[-(11 + 31 / 60), 48 + 7.038 / 60]] * 5)
     assert found.above_sea_m.tolist() == [545.4] * 5 and np.isnan(found.altitude_m).all()
     np.testing.assert_allclose(found.speed_m_s, 10 * 1852 / 3600)
     np.testing.assert_allclose(np.degrees(found.vehicle_heading_rad), 274)
+    assert not any("left out" in note for note in found.notes)
     assert (
         found.start_utc_s == pytest.approx(764_426_119.5 - 1.0 - 0.0, abs=3600 * 24 * 366)
         and found.start_utc_s % 1 == 0.5

@@ -9,7 +9,8 @@ import numpy as np
 
 from torchvision_dddas.sources.telemetry.attitude import angles, axes
 from torchvision_dddas.sources.telemetry.klv import LocalSet, imap, local_sets, mapped, stamp_s
-from torchvision_dddas.sources.telemetry.record import Log, assembled
+from torchvision_dddas.sources.telemetry.log import Log
+from torchvision_dddas.sources.telemetry.record import assembled
 from torchvision_dddas.sources.telemetry.transport import Piece, Stream, read_stream
 from torchvision_dddas.types import Telemetry
 

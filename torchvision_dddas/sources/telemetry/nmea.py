@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.telemetry.record import Log, assembled
+from torchvision_dddas.sources.telemetry.log import Log
+from torchvision_dddas.sources.telemetry.record import assembled
 from torchvision_dddas.types import Telemetry
 
 _KNOT = 1852 / 3600
 _DAY_S = 86_400.0
+_KINDS = {"GGA", "RMC", "GLL", "VTG", "HDT", "THS"}
 
 
 def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
@@ -31,7 +33,7 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     clock = _Clock()
     for number, line in enumerate(text.splitlines(), 1):
         place = line.find("$")
-        if place < 0:
+        if place < 0 or line[place + 3 : place + 6] not in _KINDS:
             continue
         try:
             sentence = pynmea2.parse(line[place:].strip(), check=checked)

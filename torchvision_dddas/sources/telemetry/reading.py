@@ -6,11 +6,12 @@ from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.telemetry.klv import KEY
+from torchvision_dddas.sources.telemetry.mavlink import looks_like_tlog
 from torchvision_dddas.sources.telemetry.misb import read_misb
 from torchvision_dddas.sources.telemetry.nmea import read_nmea
 from torchvision_dddas.sources.telemetry.srt import read_subtitles
 from torchvision_dddas.sources.telemetry.table import read_table
-from torchvision_dddas.sources.telemetry.tlog import looks_like_tlog, read_tlog
+from torchvision_dddas.sources.telemetry.tlog import read_tlog
 from torchvision_dddas.sources.telemetry.transport import spacing
 from torchvision_dddas.sources.telemetry.ulog import MAGIC, read_ulog
 from torchvision_dddas.types import Telemetry

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.sources.telemetry.log import Log
 from torchvision_dddas.sources.telemetry.names import dated, hfov_of_focal, quantity_of, understood
-from torchvision_dddas.sources.telemetry.record import Log, assembled
+from torchvision_dddas.sources.telemetry.record import assembled
 from torchvision_dddas.types import Telemetry
 
 _TIMING = re.compile(r"(\d+):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")

@@ -4,13 +4,13 @@ import contextlib
 import io
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.telemetry.attitude import angles, axes_of_quaternion, heading_at
-from torchvision_dddas.sources.telemetry.record import Log, assembled
+from torchvision_dddas.sources.telemetry.log import Log
+from torchvision_dddas.sources.telemetry.record import assembled
 from torchvision_dddas.types import Telemetry
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -47,10 +47,7 @@ def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
         yaw = np.stack([_seconds(attitude), heading], axis=1)[np.isfinite(heading)]
         _say(log, "vehicle_heading_rad", yaw[:, 0], yaw[:, 1])
     _say_camera(log, topics, yaw)
-    start_s = min((rows[0][0] for rows in log.said.values() if rows), default=0.0)
-    for rows in log.said.values():
-        rows[:] = [(time_s - start_s, value, number) for time_s, value, number in rows]
-    return assembled(log, clock_offset_s, _clock(topics, start_s))
+    return assembled(log, clock_offset_s, _clock(topics), from_first=True)
 
 
 def _topics(log: Log) -> dict[str, Topic]:
@@ -185,11 +182,11 @@ def _say_camera(log: Log, topics: dict[str, Topic], yaw: np.ndarray) -> None:
         _say(log, name, times, values)
 
 
-def _clock(topics: dict[str, Any], start_s: float) -> float:
-    """Seconds since 1970 at the first sample, by the satellites' clock."""
+def _clock(topics: dict[str, Topic]) -> float:
+    """Seconds since 1970 when the autopilot started, by the satellites' clock."""
     gps = topics.get("vehicle_gps_position", topics.get("sensor_gps"))
     if gps is None or "time_utc_usec" not in gps:
         return math.nan
     utc_s = _column(gps, "time_utc_usec") / 1e6
     told = utc_s > 946_684_800
-    return float(np.median((utc_s - _seconds(gps))[told])) + start_s if told.any() else math.nan
+    return float(np.median((utc_s - _seconds(gps))[told])) if told.any() else math.nan
