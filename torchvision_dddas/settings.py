@@ -476,10 +476,11 @@ class LandmarkKnobs(Group):
     differentiation: Literal["exact", "greedy"] = knob(
         "exact", "-", meaning="which blob is which landmark: as many as possible at the least distance; or row by row"
     )
-    centre: Literal["motion", "steady", "colour"] = knob(
+    centre: Literal["motion", "colour"] = knob(
         "motion",
         "-",
-        meaning="where a landmark is: its blob's centre; steady: where that usually is beside its colour; its colour's",
+        meaning="where a landmark that has a blob is: the blob's centre, or that of its colour, the better one where the "
+        "colour is in the middle of the vehicle",
     )
     reach_px: float = knob(
         40.0, "px", 0, 10000, meaning="a blob further from a landmark's colour is not the landmark's"

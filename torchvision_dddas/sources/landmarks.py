@@ -235,10 +235,15 @@ def _check_far(found: Landmarks) -> None:
     known = np.isfinite(found.place[:, 0])
     if not known.any():
         return
-    middle = np.median(found.place[known], axis=0)
+    start = found.place[known][0]
+    from_start = found.place - start
+    if found.geographic:
+        from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # both sides of 180 degrees are near each other
+    middle = start + np.median(from_start[known], axis=0)
     away = _apart_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
     away = np.where(known, away, 0.0)
-    if (k := int(away.argmax())) is not None and away[k] > FARTHEST_M:
+    k = int(away.argmax())
+    if away[k] > FARTHEST_M:
         first, second = found.place[k]
         fix = "; a receiver without a fix says so: leave the place empty" if first == second == 0 else ""
         raise InputError(

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.settings import LandmarkKnobs
-from torchvision_dddas.targets.candidates import Candidate, Candidates
+from torchvision_dddas.targets.candidates import Candidates
 from torchvision_dddas.targets.colours import patches_of
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.targets.ranging import touches_border
@@ -22,8 +22,6 @@ from torchvision_dddas.types import Detections
 _SHARED = 1.8
 # Blobs of the last so many frames say what is usual; fewer than the second number say nothing.
 _MEMORY, _ENOUGH = 25, 3
-# Slower than this, px a frame, a vehicle does not show where it heads.
-_LEAST_SPEED_PX = 0.5
 
 
 def separate(
@@ -79,23 +77,11 @@ class Sighted:
 
 @dataclass
 class _Coupling:
-    """What is known of a landmark's blob.
-
-    blob_px: its place in the picture of the frame before, NaN where there was none. ratios: of the late blobs' areas to
-    those of the colour. offsets_px: from the colour's centre to the blob's, ahead and to the right of the vehicle.
-    ahead: (2,) unit vector where the vehicle heads, NaN until it has moved.
-    """
+    """What is known of a landmark's blob: its place in the picture of the frame before, NaN where there was none."""
 
     blob_px: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
     coupled: bool = False
     ratios: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
-    offsets_px: deque[np.ndarray] = field(default_factory=lambda: deque(maxlen=2 * _MEMORY))
-    ahead: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
-
-    @property
-    def axes(self) -> np.ndarray:
-        """(2, 2), its rows are ahead and right in the picture."""
-        return np.array([self.ahead, (-self.ahead[1], self.ahead[0])])
 
 
 class LandmarkFollower:
@@ -147,45 +133,13 @@ class LandmarkFollower:
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
         for k, (coupling, box) in enumerate(zip(self._blobs, chosen, strict=True)):
             own = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
-            whole = box is not None and not touches_border(box[None], size)[0]
-            usual = self._beside(coupling, self._colours[k].lock, colour[k], own, now_from_before)
-            if whole and usual is not None and self._knobs.centre == "steady":
-                image[k], by[k] = usual, "motion"
-            elif own is not None and self._knobs.centre != "colour":
+            if own is not None and self._knobs.centre == "motion":
                 image[k], by[k] = own, "motion"
-            elif whole:
+            elif box is not None and not touches_border(box[None], size)[0]:
                 image[k], by[k] = colour[k], "colour"
             if own is not None:
                 coupling.blob_px = own
         return Sighted(image, tuple(by), colour, match, touching.any(axis=0) & ~shared, shared)
-
-    @staticmethod
-    def _beside(
-        coupling: _Coupling,
-        lock: Candidate | None,
-        colour_px: np.ndarray,
-        blob_px: np.ndarray | None,
-        now_from_before: np.ndarray | None,
-    ) -> np.ndarray | None:
-        """Where the blob's centre usually lies beside the colour's, by the median over time; None until it is known.
-
-        A single blob misses parts of the vehicle or holds its shadow; the colour's centre is steady.
-        """
-        if now_from_before is not None:
-            ends = transfer(now_from_before, np.stack([colour_px, colour_px + coupling.ahead]))
-            turned = ends[1] - ends[0]
-            if np.isfinite(turned).all():
-                coupling.ahead = turned / np.linalg.norm(turned)
-        if lock is None or lock.row < 0:
-            return None
-        speed = float(np.linalg.norm(lock.velocity_px))
-        if speed > _LEAST_SPEED_PX and lock.seen > 2 * _ENOUGH:
-            coupling.ahead = lock.velocity_px / speed
-        if blob_px is not None and np.isfinite(coupling.ahead).all() and np.isfinite(colour_px).all():
-            coupling.offsets_px.append(coupling.axes @ (blob_px - colour_px))
-        if len(coupling.offsets_px) < 2 * _ENOUGH:
-            return None
-        return colour_px + coupling.axes.T @ np.median(coupling.offsets_px, axis=0)
 
     def _find(
         self,
