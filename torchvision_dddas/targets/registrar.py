@@ -18,6 +18,15 @@ Degrees = tuple[np.ndarray, tuple[float, float]]
 
 OF_POSE = ("heading", "heading", "heading", "place", "place", "altitude", "focal length")
 
+LEARNS = 0.05
+"""Share of a frame's surprise that the pace of forgetting takes over: it follows in some twenty frames."""
+
+MOST_SURPRISED = 4.0
+"""No single frame counts for more than this, such as one with a report that jumps."""
+
+FASTEST = 20.0
+"""Errors are forgotten at most so many times faster than by aerial.correlation_s."""
+
 
 @dataclass(frozen=True)
 class _Habit:
@@ -46,6 +55,7 @@ class Registrar:
         self.camera, self.settings, self.solver = camera, settings, solver
         self.focal_known, self.names, self.ground_up_m = focal_known, names, ground_up_m
         self.memory = Memory()
+        self.pace = 1.0
         self.habit = _Habit({}, frozenset())
 
     def step(
@@ -72,12 +82,14 @@ class Registrar:
         knobs, n = self.settings.aerial, len(marks)
         cause = _refused(frame, prior, marks, knobs.least_spread)
         bare = bare_prior(self.camera, knobs, self.focal_known)
-        before = self.memory.at(time_s, prior or bare, marks, knobs.correlation_s)
+        whole = before = self.memory.at(time_s, prior or bare, marks, knobs.correlation_s / self.pace)
         if cause:
             self.memory = before
             return _nothing(frame, marks, cause)
         verdict, before = self._judged(before, prior or bare, marks, None if prior is None else bare)
         solution = verdict.solution
+        if whole.told and solution is not None and solution.freedom > 0:
+            self._hurry(solution.cost / solution.freedom if before is whole else MOST_SURPRISED)
         if solution is None:
             self.memory = before
             cause = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
@@ -100,6 +112,15 @@ class Registrar:
             changes=verdict.changes,
             cause=cause,
         )
+
+    def _hurry(self, surprise: float) -> None:
+        """Forget faster while frames disagree with the past more than its errors let expect, 1 being as expected.
+
+        Errors that change faster than they are said to would else be believed long after they are gone. Never slower
+        than is said: errors that stay alike for longer cost nothing.
+        """
+        pace = self.pace * (1 + LEARNS * (min(surprise, MOST_SURPRISED) - 1))
+        self.pace = min(max(pace, 1.0), FASTEST)
 
     def _judged(self, before: Memory, prior: Prior, marks: Marks, bare: Prior | None) -> tuple[Verdict, Memory]:
         """The landmarks tested against what is remembered, and what is to be remembered of the past then."""
