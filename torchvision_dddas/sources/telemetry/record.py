@@ -35,6 +35,9 @@ def assembled(
     rows_of = {name: np.array(rows, float).reshape(-1, 3) for name, rows in log.said.items()} | log.columns
     said = {name: in_order(log, rows) for name, rows in rows_of.items()}
     moments = in_order(log, np.insert(np.array(log.moments, float).reshape(-1, 2), 1, 0.0, axis=1))
+    start = min((rows[0, 0] for rows in (*said.values(), moments) if len(rows)), default=0.0) if from_first else 0.0
+    for rows in (*said.values(), moments):
+        rows[:, 0] -= start
     sane(log, said)
     on_the_globe(log, said)
     said = {name: rows for name, rows in said.items() if np.isfinite(rows[:, 1]).any()}
@@ -43,7 +46,6 @@ def assembled(
     note_lacks(log, said)
     note_silence(log, said)
     times = _with_gaps(log, np.unique(np.concatenate([moments[:, 0], *(rows[:, 0] for rows in said.values())])))
-    start = float(times[0]) if from_first else 0.0
     columns = {name: _column(times, rows, log.bridge_s, _FULL.get(name)) for name, rows in said.items()}
     for name in _TURNING:
         if name in columns:
@@ -59,13 +61,13 @@ def assembled(
         if np.isfinite(columns["speed_m_s"]).any():
             log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
     return Telemetry(
-        times - start + clock_offset_s,
+        times + clock_offset_s,
         columns.get("altitude_m", unknown),
         columns.get("speed_m_s", unknown),
         place,
         geographic,
         **{name: columns.get(name, unknown) for name in (*_TURNING, "above_sea_m", "pitch_rad", "hfov_rad")},
-        start_utc_s=start_utc_s + start - clock_offset_s,
+        start_utc_s=float(start_utc_s + start - clock_offset_s),
         origin=f"{log.path.name} ({log.kind})",
         notes=tuple(log.notes),
     )
