@@ -479,7 +479,7 @@ class LandmarkKnobs(Group):
     centre: Literal["motion", "colour"] = knob(
         "motion",
         "-",
-        meaning="where a landmark that has a blob is: the blob's centre, or that of its colour, the better one where the "
+        meaning="where a landmark that has a blob is: the blob's centre, or its colour's, the better one where the "
         "colour is in the middle of the vehicle",
     )
     reach_px: float = knob(

@@ -22,7 +22,7 @@ _MOST = 16
 # By so much more must speak for the best patch than for the next before it is taken for the landmark.
 _MARGIN = 1.0
 # Only patches of at least this logarithm less than its size can be taken for it.
-_ALIKE = 1.5
+_ALIKE = 2.0
 
 
 @dataclass
