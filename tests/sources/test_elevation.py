@@ -136,6 +136,15 @@ def test_a_photo_shows_each_place_in_its_colour(tmp_path):
         assert found.image[v, u].tolist() == list(blue_green_red)
 
 
+def test_a_white_band_of_a_photo_is_no_hole(tmp_path):
+    photo = np.full((3, 60, 60), 90, "uint8")
+    photo[0, 28:32, 28:32] = 255
+    photo[:, :10] = 255
+    found = read_ortho(write(tmp_path / "a.tif", photo, nodata=255), HERE, ORIGIN, 20)
+    middle = found.image.shape[0] // 2
+    assert found.image[middle, middle].tolist() == [90, 90, 255]
+
+
 def test_a_photo_that_is_none_or_lies_elsewhere_is_refused(tmp_path):
     with pytest.raises(InputError, match="1 bands of float32; wanted a photo"):
         read_ortho(write(tmp_path / "a.tif", slope()), HERE, ORIGIN)

@@ -142,7 +142,10 @@ def _part(raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: 
     values = raster.read(bands, window=window, out_shape=out, masked=True, resampling=Resampling.average)
     wide, high, t = width / shape[1], height / shape[0], raster.window_transform(window)
     scaled = Affine(t.a * wide, t.b * high, t.c, t.d * wide, t.e * high, t.f)
-    return values.astype(np.float64).filled(np.nan), scaled
+    holes = np.ma.getmaskarray(values)
+    # Of a photo, a band that is white is no hole, though the file's value for holes be 255.
+    holes = holes if values.ndim == 2 else np.broadcast_to(holes.all(axis=0), values.shape)
+    return np.where(holes, np.nan, values.data.astype(np.float64)), scaled
 
 
 def _resolution_m(raster: Any) -> float:
