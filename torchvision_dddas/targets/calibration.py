@@ -23,7 +23,7 @@ _APART = 10
 # From this area on size says nothing; and a clear colour has a score of at least the second.
 _AREA_PX, _CLEAR = 150.0, 0.24
 # Ranges go beyond what was seen by these, hue, saturation and value: the widest that marks the least else is taken.
-_MARGINS = ((8, 60, 80), (6, 40, 50), (4, 25, 30), (2, 10, 15))
+_MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
 _LOWEST = (40, 30)
 _ENDS = (2, 98)
 
@@ -87,8 +87,8 @@ def in_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0)
     count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
     window = np.ones(2 * _HALF + 1)
     around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], window, "valid")
-    hue = float(around.argmax())
-    return Sample(hue, vivid[np.abs(hue_apart(vivid[:, 0], hue)) <= _HALF], 1.0, picture, box_px)
+    most = vivid[np.abs(hue_apart(vivid[:, 0], float(around.argmax()))) <= _HALF]
+    return Sample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
 
 
 def pooled(samples: Sequence[Sequence[Sample]], count: int | None) -> list[list[Sample]]:
@@ -135,6 +135,8 @@ def ranges_of(
             count = sum(_others(hsv, lowest, highest, group, n, least_area_px) for n, hsv in enumerate(pictures))
             if best is None or count < best:
                 best, low[k], high[k], others[k] = count, lowest, highest, count
+            if count == 0:
+                break
     return low, high, others[:, 0]
 
 
@@ -147,15 +149,19 @@ def named(hues: Sequence[float]) -> list[str]:
 def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> Sample:
     x, y, width, height = (int(v) for v in patches.box_px[k])
     seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
-    hue = float(np.angle(np.exp(1j * np.pi * seen[:, 0].astype(float) / 90).mean()) * 90 / np.pi % 180)
+    hue = _mean_hue(seen[:, 0])
     # What is rare in the picture, and alone of its kind where it is.
     around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
-    share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0) ** 0.5
+    share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
     # The middle of the box is all of it, also what the window of hue and saturation left out.
     inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
     alike = inner[(np.abs(hue_apart(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
     pixels = np.concatenate([seen, alike])
     return Sample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
+
+
+def _mean_hue(hues: np.ndarray) -> float:
+    return float(np.angle(np.exp(1j * np.pi * hues.astype(float) / 90).mean()) * 90 / np.pi % 180)
 
 
 def _compact(patches: Patches, picture_px: int) -> np.ndarray:
