@@ -217,6 +217,8 @@ def main() -> None:
         for kind, crowd in kinds.items():
             every = 1 if kind.endswith("detections") else options.every
             found[kind] = study(crowd, camera, RATE_HZ[name], options.seeds, every)
+            if not found[kind]:
+                continue
             tables.append(table(kind, found[kind]))
             print(tables[-1] + "\n")
     if not tables:

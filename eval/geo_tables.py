@@ -58,7 +58,7 @@ def fault_table(rows: list[Row]) -> str:
         "| its crowd | in ellipses",
     )
     for row in rows:
-        told = {"none": "–", "swap": f"{percent(row['reassigned'])} reassigned"}
+        told = {"none": "–", "swap": f"{percent(row['found'])} swapped back"}
         cells = [row["fault"], row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}"]
         pairs = [f"{metres(row[k][0])} ({metres(row[k][1])})" for k in ("homography", "before", "after")]
         found = told.get(row["fault"], f"{percent(row['found'])} that alone")
@@ -81,8 +81,8 @@ def time_table(rows: list[Row]) -> str:
     """What memory of earlier frames gains."""
     lines = heading(
         "GPS",
-        "n | errors alike over | flights | single frames: mean (median) | in ellipses | over time: mean (median) | in ellipses "
-        "| over time − single",
+        "n | errors alike over | flights | single frames: mean (median) | in ellipses | over time: mean (median) "
+        "| in ellipses | over time − single",
     )
     for row in rows:
         cells = [row["gps"], row["landmarks"], f"{row['alike_s']:g} s", row["flights"]]
