@@ -143,6 +143,19 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(aerial, tmp_path):
     assert "note: 1 frames could not be located" in result.stdout
 
 
+def test_a_landmark_that_is_hardly_ever_where_it_is_expected_is_told_of(aerial, tmp_path):
+    class Wrong(Overflight):
+        def shown(self, frame, east_north, up_m=0.0):
+            seen = super().shown(frame, east_north, up_m)
+            # The picture shows another vehicle, 200 px away, in its place.
+            return seen + [[200.0, 0.0]] * np.isclose(east_north, self.marks(frame)[1]).all(axis=1)[:, None]
+
+    result = aerial(Wrong(landmarks=6))
+    found = located(result, tmp_path / "out")
+    assert Overflight(landmarks=6).errors(found).max() < 0.3
+    assert "note: ugv1 was left out in 10 of 10 frames" in result.stdout
+
+
 def test_telemetry_alone_bridges_a_frame_without_landmarks(aerial, tmp_path):
     flight = Overflight()
     few = flight.landmarks_csv(keep=lambda frame, k: frame != 4)

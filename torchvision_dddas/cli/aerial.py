@@ -257,4 +257,10 @@ def ground_lines(journal: "Record") -> list[str]:
     lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
     if gaps := counts["by"].get("nothing", 0):
         lines.append(f"note: {gaps} frames could not be located and have no positions; run.json says why")
+    for name, kept in counts.get("landmarks", {}).items():
+        if kept["seen"] and kept["used"] < 0.5 * kept["seen"]:
+            lines.append(
+                f"note: {name} was left out in {kept['seen'] - kept['used']} of {kept['seen']} frames; is its place "
+                "right, and does the ground rise or fall there (--dem)?"
+            )
     return lines
