@@ -178,3 +178,11 @@ def test_a_plate_with_a_seam_is_one_patch_and_specks_are_none():
     masks = plates([(100, 50, 10, 10), (112, 50, 8, 10), (300, 200, 2, 2)])
     found = follower().step(1, masks, blobs())
     assert found.colour_px[0] == pytest.approx([109.5, 54.5], abs=0.2)
+
+
+def test_a_jerk_of_the_camera_that_nobody_measured_does_not_lose_a_landmark():
+    one = follower()
+    for frame in range(1, 6):
+        one.step(frame, plates((100, 50, 10, 10)), blobs(), np.eye(3))
+    found = one.step(6, plates((122, 62, 10, 10)), blobs(), None)
+    assert found.image_px.tolist() == [[126.5, 66.5]]

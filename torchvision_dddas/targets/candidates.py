@@ -62,9 +62,11 @@ class Candidates:
         self._all: list[Candidate] = []
         self.lock: Candidate | None = None
         self.sure = False
+        self._blind = False
 
     def advance(self, now_from_before: np.ndarray | None) -> None:
-        """Go on to the next picture."""
+        """Go on to the next picture; without the background's motion patches are looked for further around."""
+        self._blind = now_from_before is None
         if now_from_before is not None and self._all:
             places = np.array([(one.centre_px, one.origin_px) for one in self._all])
             places = transfer(now_from_before, places.reshape(-1, 2)).reshape(places.shape)
@@ -115,7 +117,8 @@ class Candidates:
             return {}
         before = np.array([one.centre_px for one in self._all])
         gate = np.array([np.sqrt(one.area_px) * (1 + 0.2 * one.missed) + 4 for one in self._all])
-        gate = np.minimum(gate, max(self._knobs.reach_px, 4.0))
+        reach = max(self._knobs.reach_px, 4.0)
+        gate = np.full(len(gate), reach) if self._blind else np.minimum(gate, reach)
         apart = np.linalg.norm(before[:, None] - found.centre_px[rows][None], axis=2) / gate[:, None]
         change = np.log(found.area_px[rows][None] / np.array([one.area_px for one in self._all])[:, None])
         cost = np.where(apart <= 1, apart + 0.3 * np.abs(change), 100.0)
