@@ -10,6 +10,9 @@ from torchvision_dddas.targets.projection import lifted, rays
 from torchvision_dddas.targets.rotation import turned
 from torchvision_dddas.types import Camera, CameraPose, Marks
 
+HEADINGS = 8
+"""So many are tried where nothing else tells one."""
+
 
 def find_pose(
     marks: Marks, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
@@ -28,6 +31,8 @@ def find_pose(
     starts = [] if known.all() else _turned_about_up(seen, camera, expected)
     if len(seen) >= 4 and not (starts and known[:2].all() and known[5]):
         starts += of_homography(_plain(seen, camera), camera, seen.east_north_m, seen.up_m)
+    if not starts and known[[0, 1, 3, 4, 5]].all():
+        starts = _all_headings(expected)
     found = [one for start in starts if (one := fit_pose(marks, camera, expected, start, used)) is not None]
     return min(found, key=lambda one: one.cost) if found else None
 
@@ -66,6 +71,13 @@ def _turned_about_up(marks: Marks, camera: Camera, expected: Expected) -> list[C
     place[:2] = np.where(known[3:5], place[:2], [middle.real, middle.imag])
     axes = turned(np.array([0.0, 0.0, turn])) @ pose.axes
     return [CameraPose(place, axes, pose.focal)]
+
+
+def _all_headings(expected: Expected) -> list[CameraPose]:
+    """With all known but the heading: looking every way."""
+    pose = moved(expected.reference, expected.mean[:7])
+    turns = np.linspace(0, 2 * np.pi, HEADINGS, endpoint=False)
+    return [replace(pose, axes=turned(np.array([0.0, 0.0, turn])) @ pose.axes) for turn in turns]
 
 
 def of_homography(flat_from_ground: np.ndarray, camera: Camera, east_north_m: np.ndarray, up_m: np.ndarray) -> list:

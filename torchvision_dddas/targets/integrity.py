@@ -4,8 +4,8 @@ The sum of squares of the likeliest pose is chi-square where all is right: it we
 telemetry and reports expect, with the errors of both. Above the gate something is wrong. Tried are then, in this order,
 and the likeliest that passes is taken:
   one change: two identities swapped, or one landmark left out;
-  more changes: identities by assignment of the pixels to where they are expected, less the shift that all have in
-  common, or two left out;
+  identities by assignment of the pixels to where they are expected, less the shift that all have in common;
+  two landmarks left out, or one with identities by assignment;
   the telemetry left out, where five landmarks or more agree among themselves.
 Where nothing passes the errors are taken to be as much larger as they were seen to be.
 """
@@ -72,11 +72,13 @@ def judge(
     names: tuple[str, ...],
     alone: Expected | None = None,
     known: Hypothesis | None = None,
+    only: bool = False,
 ) -> Verdict:
     """Test the landmarks of a frame and repair what is wrong.
 
     names: (n,) of the landmarks, for the words. probability: share of right landmarks that pass. alone: what is
-    expected without telemetry; None where `expected` is that already. known: a repair to try before all others.
+    expected without telemetry; None where `expected` is that already. known: a repair to try before all others;
+    only: and instead of them.
     """
     n = len(marks)
     everyone, itself = np.ones(n, bool), np.arange(n)
@@ -84,9 +86,10 @@ def judge(
     if passes(first, probability):
         return Verdict(first, itself, everyone)
     as_before: list[Hypothesis] = [] if known is None else [known]
-    for hypotheses in (iter(as_before), _one_change(marks, camera, expected), _more_changes(marks, camera, expected)):
+    others = () if only else (_one_change, _assignment, _two_changes)
+    for hypotheses in (lambda *_: iter(as_before), *others):
         tried = []
-        for order, used in hypotheses:
+        for order, used in hypotheses(marks, camera, expected):
             solution = find_pose(reordered(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
                 tried.append((float(chdtrc(solution.freedom, solution.cost)), solution, order, used))
@@ -122,14 +125,18 @@ def _one_change(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hy
     return _best_first(swaps + drops, marks, camera, expected)
 
 
-def _more_changes(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
-    n = len(marks)
+def _assignment(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
     order = _assigned(marks, camera, expected)
-    assigned = [] if order is None else [(order, np.ones(n, bool))]
+    if order is not None:
+        yield order, np.ones(len(marks), bool)
+
+
+def _two_changes(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
+    n = len(marks)
     drops = [_without(n, set(pair)) for pair in combinations(range(n), 2)]
-    both = [(order, used) for order, _ in assigned for _, used in (_without(n, {one}) for one in range(n))]
-    yield from assigned
-    yield from _best_first(drops + both, marks, camera, expected)
+    one_out = [_without(n, {one})[1] for one in range(n)]
+    both = [(order, used) for order, _ in _assignment(marks, camera, expected) for used in one_out]
+    return _best_first(drops + both, marks, camera, expected)
 
 
 def _swapped(n: int, pair: tuple[int, int]) -> Hypothesis:

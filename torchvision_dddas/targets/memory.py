@@ -15,6 +15,10 @@ from torchvision_dddas.types import Marks
 FORGOTTEN = 4.0
 """A landmark not seen for so many time constants is forgotten."""
 
+JITTER = 0.1
+"""Share of the variance of the telemetry's angles and place that is new in every frame: a gimbal shakes, and samples
+are older than the picture. Without it a clip would take such shaking for news of its landmarks."""
+
 ANOTHER = 1.5
 """A receiver whose standard deviation changes by more than this factor works another way: its error is another."""
 
@@ -68,7 +72,8 @@ class Memory:
         # The telemetry's may be a share of the altitude, and grow with it.
         grown[7:] = np.where((grown[7:] < ANOTHER) & (grown[7:] > 1 / ANOTHER), grown[7:], 0.0)
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
-        filled = np.where(np.isfinite(sigma), sigma, 0.0)
+        filled = np.where(np.isfinite(sigma), sigma, 0.0) * _slow(size)
+        was = was * _slow(size)
         mean, covariance = mean * factor, covariance * np.outer(factor, factor)
         # What is new of each: all that it has beyond what it keeps of its standard deviation.
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
@@ -81,7 +86,7 @@ class Memory:
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
         mean, information = np.zeros(7 + 2 * n), np.zeros((7 + 2 * n, 7 + 2 * n))
         mean[theirs] = self.mean[ours]
-        inverse = np.linalg.inv(self.covariance[np.ix_(ours, ours)])
+        inverse = np.linalg.inv(self._seen(ours))
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
@@ -90,7 +95,7 @@ class Memory:
         known, n = np.flatnonzero(prior.known), len(marks)
         ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
-        before = self.covariance[np.ix_(ours, ours)]
+        before = self._seen(ours)
         gain = np.linalg.solve(before, self.covariance[ours]).T
         now = solution.correction_covariance[np.ix_(theirs, theirs)]
         mean = self.mean + gain @ (solution.correction[theirs] - self.mean[ours])
@@ -105,8 +110,21 @@ class Memory:
         mean[rows] = 0
         covariance[rows] = 0
         covariance[:, rows] = 0
-        covariance[rows, rows] = np.where(np.isfinite(self.sigma[rows]), self.sigma[rows], 0.0) ** 2
+        slow = (self.sigma * _slow(len(mean)))[rows]
+        covariance[rows, rows] = np.where(np.isfinite(slow), slow, 0.0) ** 2
         return replace(self, mean=mean, covariance=covariance)
+
+    def _seen(self, rows: np.ndarray) -> np.ndarray:
+        """The covariance of errors as a single frame has them: what lasts, and what is new in every frame."""
+        sigma = self.sigma[rows]
+        return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - _slow(len(self.mean))[rows] ** 2))
+
+
+def _slow(size: int) -> np.ndarray:
+    """Share of each standard deviation that lasts."""
+    share = np.ones(size)
+    share[:6] = np.sqrt(1 - JITTER)
+    return share
 
 
 def places_of(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:

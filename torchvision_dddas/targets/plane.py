@@ -5,29 +5,24 @@ Bare homography (appendix A, IV-B, eq. 6 to 11): eight unknowns by landmarks alo
 belongs; here it has its place. With a pose of the camera pixels are laid on the ground by rays.
 """
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from torchvision_dddas.targets.geodesy import lonlat
-from torchvision_dddas.targets.projection import inverse_2x2, slopes_of_lift
+from torchvision_dddas.targets.projection import inverse_2x2, project, slopes_of_lift
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.targets.rotation import cross
+from torchvision_dddas.targets.surface import Surface, met_surface
 from torchvision_dddas.types import Camera, Fix, Marks
-
-Surface = Callable[[np.ndarray], np.ndarray]
-"""Height above the plane up = 0 of places (N, 2) in east and north; NaN where it is not known."""
 
 LEAST = 4
 """Landmarks that a plane homography takes."""
 
-_SLOPE_M = 0.5
-"""How far aside heights are compared to tell a slope."""
 
-_REACH, _SAMPLES, _HALVINGS = 4.0, 96, 14
-"""A ray is followed so many times as deep as the ground below the camera lies, in so many steps, then halved."""
+VAGUE = 0.3
+"""A homography is none whose depth at a landmark is no better known than this, as a share of it."""
 
 
 class Solver(Protocol):
@@ -87,6 +82,13 @@ def homography_fix(
     spread_out = np.einsum("n,nki,nkl,nlj->ij", ours**2, by_matrix, seen, by_matrix)
     inverse = np.linalg.pinv(information, rcond=1e-15, hermitian=True)
     covariance = inverse @ spread_out @ inverse
+    vague = np.sqrt(np.einsum("ni,ij,nj->n", ground, covariance[6:, 6:], ground)) / np.abs(depth)
+    if vague.max() > VAGUE:
+        cause = (
+            f"the {n} landmarks of frame {frame} lie too near one line, three of them or all, for how well they are "
+            "known: their homography would be no more than a guess; add a landmark off the line, or telemetry"
+        )
+        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
     matrix, covariance = _shifted(matrix[0], covariance, -middle)
     return Fix(
         frame, "homography", image_from_ground=matrix, matrix_covariance=covariance, landmark=ids, state=("used",) * n
@@ -136,6 +138,27 @@ def ground_points(
     if fix.image_from_ground is None:
         return np.full((len(pixels), 2), np.nan), np.full((len(pixels), 2, 2), np.nan)
     return _by_inverse(fix.image_from_ground, fix.matrix_covariance, pixels, sigma_px)
+
+
+def feet_px(
+    fix: Fix, camera: Camera, box_px: Float[np.ndarray, "N 4"], body_height_m: float | Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N 2"]:
+    """Pixels of the ground below upright bodies whose middles are the middles of their boxes.
+
+    The ray through the middle is met with the plane at half the body's height. The foot is never further from the
+    middle than the box reaches: a shadow's box, or a height that is too large, must not throw it off. Straight down,
+    and where no pose of the camera is known, it is the middle itself.
+    """
+    box = np.asarray(box_px, float).reshape(-1, 4)
+    middle = box[:, :2] + box[:, 2:] / 2 - 0.5
+    if fix.pose is None or fix.covariance is None or len(box) == 0:
+        return middle
+    half = np.broadcast_to(np.asarray(body_height_m, float) / 2, len(box))
+    below, _ = _by_rays(fix, camera, middle, 0.0, half, None)
+    step = project(np.column_stack([below, np.zeros(len(box))]), fix.pose, camera) - middle
+    step[~np.isfinite(step).all(axis=1)] = 0.0
+    share = np.minimum(box[:, 2:] / 2 / np.maximum(np.abs(step), 1e-9), 1.0).min(axis=1)
+    return middle + step * share[:, None]
 
 
 def absolute(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m: float) -> Float[np.ndarray, "N 2 2"]:
@@ -254,50 +277,9 @@ def _met(
     place_m: np.ndarray, way: np.ndarray, up_m: np.ndarray, surface: Surface | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far along rays the ground is (N,), and its normal there (N, 3), upward; NaN where a ray meets none."""
-    normal = np.tile([0.0, 0.0, 1.0], (len(way), 1))
+    if surface is not None:
+        return met_surface(place_m, way, up_m, surface)
+    flat = np.broadcast_to(np.array([0.0, 0.0, 1.0]), way.shape)
     down = np.where(way[:, 2] < -1e-9 * np.linalg.norm(way, axis=1), way[:, 2], np.nan)
-    if surface is None:
-        far = (up_m - place_m[2]) / down
-        return np.where(far > 0, far, np.nan), normal
-    far = _first_met(place_m, way, up_m, surface, down)
-    there = place_m[:2] + far[:, None] * way[:, :2]
-    for axis in (0, 1):
-        aside = np.zeros(2)
-        aside[axis] = _SLOPE_M
-        rise = (surface(there + aside) - surface(there - aside)) / (2 * _SLOPE_M)
-        normal[:, axis] = -np.nan_to_num(rise)  # at the edge of what is known
-    return far, normal
-
-
-def _first_met(
-    place_m: np.ndarray, way: np.ndarray, up_m: np.ndarray, surface: Surface, down: np.ndarray
-) -> np.ndarray:
-    """(N,) how far along each ray it first comes below the surface raised by up_m; NaN where that is not known."""
-    below = float(surface(place_m[None, :2])[0])
-    height = place_m[2] - (below if np.isfinite(below) else 0.0)
-    if not height > 0 or not len(way):
-        return np.full(len(way), np.nan)
-
-    def above(far: np.ndarray) -> np.ndarray:
-        """Metres above the ground (..., N)."""
-        points = place_m + far[..., None] * way
-        return points[..., 2] - up_m - surface(points[..., :2].reshape(-1, 2)).reshape(far.shape)
-
-    steps = np.linspace(0, _REACH, _SAMPLES + 1)[:, None] * (-height / down)
-    gap = above(steps)
-    # Where the ground is not known a ray may have met it: only from above to below is it seen to.
-    with np.errstate(invalid="ignore"):
-        met = (gap[:-1] > 0) & (gap[1:] <= 0)
-        hidden = np.cumsum(gap <= 0, axis=0)[:-1] > 0
-    met &= ~hidden
-    first, ray = met.argmax(axis=0), np.arange(len(way))
-    low, high = steps[first, ray], steps[first + 1, ray]
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        with np.errstate(invalid="ignore"):
-            over = above(middle) > 0
-        low, high = np.where(over, middle, low), np.where(over, high, middle)
-    at_low, at_high = above(low), above(high)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.where(at_low > at_high, at_low / (at_low - at_high), 0.5)
-    return np.where(met.any(axis=0), low + share * (high - low), np.nan)
+    far = (up_m - place_m[2]) / down
+    return np.where(far > 0, far, np.nan), flat

@@ -27,6 +27,14 @@ ENOUGH = 1e-6
 """A step this small, squared and in standard deviations, is the last: a thousandth."""
 
 
+NO_BETTER = 1e-5
+"""A step that lessens the sum of squares by a smaller share is the last, too."""
+
+SETTLING = 2
+"""Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
+than places that the sum of squares lies in a bent valley, and straight steps along it would be short."""
+
+
 @dataclass(frozen=True)
 class Prior:
     """What is expected of a pose before any landmark is seen.
@@ -154,7 +162,11 @@ def fit_pose(
             continue
         gain = float(step @ downhill)
         tried = problem.at(moved(state.pose, step[:7]), state.places + step[7:].reshape(n, 2))
+        for _ in range(0 if expected.known.all() else SETTLING):
+            tried = problem.settled(tried)
         if tried is not None and tried.cost <= state.cost + 1e-9:
+            # What fits badly at best need not be known as finely.
+            gain = min(gain, (state.cost - tried.cost) / (NO_BETTER * (1 + tried.cost)) * ENOUGH)
             state, damping = tried, damping / 10
         else:
             damping = max(10 * damping, 1e-3)
@@ -206,6 +218,14 @@ class _Problem:
         self.image = marks.image_px[used].ravel()
         self.weight = 1 / np.repeat(marks.pixel_sigma[used], 2) ** 2
         self.free_heading = not expected.known[HEADING]
+
+    def settled(self, state: _State | None) -> _State | None:
+        """The same pose, with the places a step nearer to the likeliest that go with it."""
+        if state is None or len(self.used) == 0:
+            return state
+        step = np.linalg.solve(state.curvature[7:, 7:], state.downhill[7:])
+        nearer = self.at(state.pose, state.places + step.reshape(-1, 2))
+        return nearer if nearer is not None and nearer.cost < state.cost else state
 
     def at(self, pose: CameraPose, places: np.ndarray) -> _State | None:
         points = np.column_stack([places, self.marks.up_m])[self.used]

@@ -86,16 +86,20 @@ class Registrar:
         if cause:
             self.memory = before
             return _nothing(frame, marks, cause)
+        if prior is None:
+            # By landmarks alone a tilt and its mirror are hard to tell apart: remembered, a wrong one would last.
+            before = before.anew(np.arange(len(before.mean)))
         verdict, before = self._judged(before, prior or bare, marks, None if prior is None else bare)
         solution = verdict.solution
-        if whole.told and solution is not None and solution.freedom > 0:
+        if prior is not None and whole.told and solution is not None and solution.freedom > 0:
             self._hurry(solution.cost / solution.freedom if before is whole else MOST_SURPRISED)
         if solution is None:
             self.memory = before
             cause = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
             return _nothing(frame, marks, cause)
-        told = bare if verdict.alone else prior or bare
-        self.memory = before.after(told, marks, verdict.used, solution) if verdict.passed else before
+        self.memory = whole
+        if prior is not None and verdict.passed and not verdict.alone:
+            self.memory = before.after(prior, marks, verdict.used, solution)
         count = int(verdict.used.sum())
         cause = verdict.cause
         if not cause and count < LEAST:
@@ -133,13 +137,17 @@ class Registrar:
         alone = None if bare is None else expected_of(bare, marks.sigma_m)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         known = self._as_before(marks)
+        if known is not None:
+            verdict = judge(marks, self.camera, before.expected(prior, marks), gate, names, known=known, only=True)
+            if verdict.passed:
+                return verdict, before
         for memory in self._less_and_less(before, prior, marks):
             expected = memory.expected(prior, marks)
             solution = find_pose(marks, self.camera, expected)
             if passes(solution, gate):
                 return Verdict(solution, itself, everyone), memory
         for memory in (before, before.anew(np.arange(len(before.mean)))):
-            verdict = judge(marks, self.camera, memory.expected(prior, marks), gate, names, alone, known)
+            verdict = judge(marks, self.camera, memory.expected(prior, marks), gate, names, alone)
             if verdict.passed:
                 break
         identities = marks.landmark.tolist()
