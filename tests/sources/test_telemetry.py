@@ -53,7 +53,7 @@ def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path: Pa
         ),
         ("time_s,altitude_m,longitude_deg,latitude_deg\n0,20,50,110\n", ["line 2", "latitude_deg is 110", "swapped?"]),
         ("time_s,altitude_m,longitude_deg,latitude_deg\n0,20,190,50\n", ["line 2", "longitude_deg is 190"]),
-        ("time_s,altitude_m,pitch_deg\n0,20,95\n", ["line 2", "pitch_deg is '95'", "-90 to 90"]),
+        ("time_s,altitude_m,pitch_deg\n0,20,195\n", ["line 2", "pitch_deg is '195'", "-180 to 180"]),
         ("time_s,altitude_m,hfov_deg\n0,20,200\n", ["line 2", "hfov_deg is '200'"]),
     ],
 )

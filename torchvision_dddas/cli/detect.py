@@ -77,7 +77,7 @@ def detect_clip(
         from torchvision_dddas.vision import load
 
         source = open_source(clip, rate_hz=rate_hz)
-        flight = read_telemetry(telemetry) if telemetry else None
+        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip) if telemetry else None
         vision = load(backend, settings)
         facts = {
             "input": clip,
@@ -87,6 +87,7 @@ def detect_clip(
             "settings": settings.model_dump(),
         }
         journal = output.begin(facts, source.rate_hz)
+        journal.notes += flight.notes if flight is not None else ()
         try:
             with progress(source.name, source.count, quiet) as tick:
                 for scene in run(source, vision, settings, flight):
@@ -103,4 +104,4 @@ def summary(journal: "Journal", folder: Path, save: Sequence[str]) -> list[str]:
     made = ["detections.csv", "detections.txt", *(saved[name] for name in save), "run.json"]
     doubtful = f"{journal.unreliable_frames} frames with unreliable registration"
     first = f"{journal.frames} frames, {journal.targets} targets, {doubtful}"
-    return last_lines(first, journal, folder, made)
+    return last_lines(first, journal, folder, made, journal.notes)
