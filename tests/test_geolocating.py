@@ -15,7 +15,7 @@ from torchvision_dddas.sources.colours import read_colours
 from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.sources.landmarks import read_landmarks
 from torchvision_dddas.sources.telemetry import read_telemetry
-from torchvision_dddas.types import Detections, Elevation, Flight, Frame, Scene, Telemetry
+from torchvision_dddas.types import Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision import load_colours, load_solver
 
 
@@ -221,6 +221,20 @@ def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path
         # The landmark's blob is gone from the targets, and the mask counts on.
         assert len(found.scene.detections) == 1
         assert found.scene.mask.max() == 1
+
+
+def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_tells(prepared, tmp_path):
+    flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
+    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
+    locator, _ = prepared(flight, pictured=False)
+    watch = Watch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
+    still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
+        truth = flight.shown(frame, flight.marks(frame))
+        beside = truth[:1] + [[9.0 if frame == 4 else 0.0, 0.0]]
+        found = watch.step(replace(scene(frame, picture, beside), step=still))
+        np.testing.assert_allclose(found.look.marks.image_px[0], truth[0], atol=1.0)
+    assert found.sighted_by[0] == "colour"
 
 
 def scene(frame, picture, landmark_px):

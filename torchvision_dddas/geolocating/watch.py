@@ -103,7 +103,10 @@ class Watch:
         by = [""] * len(marks)
         for row, which in enumerate(marks.landmark.tolist()):
             if which in place:
-                pixels[row], by[row] = seen.image_px[place[which]], seen.by[place[which]]
+                k = place[which]
+                pixels[row], by[row] = seen.image_px[k], seen.by[k]
+                if by[row] == "motion" and _astray(pixels[row], seen.colour_px[k], expected[k], marks.pixel_sigma[row]):
+                    pixels[row], by[row] = seen.colour_px[k], "colour"
         return replace(marks, image_px=pixels), seen.rows, tuple(by)
 
     def _expected(self, marks: Marks, step: np.ndarray | None) -> np.ndarray:
@@ -118,6 +121,17 @@ class Watch:
         else:
             return np.full((len(marks), 2), np.nan)
         return transfer(step, before)
+
+
+def _astray(
+    blob_px: np.ndarray, colour_px: np.ndarray, expected_px: np.ndarray, sigma_px: float, least_sigmas: float = 3.0
+) -> bool:
+    """Whether a landmark's colour is clearly nearer to where the landmark is expected than the centre of its blob.
+
+    Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the vehicle's.
+    """
+    blob, colour = (float(np.linalg.norm(at - expected_px)) for at in (blob_px, colour_px))
+    return blob > least_sigmas * sigma_px and colour < 0.5 * blob
 
 
 def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
