@@ -231,7 +231,7 @@ def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_
     still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
         truth = flight.shown(frame, flight.marks(frame))
-        beside = truth[:1] + [[9.0 if frame == 4 else 0.0, 0.0]]
+        beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
         found = watch.step(replace(scene(frame, picture, beside), step=still))
         np.testing.assert_allclose(found.look.marks.image_px[0], truth[0], atol=1.0)
     assert found.sighted_by[0] == "colour"
