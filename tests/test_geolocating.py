@@ -15,7 +15,7 @@ from torchvision_dddas.sources.colours import read_colours
 from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.sources.landmarks import read_landmarks
 from torchvision_dddas.sources.telemetry import read_telemetry
-from torchvision_dddas.types import Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Camera, Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision import load_colours, load_solver
 
 
@@ -196,6 +196,13 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert not known
     assert "70 degrees were taken" in note
     assert camera.centre_px == (499.5, 299.5)
+
+
+def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), height_m=50.0)
+    _, known, (note,) = camera_of(camera, None, None, Settings())
+    assert known
+    assert "give --telemetry" in note
 
 
 def test_places_over_the_date_line_are_near_each_other(prepared):
