@@ -237,6 +237,7 @@ def _by_inverse(
             return found, np.full((len(pixels), 2, 2), np.nan)
         seen = by_matrix @ covariance @ by_matrix.swapaxes(1, 2) + sigma_px**2 * np.eye(2)
         spread_m2 = by_pixel @ seen @ by_pixel.swapaxes(1, 2)
+        spread_m2 = (spread_m2 + spread_m2.swapaxes(1, 2)) / 2
     return found, np.where(np.isfinite(found).all(axis=1)[:, None, None], spread_m2, np.nan)
 
 

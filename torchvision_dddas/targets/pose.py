@@ -23,14 +23,14 @@ EXACT_M = 1e-3
 """A landmark is never known better than this: the curvature would be too steep to invert."""
 
 STEPS = 30
-ENOUGH = 1e-6
-"""A step this small, squared and in standard deviations, is the last: a thousandth."""
+ENOUGH = 1e-5
+"""A step this small, squared and in standard deviations, is the last."""
 
 
 NO_BETTER = 1e-5
 """A step that lessens the sum of squares by a smaller share is the last, too."""
 
-SETTLING = 2
+SETTLING = 1
 """Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
 than places that the sum of squares lies in a bent valley, and straight steps along it would be short."""
 

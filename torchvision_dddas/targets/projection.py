@@ -106,10 +106,20 @@ def bend(flat: Float[np.ndarray, "N 2"], camera: Camera) -> tuple[np.ndarray, np
     square = (flat**2).sum(axis=1)
     grown = 1 + camera.k1 * square + camera.k2 * square**2
     slope = 2 * camera.k1 + 4 * camera.k2 * square
-    grown = np.where(grown + slope * square > 0.05, grown, np.nan)
+    grown = np.where((grown + slope * square > 0.05) & (square < _fold(camera)), grown, np.nan)
     by_flat = slope[:, None, None] * flat[:, :, None] * flat[:, None, :]
     by_flat += grown[:, None, None] * np.eye(2)
     return flat * grown[:, None], by_flat
+
+
+def _fold(camera: Camera) -> float:
+    """The square of the radius where the lens begins to fold the picture back: 1 + 3 k1 r² + 5 k2 r⁴ falls to 0.05."""
+    a, b, c = 5 * camera.k2, 3 * camera.k1, 0.95
+    inside = b * b - 4 * a * c
+    if (b >= 0 and a >= 0) or inside < 0:
+        return float("inf")
+    # The smaller positive root, in the form that holds for a = 0 too.
+    return 2 * c / (-b + float(np.sqrt(inside)))
 
 
 def straight(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
