@@ -223,7 +223,11 @@ class _Problem:
         """The same pose, with the places a step nearer to the likeliest that go with it."""
         if state is None or len(self.used) == 0:
             return state
-        step = np.linalg.solve(state.curvature[7:, 7:], state.downhill[7:])
+        try:
+            step = np.linalg.solve(state.curvature[7:, 7:], state.downhill[7:])
+        except np.linalg.LinAlgError:
+            # A wild pose has landmarks so near its horizon that nothing else counts.
+            return state
         nearer = self.at(state.pose, state.places + step.reshape(-1, 2))
         return nearer if nearer is not None and nearer.cost < state.cost else state
 
