@@ -176,11 +176,20 @@ def test_the_tables_own_pixels_do_without_colours_and_only_frames_followed_are_l
 
 
 def test_without_landmarks_it_says_that_nothing_is_located(dddas, clip, engine, tmp_path):
+    assert dddas("run", clip, "--save", "none", "--out", tmp_path / "out").exit_code == 0
+    # As if an earlier run had located something here.
+    (tmp_path / "out" / "positions.csv").write_text("old")
     result = dddas("run", clip, "--save", "none", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert "note: no --landmarks was given: nothing was located" in result.stdout
     assert (tmp_path / "out" / "tracks.csv").exists()
     assert not (tmp_path / "out" / "positions.csv").exists()
+
+
+def test_positions_of_someone_else_are_neither_replaced_nor_removed(dddas, clip, engine, file, tmp_path):
+    theirs = file("positions.csv", "not ours")
+    assert "was not written by dddas" in bad(dddas("run", clip, "--save", "none", "--out", tmp_path))
+    assert theirs.read_text() == "not ours"
 
 
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):

@@ -244,7 +244,9 @@ def ground_facts(locator: "Locator", given: AerialInput) -> dict[str, Any]:
 
 def summary(journal: "GroundedJournal", folder: Path) -> list[str]:
     """What to tell the user at the end."""
-    made = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    from torchvision_dddas.sinks.grounded import GroundedOutput
+
+    made = [name for name in GroundedOutput.files if (folder / name).exists()]
     first = f"{journal.frames} frames, {journal.targets} targets"
     notes = [f"note: {note}" for note in journal.notes]
     return [first, *ground_lines(journal), *notes, f"{folder}: {', '.join(made)}"]

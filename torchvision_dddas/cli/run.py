@@ -77,7 +77,7 @@ def run(
     settings, names = load(config, set_ or []), saved(save, SAVED)
     journal = run_into(out, clip, given, telemetry, interval, settings, backend.value, names, rate, quiet)
     if not quiet:
-        for line in summary(journal, out, given is not None):
+        for line in summary(journal, out, given is not None, names):
             typer.echo(line)
 
 
@@ -240,10 +240,13 @@ def _located(followed: "Followed", past: "Sequence[Watched]", locator: "Locator"
     return Surveyed(followed, grounded, here.sighted_by, degrees)
 
 
-def summary(journal: "Record", folder: Path, located: bool) -> list[str]:
+def summary(journal: "Record", folder: Path, located: bool, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
-    made = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    from torchvision_dddas.sinks.survey_output import ALL, FOUND
+
+    files = ALL if located else FOUND
+    made = [n for n in files if (folder / n).exists() and (n != "overlay.mp4" or "overlay" in save)]
     counts = journal.counts
     found = f"{journal.frames} frames, {journal.targets} targets, {counts.get('identities', 0)} identities"
-    lines = [found, *(ground_lines(journal) if located else [])]
-    return [lines[0], *lines[1:], *last_lines("", journal, folder, made, journal.notes)[1:]]
+    first, *others = last_lines(found, journal, folder, made, journal.notes)
+    return [first, *(ground_lines(journal) if located else []), *others]

@@ -16,12 +16,15 @@ from torchvision_dddas.sinks.survey_overlay import SurveyPictures
 from torchvision_dddas.sinks.tables import Tables
 from torchvision_dddas.sinks.track_output import TrackJournal
 from torchvision_dddas.sinks.track_tables import TrackTables
+from torchvision_dddas.sinks.whole import remove
 from torchvision_dddas.types import Followed, Scene, Surveyed
 
 SAVED = ("overlay", *MAPS)
 """What --save may name. The tables and run.json are always written."""
 
-FOUND = ("detections.csv", "detections.txt", "tracks.csv", "tracks.txt")
+FOUND = ("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", *RunFolder.files)
+ALL = (*FOUND, "landmarks.csv", *(name for name in GroundedOutput.files if name not in FOUND))
+"""What a run leaves where nothing is located, and where targets are."""
 
 Part = TypeVar("Part")
 
@@ -29,7 +32,8 @@ Part = TypeVar("Part")
 class FoundOutput(RunFolder[Surveyed]):
     """What `dddas run` writes where nothing lays the pictures on the ground. Raises InputError as RunFolder does."""
 
-    files = (*FOUND, *RunFolder.files)
+    # Those too that only a run that locates makes: of an earlier one here they go, of someone else they stop this one.
+    files = ALL
 
     def begin(self, facts: dict[str, Any], rate_hz: float, size: tuple[int, int]) -> TrackJournal:
         """Say what the run is, for run.json; how fast the overlay plays and its (width, height)."""
@@ -37,11 +41,17 @@ class FoundOutput(RunFolder[Surveyed]):
         self._sinks = [_Of(kept, _followed), *_found(self.folder, self._save, rate_hz, size, ())]
         return kept
 
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, as in RunFolder; what an earlier run here located goes."""
+        super().close(complete)
+        for name in set(ALL) - set(FOUND):
+            remove(self.folder / name)
+
 
 class SurveyOutput(GroundedOutput):
     """What `dddas run` writes beside what `dddas locate aerial` does. Give it frames by `survey`."""
 
-    files = (*FOUND, "landmarks.csv", "overlay.mp4", *GroundedOutput.files)  # type: ignore[assignment]
+    files = ALL  # type: ignore[assignment]
 
     def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
         """Claim a folder, as in RunFolder."""
