@@ -27,7 +27,7 @@ def paper_table(rows: list[Row]) -> str:
     """What raw degrees do."""
     lines = heading("GPS", "n | AGL m | pose | homography in metres | raw degrees: mean | median | places told")
     for row in rows:
-        if "paper" in row:
+        if "paper" in row and row["pixel_sigma"] == 1:
             raw = row["paper"]["disc"]
             errors = [row["pose"]["disc"]["mean"], row["homography"]["disc"]["mean"], raw["mean"], raw["median"]]
             cells = [row["gps"], row["landmarks"], f"{row['altitude_m']:.0f}", *map(metres, errors)]
@@ -46,7 +46,8 @@ def six_table(rows: list[Row]) -> str:
         cells = [row["layout"], row["gps"], metres(row[f"pose, {few[0]}"]["six"])]
         for part in (row[f"pose, {name}"] for name in few):
             cells += [metres(part["four"]), f"{part['difference']:+.3f} ± {part['error']:.3f}"]
-        lines.append(line([*cells, f"{row[f'homography, {few[0]}']['ratio of medians']:.2f}"]))
+        ratio = row[f"homography, {few[0]}"]["ratio of medians"]
+        lines.append(line([*cells, "–" if np.isnan(ratio) else f"{ratio:.2f}"]))
     return "\n".join(lines)
 
 
