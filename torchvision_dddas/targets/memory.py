@@ -1,26 +1,37 @@
 """Errors of telemetry and of the landmarks' receivers from frame to frame: they change slowly, so a clip tells them.
 
-Each is an Ornstein-Uhlenbeck process: it has the standard deviation that it is said to have, and forgets itself by a
-time constant. The first frame thus is like any single one; later ones gain by what is independent, pixels and motion,
-and no confidence grows beyond what slow errors allow.
+Each is an Ornstein-Uhlenbeck process and noise: together they have the standard deviation that the error is said to
+have, and the process forgets itself by a time constant. The first frame thus is like any single one; later ones gain
+by what is independent, pixels and motion, and no confidence grows beyond what slow errors allow.
 """
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from torchvision_dddas.targets.glimpse import Glimpse
 from torchvision_dddas.targets.pose import EXACT_M, Expected, Prior, Solution
 from torchvision_dddas.types import Marks
 
 FORGOTTEN = 4.0
 """A landmark not seen for so many time constants is forgotten."""
 
-JITTER = 0.1
-"""Share of the variance of the telemetry's angles and place that is new in every frame: a gimbal shakes, and samples
-are older than the picture. Without it a clip would take such shaking for news of its landmarks."""
-
 ANOTHER = 1.5
 """A receiver whose standard deviation changes by more than this factor works another way: its error is another."""
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """What of the errors lasts from frame to frame; the rest is new in every frame.
+
+    telemetry: share of the variance of its angles and place: a gimbal shakes, samples are older than the picture.
+    landmarks: share of that of their reports. pace: how many times faster than by aerial.correlation_s the rest is
+    forgotten; infinite where nothing is kept.
+    """
+
+    telemetry: float = 0.9
+    landmarks: float = 1.0
+    pace: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,7 @@ class Memory:
     mean: np.ndarray = field(default_factory=lambda: np.zeros(7))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((7, 7)))
     sigma: np.ndarray = field(default_factory=lambda: np.full(7, np.nan))
+    lasting: Lasting = Lasting()
 
     @property
     def told(self) -> bool:
@@ -45,6 +57,7 @@ class Memory:
 
     def at(self, time_s: float, prior: Prior, marks: Marks, correlation_s: float) -> "Memory":
         """The same at a later time, with the landmarks that are new."""
+        correlation_s /= self.lasting.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
         known = np.flatnonzero(prior.known)
@@ -72,12 +85,12 @@ class Memory:
         # The telemetry's may be a share of the altitude, and grow with it.
         grown[7:] = np.where((grown[7:] < ANOTHER) & (grown[7:] > 1 / ANOTHER), grown[7:], 0.0)
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
-        filled = np.where(np.isfinite(sigma), sigma, 0.0) * _slow(size)
-        was = was * _slow(size)
+        filled = np.where(np.isfinite(sigma), sigma, 0.0) * self._slow(size)
+        was = was * self._slow(size)
         mean, covariance = mean * factor, covariance * np.outer(factor, factor)
         # What is new of each: all that it has beyond what it keeps of its standard deviation.
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
-        return Memory(time_s, ids, seen_s, mean, covariance, sigma)
+        return replace(self, time_s=time_s, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
 
     def expected(self, prior: Prior, marks: Marks) -> Expected:
         """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
@@ -90,6 +103,22 @@ class Memory:
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
+    def foretold(self, marks: Marks, glimpse: Glimpse) -> tuple[float, "Memory"]:
+        """How well it foretold a picture, the log of the density of where the landmarks were, and itself after it.
+
+        The telemetry must tell all seven.
+        """
+        ours = np.concatenate([np.arange(7), places_of(self.ids, marks.landmark)])
+        crossed = self.covariance[:, ours] @ glimpse.slopes.T
+        expected = glimpse.slopes @ self._seen(ours) @ glimpse.slopes.T + np.diag(glimpse.variance_px2)
+        surprise = glimpse.shown_px - glimpse.slopes @ self.mean[ours]
+        root = np.linalg.cholesky(expected)
+        white = np.linalg.solve(root, np.column_stack([surprise, crossed.T]))
+        density = -0.5 * float(white[:, 0] @ white[:, 0]) - float(np.log(np.diag(root)).sum())
+        covariance = self.covariance - white[:, 1:].T @ white[:, 1:]
+        mean = self.mean + white[:, 1:].T @ white[:, 0]
+        return density, self._with(mean, covariance, marks.landmark[glimpse.used])
+
     def after(self, prior: Prior, marks: Marks, used: np.ndarray, solution: Solution) -> "Memory":
         """With what a frame told: of errors that were not looked at too, as far as they go with those that were."""
         known, n = np.flatnonzero(prior.known), len(marks)
@@ -100,8 +129,11 @@ class Memory:
         now = solution.correction_covariance[np.ix_(theirs, theirs)]
         mean = self.mean + gain @ (solution.correction[theirs] - self.mean[ours])
         covariance = self.covariance + gain @ (now - before) @ gain.T
-        seen_s = self.seen_s.copy()
-        seen_s[np.isin(self.ids, marks.landmark[used])] = self.time_s
+        return self._with(mean, covariance, marks.landmark[used])
+
+    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "Memory":
+        ids = set(seen.tolist())
+        seen_s = np.array([self.time_s if i in ids else t for i, t in zip(self.ids.tolist(), self.seen_s, strict=True)])
         return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
 
     def anew(self, rows: np.ndarray) -> "Memory":
@@ -110,21 +142,20 @@ class Memory:
         mean[rows] = 0
         covariance[rows] = 0
         covariance[:, rows] = 0
-        slow = (self.sigma * _slow(len(mean)))[rows]
+        slow = (self.sigma * self._slow(len(mean)))[rows]
         covariance[rows, rows] = np.where(np.isfinite(slow), slow, 0.0) ** 2
         return replace(self, mean=mean, covariance=covariance)
 
     def _seen(self, rows: np.ndarray) -> np.ndarray:
         """The covariance of errors as a single frame has them: what lasts, and what is new in every frame."""
         sigma = self.sigma[rows]
-        return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - _slow(len(self.mean))[rows] ** 2))
+        return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - self._slow(len(self.mean))[rows] ** 2))
 
-
-def _slow(size: int) -> np.ndarray:
-    """Share of each standard deviation that lasts."""
-    share = np.ones(size)
-    share[:6] = np.sqrt(1 - JITTER)
-    return share
+    def _slow(self, size: int) -> np.ndarray:
+        """Share of each standard deviation that lasts; a focal length does."""
+        share = np.full(size, np.sqrt(self.lasting.landmarks))
+        share[:6], share[6] = np.sqrt(self.lasting.telemetry), 1.0
+        return share
 
 
 def places_of(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:

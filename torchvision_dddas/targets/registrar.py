@@ -7,10 +7,11 @@ import numpy as np
 
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.targets.first_pose import find_pose, rows
+from torchvision_dddas.targets.glimpse import glimpse_of
 from torchvision_dddas.targets.integrity import Verdict, judge, passes, reordered
-from torchvision_dddas.targets.memory import Memory, places_of
+from torchvision_dddas.targets.memory import Lasting, Memory, places_of
 from torchvision_dddas.targets.plane import LEAST, Solver, homography_fix, on_one_line, too_few
-from torchvision_dddas.targets.pose import Prior, bare_prior, expected_of, prior_of
+from torchvision_dddas.targets.pose import Prior, Solution, bare_prior, expected_of, prior_of
 from torchvision_dddas.types import Camera, Fix, Flight, Marks
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
@@ -18,14 +19,22 @@ Degrees = tuple[np.ndarray, tuple[float, float]]
 
 OF_POSE = ("heading", "heading", "heading", "place", "place", "altitude", "focal length")
 
-LEARNS = 0.05
-"""Share of a frame's surprise that the pace of forgetting takes over: it follows in some twenty frames."""
+BELIEFS = (
+    Lasting(),
+    Lasting(pace=5.0),
+    Lasting(pace=25.0),
+    Lasting(telemetry=0.5),
+    Lasting(telemetry=0.0),
+    Lasting(landmarks=0.0),
+    Lasting(telemetry=0.0, landmarks=0.0, pace=np.inf),
+)
+"""Nobody says which errors of a vehicle and its landmarks last. The belief that foretells the pictures best counts."""
 
-MOST_SURPRISED = 4.0
-"""No single frame counts for more than this, such as one with a report that jumps."""
+REMEMBERS = 0.95
+"""Share of what spoke for a belief that still does a frame later."""
 
-FASTEST = 20.0
-"""Errors are forgotten at most so many times faster than by aerial.correlation_s."""
+MOST_SURPRISED = 15.0
+"""A frame that a belief foretells worse than another by more than this counts for this much: a report may jump."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,9 @@ class Registrar:
     ) -> None:
         self.camera, self.settings, self.solver = camera, settings, solver
         self.focal_known, self.names, self.ground_up_m = focal_known, names, ground_up_m
-        self.memory = Memory()
-        self.pace = 1.0
+        beliefs = BELIEFS if settings.aerial.correlation_s > 0 else BELIEFS[-1:]
+        self.memories = [Memory(lasting=belief) for belief in beliefs]
+        self.credit = np.zeros(len(beliefs))
         self.habit = _Habit({}, frozenset())
 
     def step(
@@ -82,24 +92,22 @@ class Registrar:
         knobs, n = self.settings.aerial, len(marks)
         cause = _refused(frame, prior, marks, knobs.least_spread)
         bare = bare_prior(self.camera, knobs, self.focal_known)
-        whole = before = self.memory.at(time_s, prior or bare, marks, knobs.correlation_s / self.pace)
+        self.memories = [memory.at(time_s, prior or bare, marks, knobs.correlation_s) for memory in self.memories]
+        believed = int(self.credit.argmax())
+        before = self.memories[believed]
         if cause:
-            self.memory = before
             return _nothing(frame, marks, cause)
         if prior is None:
             # By landmarks alone a tilt and its mirror are hard to tell apart: remembered, a wrong one would last.
             before = before.anew(np.arange(len(before.mean)))
         verdict, before = self._judged(before, prior or bare, marks, None if prior is None else bare)
         solution = verdict.solution
-        if prior is not None and whole.told and solution is not None and solution.freedom > 0:
-            self._hurry(solution.cost / solution.freedom if before is whole else MOST_SURPRISED)
         if solution is None:
-            self.memory = before
             cause = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
             return _nothing(frame, marks, cause)
-        self.memory = whole
         if prior is not None and verdict.passed and not verdict.alone:
-            self.memory = before.after(prior, marks, verdict.used, solution)
+            self._learn(prior, reordered(marks, verdict.order), verdict.used, solution)
+            self.memories[believed] = before.after(prior, marks, verdict.used, solution)
         count = int(verdict.used.sum())
         cause = verdict.cause
         if not cause and count < LEAST:
@@ -117,14 +125,15 @@ class Registrar:
             cause=cause,
         )
 
-    def _hurry(self, surprise: float) -> None:
-        """Forget faster while frames disagree with the past more than its errors let expect, 1 being as expected.
-
-        Errors that change faster than they are said to would else be believed long after they are gone. Never slower
-        than is said: errors that stay alike for longer cost nothing.
-        """
-        pace = self.pace * (1 + LEARNS * (min(surprise, MOST_SURPRISED) - 1))
-        self.pace = min(max(pace, 1.0), FASTEST)
+    def _learn(self, prior: Prior, marks: Marks, used: np.ndarray, solution: Solution) -> None:
+        """Hold what each belief foretold against what the picture shows, and let it learn from it."""
+        if len(self.memories) == 1 or not (prior.known.all() and used.any()):
+            return
+        glimpse = glimpse_of(marks, self.camera, used, solution)
+        told = [memory.foretold(marks, glimpse) for memory in self.memories]
+        density = np.array([density for density, _ in told])
+        self.credit = REMEMBERS * self.credit + np.maximum(density - density.max(), -MOST_SURPRISED)
+        self.memories = [memory for _, memory in told]
 
     def _judged(self, before: Memory, prior: Prior, marks: Marks, bare: Prior | None) -> tuple[Verdict, Memory]:
         """The landmarks tested against what is remembered, and what is to be remembered of the past then."""

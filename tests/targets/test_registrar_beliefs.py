@@ -1,4 +1,4 @@
-"""How fast the registrar forgets: as it is told where that holds, faster where errors change faster."""
+"""What the registrar believes of errors: that those last which foretell the pictures best."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.targets.plane import ground_points
 from torchvision_dddas.targets.projection import axes_of, project
-from torchvision_dddas.targets.registrar import FASTEST, Registrar
+from torchvision_dddas.targets.registrar import Registrar
 from torchvision_dddas.types import Camera, CameraPose, Flight, Marks
 from torchvision_dddas.vision import load_solver
 
@@ -17,14 +17,15 @@ GPS_M, TILT, HEADING = 1.43, np.radians(1.0), np.radians(5.0)
 FRAMES, STEP_S = 70, 0.2
 
 
-def flown(alike_s: float, told_s: float, seed: int) -> tuple[float, float, float]:
-    """Mean error and share in the ellipses of 95 % in the second half of a flight, and the last pace.
+def flown(alike_s: tuple[float, float], told_s: float, seed: int) -> tuple[float, float]:
+    """Mean error and share in the ellipses of 95 % in the second half of a flight.
 
-    Telemetry and receivers err as the settings say, alike over alike_s; the registrar is told told_s.
+    Telemetry and receivers err as the settings say, alike over alike_s each; the registrar is told told_s.
     """
     rng = np.random.default_rng(seed)
     registrar = Registrar(CAMERA, with_knobs(Settings(), {"aerial.correlation_s": told_s}), load_solver("onboard"))
-    keep, off, inside = np.exp(-STEP_S / alike_s), [], []
+    keep = np.repeat(np.exp(-STEP_S / np.array(alike_s)), (6, 8))
+    off, inside = [], []
     slow = rng.normal(0, 1, 14)
     pose = CameraPose(np.array([0.0, 0.0, 50.0]), axes_of(0.4, 1.4, 0.0))
     for frame in range(1, FRAMES + 1):
@@ -44,26 +45,25 @@ def flown(alike_s: float, told_s: float, seed: int) -> tuple[float, float, float
             off.append(np.linalg.norm(away, axis=1).mean())
             inside.append((np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away) < 5.991).mean())
         slow = keep * slow + np.sqrt(1 - keep**2) * rng.normal(0, 1, slow.shape)
-    return float(np.mean(off)), float(np.mean(inside)), registrar.pace
+    return float(np.mean(off)), float(np.mean(inside))
 
 
-def test_errors_that_change_faster_than_told_are_forgotten_faster_and_ellipses_still_hold() -> None:
-    found = np.array([flown(4.0, 20.0, seed) for seed in range(4)])
-    alone = np.array([flown(4.0, 0.0, seed) for seed in range(4)])
-    assert (found[:, 2] > 2).all()
-    assert found[:, 0].mean() < 1.1 * alone[:, 0].mean()
-    assert found[:, 1].mean() > 0.85
+def flights(alike_s: tuple[float, float], told_s: float = 20.0) -> tuple[float, float]:
+    off, inside = np.mean([flown(alike_s, told_s, seed) for seed in range(4)], axis=0)
+    return off, inside
 
 
-def test_where_errors_are_as_told_the_pace_stays_as_told() -> None:
-    assert np.mean([flown(20.0, 20.0, seed)[2] for seed in range(2)]) < 1.5
+@pytest.mark.parametrize("alike_s", [(4.0, 4.0), (1.0, 1.0), (1e-3, 1e-3)])
+def test_errors_that_change_faster_than_told_do_no_harm_and_ellipses_still_hold(alike_s: tuple[float, float]) -> None:
+    off, inside = flights(alike_s)
+    assert off < 1.05 * flights(alike_s, told_s=0.0)[0]
+    assert inside > 0.85
 
 
-def test_a_flight_that_surprises_for_good_is_not_forgotten_faster_than_the_limit() -> None:
-    registrar = Registrar(CAMERA, Settings(), load_solver("onboard"))
-    for _ in range(1000):
-        registrar._hurry(100.0)
-    assert registrar.pace == FASTEST
-    for _ in range(1000):
-        registrar._hurry(0.2)
-    assert registrar.pace == pytest.approx(1.0)
+@pytest.mark.parametrize("alike_s", [(1e-3, 20.0), (20.0, 1e-3)])
+def test_where_one_errs_anew_in_every_frame_and_the_other_alike_a_flight_averages_it_out(
+    alike_s: tuple[float, float],
+) -> None:
+    off, inside = flights(alike_s)
+    assert off < 0.8 * flights(alike_s, told_s=0.0)[0]
+    assert inside > 0.85
