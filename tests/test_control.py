@@ -151,12 +151,12 @@ def test_every_landmark_in_view_is_used_by_default_and_no_other():
 def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
     rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
     assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
-    rows, use, (record,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
+    rows, use, (more,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
     assert len(rows) == 6 and use.poor
-    assert (record.frame, record.knob, record.old, record.new) == (2, "landmarks.used", 4, 6)
-    assert record.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
-    _, use, (record,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
-    assert (record.old, record.new, use.poor) == (6, 4, False)
+    assert (more.frame, more.knob, more.old, more.new) == (2, "landmarks.used", 4, 6)
+    assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
+    _, use, (fewer,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
+    assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
 
 
 def test_four_fast_landmarks_alone_change_nothing():

@@ -33,7 +33,7 @@ def test_colours_are_found_named_and_shown(dddas, picture, tmp_path):
     assert [line.split(":")[0] for line in lines[:2]] == list(found.names)
     assert lines[-1] == f"{out}; {out.with_suffix('.png')} shows what the ranges mark"
     drawn = cv2.imread(str(out.with_suffix(".png")))
-    assert drawn.shape == (120, 160, 3)
+    assert drawn is not None and drawn.shape == (120, 160, 3)
     assert drawn[68, 100].tolist() == list(BGR["blue"])  # what is marked keeps its colour
     assert np.ptp(drawn[100, 20].astype(int)) == 0  # the rest is grey
 

@@ -30,7 +30,7 @@ def painted(plates, seed=0, shade=1.0):
     boxes = {}
     for k, (name, colour) in enumerate(plates.items()):
         x, y = 60 + 130 * k, int(rng.integers(60, 400))
-        image[y : y + 16, x : x + 24] = cv2.cvtColor(np.uint8([[colour]]), cv2.COLOR_HSV2BGR)[0, 0] * shade
+        image[y : y + 16, x : x + 24] = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0] * shade
         boxes[name] = (x, y, 24, 16)
     image += rng.normal(0, 5, image.shape)
     return cv2.GaussianBlur(np.clip(image, 0, 255).astype(np.uint8), (0, 0), 0.6), boxes
@@ -93,7 +93,9 @@ def test_what_else_a_range_marks_is_counted():
     image, boxes = painted({"red": PLATES["red"], "blue": PLATES["blue"]})
     image[430:450, 500:530] = image[boxes["red"][1] + 8, boxes["red"][0] + 12]
     hsv = hsv_of(image)
-    found = [[in_box(hsv, boxes["red"])], [in_box(hsv, boxes["blue"])]]
+    red, blue = in_box(hsv, boxes["red"]), in_box(hsv, boxes["blue"])
+    assert red is not None and blue is not None
+    found = [[red], [blue]]
     assert ranges_of(found, [hsv], LEAST)[2].tolist() == [1, 0]
 
 
@@ -101,7 +103,7 @@ def test_a_box_on_grey_has_no_colour_and_one_half_on_the_plate_has_the_plates():
     image, boxes = painted({"blue": PLATES["blue"]})
     x, y, _, _ = boxes["blue"]
     half = in_box(hsv_of(image), (x - 8, y - 4, 24, 16))
-    assert abs(hue_apart(half.hue, 112)) <= 4
+    assert half is not None and abs(hue_apart(half.hue, 112)) <= 4
     assert in_box(np.full((20, 20, 3), (90, 10, 200), np.uint8), (0, 0, 20, 20)) is None
 
 

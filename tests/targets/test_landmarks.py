@@ -144,7 +144,7 @@ def test_what_moves_over_the_ground_counts_not_what_moves_in_the_picture():
         pan = np.array([[1, 0, -4], [0, 1, 0], [0, 0, 1.0]])
         roof = (300 - 4 * frame, 200, 12, 12)
         found = one.step(frame, plates([(100, 50, 10, 10), roof]), blobs(), pan)
-    assert found.image_px[0] == pytest.approx([104.5, 54.5])
+    assert found is not None and found.image_px[0] == pytest.approx([104.5, 54.5])
 
 
 def test_where_a_landmark_is_expected_tells_between_two_that_stand_still():
