@@ -65,6 +65,12 @@ def test_the_table_of_positions_says_more_than_places(tmp_path):
     assert (one["velocity_east_m_s"], one["velocity_north_m_s"]) == ("3.0000", "4.0000")
 
 
+def test_small_covariances_are_read_back_as_they_are(tmp_path):
+    small = np.array([[3.2e-5, 1.7e-5], [1.7e-5, 2.1e-5]])
+    run(tmp_path, [grounded(1, covariance=small)])
+    assert np.allclose(read_positions(tmp_path / "positions.csv").covariance_m2, small, rtol=1e-5)
+
+
 def test_what_is_unknown_is_an_empty_cell_and_is_read_back_as_unknown(tmp_path):
     unknown = grounded(1, covariance=np.full((2, 2), np.nan), origin=None)
     unknown.velocity_m_s[:] = np.nan

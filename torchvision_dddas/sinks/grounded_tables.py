@@ -30,14 +30,14 @@ def position_lines(grounded: Grounded) -> str:
     n, covariance = len(at), at.covariance_m2
     columns: list[tuple[np.ndarray, str]] = [
         (at.east_north_m, ",%.4f,%.4f"),
-        (np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=1), ",%.4f,%.4f,%.4f"),
+        (np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]], axis=1), ",%.6g,%.6g,%.6g"),
     ]
     if at.lonlat_deg is not None:
         columns.append((at.lonlat_deg, ",%.9f,%.9f"))
     columns += [
         (at.score[:, None], ",%.6g"),
         (np.full((n, 1), grounded.time_s), ",%.4f"),
-        (np.sqrt(np.trace(grounded.relative_m2, axis1=1, axis2=2))[:, None], ",%.4f"),
+        (np.sqrt(np.trace(grounded.relative_m2, axis1=1, axis2=2))[:, None], ",%.6g"),
         (grounded.velocity_m_s, ",%.4f,%.4f"),
     ]
     values = np.concatenate([column for column, _ in columns], axis=1)

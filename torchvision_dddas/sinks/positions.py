@@ -41,8 +41,9 @@ def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
     lines = []
     for i in range(len(seen)):
         box = ",".join(f"{v:.2f}" for v in located.box_px[i])
-        place = [*seen.east_north_m[i], covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1]]
-        rest = ",".join(_cell(v) for v in (seen.distance_m[i], math.degrees(seen.bearing_rad[i]), *place))
+        place = (seen.distance_m[i], math.degrees(seen.bearing_rad[i]), *seen.east_north_m[i])
+        variances = (covariance[i, 0, 0], covariance[i, 0, 1], covariance[i, 1, 1])
+        rest = ",".join([*(_cell(v) for v in place), *(_cell(v, ".6g") for v in variances)])
         lines.append(
             f"{located.frame},{_text(names[located.vehicle[i]])},{located.target[i]},{box},{located.score[i]:.6g},"
             f"{located.cut[i]:d},{seen.by[i]},{rest}\n"
@@ -52,8 +53,9 @@ def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
 
 def _place(positions: Positions, row: int) -> list[str]:
     covariance = positions.covariance_m2[row]
-    values = [*positions.east_north_m[row], covariance[0, 0], covariance[0, 1], covariance[1, 1]]
-    return [_cell(v) for v in values]
+    # A centimetre squared is 0.0001 m2: fixed digits would lose what is known well.
+    variances = [covariance[0, 0], covariance[0, 1], covariance[1, 1]]
+    return [*(_cell(v) for v in positions.east_north_m[row]), *(_cell(v, ".6g") for v in variances)]
 
 
 def _text(name: str) -> str:
@@ -61,8 +63,8 @@ def _text(name: str) -> str:
     return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
 
 
-def _cell(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else ""
+def _cell(value: float, digits: str = ".4f") -> str:
+    return f"{value:{digits}}" if math.isfinite(value) else ""
 
 
 class PositionTables:
