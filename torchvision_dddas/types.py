@@ -357,8 +357,9 @@ class Fix:
 
     by: what told it: pose, homography, paper, telemetry (no landmark could be used), or "" (nothing: see cause).
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
-    image_from_ground: (3, 3) on local metres, with matrix_covariance (8, 8) of its first eight elements, h33 = 1; where
-    there is no pose. landmark: (n,) which were seen; state: for each used, reassigned, excluded.
+    image_from_ground: (3, 3) on local metres, where there is no pose. matrix_covariance: (8, 8) of the first eight
+    elements, h33 = 1, of the same on metres from about_m, the landmarks' middle: from afar rounding would swallow it.
+    landmark: (n,) which were seen; state: for each used, reassigned, excluded.
     chi2, freedom: of the landmarks against what was expected of them; NaN and 0 where nothing was expected.
     changes: what was repaired or excluded and why, in words. cause: why nothing could be concluded, or how little.
     """
@@ -369,6 +370,7 @@ class Fix:
     covariance: np.ndarray | None = None
     image_from_ground: np.ndarray | None = None
     matrix_covariance: np.ndarray | None = None
+    about_m: tuple[float, float] = (0.0, 0.0)
     landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     state: tuple[str, ...] = ()
     chi2: float = float("nan")

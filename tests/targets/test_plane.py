@@ -16,6 +16,7 @@ from torchvision_dddas.vision import load_solver
 
 SOLVER = load_solver("onboard")
 FAR = np.array([4000.0, -3000.0])
+UTM = np.array([500_000.0, 3_500_000.0])
 TUCSON = (-110.9, 31.9)
 UPRIGHT = np.array([[0.0, 0.0, 0.0], [10.0, 4.0, 0.0], [-6.0, 8.0, 0.0]])
 
@@ -36,13 +37,15 @@ def test_exact_landmarks_give_exact_ground(n, tilt_deg):
     assert np.allclose(transfer(fix.image_from_ground, seen.targets), seen.targets_px, atol=1e-6)
 
 
-def test_landmarks_far_from_the_origin_do_as_well():
-    seen = look(1, errors=0)
-    far = replace(seen.marks, east_north_m=seen.marks.east_north_m + FAR)
-    ground, covariance = ground_points(homography_fix(1, far, SOLVER), CAMERA, seen.targets_px, 1.0)
+@pytest.mark.parametrize("far", [FAR, UTM])
+@pytest.mark.parametrize(("tilt_deg", "sigma_m"), [(0.0, GPS_M), (0.0, 0.01), (50.0, 0.01)])
+def test_landmarks_far_from_the_origin_do_as_well_and_their_errors_are_the_same(far, tilt_deg, sigma_m):
+    seen = look(1, errors=0, tilt_deg=tilt_deg, sigma_m=sigma_m)
+    moved_away = replace(seen.marks, east_north_m=seen.marks.east_north_m + far)
+    ground, covariance = ground_points(homography_fix(1, moved_away, SOLVER), CAMERA, seen.targets_px, 1.0)
     near = ground_points(homography_fix(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)[1]
-    assert np.allclose(ground, seen.targets + FAR, atol=1e-3)
-    assert np.allclose(covariance, near, rtol=1e-2, atol=1e-3)
+    assert np.allclose(ground, seen.targets + far, atol=1e-6)
+    assert np.allclose(covariance, near, rtol=1e-5)
 
 
 @pytest.mark.parametrize("case", [{}, {"n": 6}, {"sigma_m": 0.0}, {"n": 5, "tilt_deg": 45.0}])

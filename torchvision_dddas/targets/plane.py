@@ -89,9 +89,15 @@ def homography_fix(
             "known: their homography would be no more than a guess; add a landmark off the line, or telemetry"
         )
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
-    matrix, covariance = _shifted(matrix[0], covariance, -middle)
+    far = _about(matrix[0], -middle)
     return Fix(
-        frame, "homography", image_from_ground=matrix, matrix_covariance=covariance, landmark=ids, state=("used",) * n
+        frame,
+        "homography",
+        image_from_ground=far / far[2, 2],
+        matrix_covariance=covariance,
+        about_m=(float(middle[0]), float(middle[1])),
+        landmark=ids,
+        state=("used",) * n,
     )
 
 
@@ -137,7 +143,10 @@ def ground_points(
         return _by_rays(fix, camera, pixels, sigma_px, up_m, surface)
     if fix.image_from_ground is None:
         return np.full((len(pixels), 2), np.nan), np.full((len(pixels), 2, 2), np.nan)
-    return _by_inverse(fix.image_from_ground, fix.matrix_covariance, pixels, sigma_px)
+    middle = np.array(fix.about_m)
+    matrix = _about(fix.image_from_ground, middle)
+    ground, covariance = _by_inverse(matrix / matrix[2, 2], fix.matrix_covariance, pixels, sigma_px)
+    return ground + middle, covariance
 
 
 def feet_px(
@@ -184,15 +193,11 @@ def _slopes(ground: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndar
     return depth, by_ground, by_matrix / depth[:, None, None]
 
 
-def _shifted(matrix: np.ndarray, covariance: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A homography on ground coordinates that are moved by so much, with its covariance, scaled so that h33 = 1."""
+def _about(matrix: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """A homography on ground coordinates that are counted from a middle."""
     shift = np.eye(3)
-    shift[:2, 2] = by
-    moved = matrix @ shift
-    by_eight = np.kron(np.eye(3), shift.T)[:, :8] / moved[2, 2]
-    scaled = moved / moved[2, 2]
-    by_eight = by_eight - np.outer(scaled.ravel(), by_eight[8])
-    return scaled, by_eight[:8] @ covariance @ by_eight[:8].T
+    shift[:2, 2] = middle
+    return matrix @ shift
 
 
 def _no_homography(frame: int, n: int) -> str:
