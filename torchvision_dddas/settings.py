@@ -501,6 +501,9 @@ class LandmarkKnobs(Group):
     )
     drift_m_s: float = knob(0.5, "m/s", 0, 100, meaning="how fast a place gets uncertain during a dropout")
     height_m: float = knob(0.0, "m", 0, 20, meaning="height above ground of the point that shows in the picture")
+    length_m: float = knob(
+        4.0, "m", 0.1, 50, meaning="length of a vehicle: what moves at its colour and is no longer is it, and no target"
+    )
     least: int = knob(4, "landmarks", 4, 64, meaning="landmarks used where they are detected well (4-or-more rule)")
     rule: Literal["all", "source"] = knob(
         "all", "-", meaning="all: every landmark at hand; source: more than `least` only where detection is poor"

@@ -116,6 +116,24 @@ def test_a_blob_much_larger_than_usual_holds_somebody_else_too_and_its_centre_is
     assert (both.rows.tolist(), both.shared.tolist()) == ([False], [True])
 
 
+def test_a_blob_no_longer_than_the_vehicle_is_it_however_large_for_its_colour_and_so_are_parts_of_it():
+    one, length_px = follower(), np.array([34.0])
+    for frame in range(1, 6):
+        one.step(frame, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14)), length_px=length_px)
+    masks, whole = plates((100, 50, 10, 10)), blobs((90, 42, 40, 26))
+    found = one.step(6, masks, whole, length_px=length_px)
+    assert (found.rows.tolist(), found.shared.tolist(), found.by) == ([True], [False], ("colour",))
+    parts = one.step(7, masks, blobs((114, 48, 8, 12), (140, 48, 8, 12), (70, 48, 60, 12)), length_px=length_px)
+    assert parts.rows.tolist() == [True, False, False]
+
+
+def test_a_vehicle_whose_colour_is_not_seen_is_kept_from_the_targets_where_it_is_expected():
+    masks, at = plates([]), np.array([[4.0, 50.0]])
+    seen = blobs((0, 44, 12, 14), (60, 44, 12, 14))
+    found = follower().step(1, masks, seen, expected_px=at, length_px=np.array([20.0]))
+    assert found.rows.tolist() == [True, False] and np.isnan(found.image_px).all()
+
+
 def test_two_landmarks_in_one_blob_are_at_their_colours_and_the_blob_is_no_target():
     one, masks = follower("ab"), plates((100, 50, 10, 10), (116, 50, 10, 10))
     for frame in range(1, 6):

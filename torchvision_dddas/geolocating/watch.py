@@ -93,12 +93,14 @@ class Watch:
             raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
         step = scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None
         place = {which: k for k, which in enumerate(self._which.tolist())}
-        expected = np.full((len(self._colours), 2), np.nan)
-        for which, pixel in zip(marks.landmark.tolist(), self._expected(marks, step), strict=True):
+        expected, length = np.full((len(self._colours), 2), np.nan), np.full(len(self._colours), np.nan)
+        pixels, scale = self._expected(marks, step)
+        for row, which in enumerate(marks.landmark.tolist()):
             if which in place:
-                expected[place[which]] = pixel
+                expected[place[which]] = pixels[row]
+                length[place[which]] = self.locator.settings.landmarks.length_m * scale[row]
         masks = self._finder.masks(image, self._colours.low, self._colours.high)
-        seen = self._follower.step(scene.frame.number, masks, scene.detections, step, scene.mask, expected)
+        seen = self._follower.step(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
         pixels = np.full((len(marks), 2), np.nan)
         by = [""] * len(marks)
         for row, which in enumerate(marks.landmark.tolist()):
@@ -109,18 +111,22 @@ class Watch:
                     pixels[row], by[row] = seen.colour_px[k], "colour"
         return replace(marks, image_px=pixels), seen.rows, tuple(by)
 
-    def _expected(self, marks: Marks, step: np.ndarray | None) -> np.ndarray:
-        """(n, 2) where the landmarks should be, by how the frame before lay on the ground; NaN where unknown."""
-        fix = self._fix
-        if fix is None or step is None:
-            return np.full((len(marks), 2), np.nan)
+    def _expected(self, marks: Marks, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 2) where the landmarks should be, by how the frame before lay on the ground, and (n,) pixels a metre.
+
+        NaN where unknown.
+        """
+        fix, n = self._fix, len(marks)
+        if fix is None or step is None or (fix.pose is None and fix.image_from_ground is None):
+            return np.full((n, 2), np.nan), np.full(n, np.nan)
+        beside = np.concatenate([marks.east_north_m + metre for metre in ((0, 0), (1, 0), (0, 1))])
         if fix.pose is not None:
-            before = project(np.c_[marks.east_north_m, marks.up_m], fix.pose, self.locator.camera)
-        elif fix.image_from_ground is not None:
-            before = transfer(fix.image_from_ground, marks.east_north_m)
+            before = project(np.c_[beside, np.tile(marks.up_m, 3)], fix.pose, self.locator.camera)
         else:
-            return np.full((len(marks), 2), np.nan)
-        return transfer(step, before)
+            assert fix.image_from_ground is not None
+            before = transfer(fix.image_from_ground, beside)
+        here, east, north = np.split(transfer(step, before), 3)
+        return here, np.maximum(*(np.linalg.norm(there - here, axis=1) for there in (east, north)))
 
 
 def _astray(

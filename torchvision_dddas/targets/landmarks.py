@@ -20,6 +20,8 @@ from torchvision_dddas.types import Detections
 
 # A blob that is this many times larger for its colour than usual holds something beside the landmark.
 _SHARED = 1.8
+# A vehicle's blob is no longer than it, but for its shadow; and its middle no further from the colour than this share.
+_LONGER, _WITHIN = 1.25, 0.6
 # Blobs of the last so many frames say what is usual; fewer than the second number say nothing.
 _MEMORY, _ENOUGH = 25, 3
 
@@ -63,8 +65,8 @@ class Sighted:
 
     image_px: (K, 2) where each is, NaN where it was not found or the border cuts it. by: (K,) motion, colour, or "".
     colour_px: (K, 2) centres of their colours. blob: (K,) int64, which detection is its own, -1 for none.
-    rows: (N,) bool, the detections that are landmarks, and so no targets. shared: (N,) bool, those that hold a landmark
-    and something beside it: they stay among the targets.
+    rows: (N,) bool, the detections that are landmarks or parts of them, and so no targets. shared: (N,) bool, those
+    that hold a landmark and something beside it: they stay among the targets.
     """
 
     image_px: np.ndarray
@@ -73,6 +75,13 @@ class Sighted:
     blob: np.ndarray
     rows: np.ndarray
     shared: np.ndarray
+
+
+def _of_vehicles(at_px: np.ndarray, length_px: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(N,) bool, the blobs that lie where a vehicle is, at (K, 2) and so long (K,), and are no longer than it."""
+    middle, longest = boxes[:, :2] + (boxes[:, 2:] - 1) / 2, boxes[:, 2:].max(axis=1, initial=0)
+    away = np.linalg.norm(at_px[:, None] - middle, axis=2)  # NaN where unknown: of no vehicle
+    return ((away <= _WITHIN * length_px[:, None]) & (longest <= _LONGER * length_px[:, None])).any(axis=0)
 
 
 @dataclass
@@ -105,13 +114,15 @@ class LandmarkFollower:
         now_from_before: np.ndarray | None = None,
         foreground: np.ndarray | None = None,
         expected_px: np.ndarray | None = None,
+        length_px: np.ndarray | None = None,
     ) -> Sighted:
         """The landmarks of the next frame.
 
         masks: (K, H, W) uint8 of the landmarks' colours. now_from_before: (3, 3) how the background moved since the
         frame before; None: it did not, or nobody knows. foreground: (H, W), i + 1 where detection i is, as in Scene;
         without it a blob's centre is its box's, which a limb or a shadow shifts more.
-        expected_px: (K, 2) where each should be by what else is known; NaN or None: unknown.
+        expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN or
+        None: unknown.
         """
         size = masks.shape[2], masks.shape[1]
         anew = frame >= self._next
@@ -132,14 +143,19 @@ class LandmarkFollower:
         clean = whole & ~shared & (touching.sum(axis=0) == 1) & ~touches_border(boxes, size)
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
         for k, (coupling, box) in enumerate(zip(self._blobs, chosen, strict=True)):
-            own = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
-            if own is not None and self._knobs.centre == "motion":
-                image[k], by[k] = own, "motion"
+            blob = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
+            if blob is not None and self._knobs.centre == "motion":
+                image[k], by[k] = blob, "motion"
             elif box is not None and not touches_border(box[None], size)[0]:
                 image[k], by[k] = colour[k], "colour"
-            if own is not None:
-                coupling.blob_px = own
-        return Sighted(image, tuple(by), colour, match, touching.any(axis=0) & ~shared, shared)
+            if blob is not None:
+                coupling.blob_px = blob
+        # Too large for its colour need not be too large for a vehicle: of most, a part alone is seen to move at first.
+        own = np.zeros(len(boxes), bool)
+        if length_px is not None:
+            at = colour if expected_px is None else np.where(np.isnan(colour), expected_px, colour)
+            own = _of_vehicles(at, length_px, boxes)
+        return Sighted(image, tuple(by), colour, match, touching.any(axis=0) & ~shared | own, shared & ~own)
 
     def _find(
         self,
