@@ -205,6 +205,13 @@ def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
     assert "give --telemetry" in note
 
 
+def test_a_homography_says_that_it_leaves_a_bent_lens_aside():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
+    _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "homography"}))
+    assert "takes the lens of camera mine for straight" in note
+    assert camera_of(camera, None, None, Settings())[2] == []
+
+
 def test_places_over_the_date_line_are_near_each_other(prepared):
     flight = Overflight()
     locator, _ = prepared(flight)

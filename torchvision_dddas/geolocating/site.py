@@ -130,9 +130,15 @@ def camera_of(
                 f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
                 f"{size[0]} x {size[1]}; give the camera's file for this size"
             )
+        notes = []
         if math.isfinite(camera.height_m) and telemetry is None:
-            return camera, True, [f"where camera {camera.name} stands is not looked at from the air: give --telemetry"]
-        return camera, True, []
+            notes.append(f"where camera {camera.name} stands is not looked at from the air: give --telemetry")
+        if settings.aerial.mode != "pose" and (camera.k1 or camera.k2):
+            notes.append(
+                f"aerial.mode = {settings.aerial.mode} takes the lens of camera {camera.name} for straight: its k1 and "
+                "k2 count in mode pose alone"
+            )
+        return camera, True, notes
     if size is None and settings.aerial.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:
