@@ -8,7 +8,9 @@ import pytest
 from tests.airborne import CAMERA, GPS_M, look
 from torchvision_dddas.settings import AerialKnobs
 from torchvision_dddas.targets.integrity import judge
+from torchvision_dddas.targets.plane import ground_points
 from torchvision_dddas.targets.pose import bare_prior, expected_of, prior_of
+from torchvision_dddas.types import Fix
 
 KNOBS = AerialKnobs()
 NAMES = ("red", "green", "blue", "white", "black", "pink")
@@ -92,6 +94,26 @@ def test_landmarks_that_agree_overrule_a_telemetry_that_does_not():
     assert verdict.alone and verdict.passed and verdict.used.all()
     assert np.allclose(verdict.solution.pose.place_m, seen.pose.place_m, atol=0.5)
     assert "telemetry left out: the 6 landmarks agree with one another, not with it" in verdict.changes[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_row_of_landmarks_does_not_overrule_the_telemetry(seed):
+    """It agrees with poses of all kinds: by it alone places were off by tens of metres."""
+    row = np.column_stack([np.linspace(-25, 25, 5), np.zeros(5)])
+    seen = look(seed, places=row, sigma_m=0.5, tilt_deg=20.0)
+    astray = replace(seen, flight=replace(seen.flight, place=(80.0, 0.0)))
+    verdict = judged(astray, seen.marks)
+    assert not verdict.alone and not verdict.passed
+    fix = Fix(1, "pose", verdict.solution.pose, verdict.solution.covariance[:7, :7])
+    ground, covariance = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+    off = ground - seen.targets
+    assert (np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 4**2).all()
+
+
+def test_landmarks_that_show_at_one_pixel_do_not_overrule_the_telemetry():
+    seen = look(3, n=5)
+    one = replace(seen.marks, image_px=np.tile(seen.marks.image_px[:1], (5, 1)))
+    assert not judged(seen, one).alone
 
 
 def test_where_nothing_explains_it_the_errors_grow_as_seen():

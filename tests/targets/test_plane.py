@@ -188,3 +188,13 @@ def test_without_a_pose_the_foot_is_the_middle():
 
 def test_the_error_common_to_the_team_is_added_to_the_absolute_covariance_only():
     assert np.allclose(absolute(np.diag([1.0, 2.0])[None], GPS_M), np.diag([1 + GPS_M**2, 2 + GPS_M**2]))
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_landmarks_on_one_line_or_in_one_spot_are_refused_in_words(paper):
+    seen = look(1, n=5)
+    row = replace(seen.marks, east_north_m=np.outer(np.arange(5), [3.0, 4.0]))
+    spot = replace(seen.marks, image_px=np.tile(seen.marks.image_px[:1], (5, 1)))
+    for marks, words in ((row, "stand on one line"), (spot, "show in one spot of the picture")):
+        fix = homography_fix(7, marks, SOLVER, paper=paper)
+        assert fix.by == "" and f"the 5 landmarks of frame 7 {words}" in fix.cause

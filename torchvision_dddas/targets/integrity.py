@@ -6,7 +6,7 @@ and the likeliest that passes is taken:
   one change: two identities swapped, or one landmark left out;
   identities by assignment of the pixels to where they are expected, less the shift that all have in common;
   two landmarks left out, or one with identities by assignment;
-  the telemetry left out, where five landmarks or more agree among themselves.
+  the telemetry left out, where five landmarks or more, not on one line, agree among themselves.
 Where nothing passes the errors are taken to be as much larger as they were seen to be.
 """
 
@@ -32,6 +32,10 @@ FITTED = 6
 
 ENOUGH_ALONE = 5
 """Landmarks that may overrule the telemetry: fewer fit anything too easily."""
+
+APART = 3.0
+"""They do so only where they lie this many standard deviations off their own best line, on the ground and in the
+picture: a row of them agrees with poses of all kinds."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ def judge(
         if tried:
             _, solution, order, used = max(tried, key=lambda one: one[0])
             return Verdict(solution, order, used, _words(order, used, first, names))
-    if alone is not None and n >= ENOUGH_ALONE:
+    if alone is not None and n >= ENOUGH_ALONE and _spread_out(marks):
         solution = find_pose(marks, camera, alone)
         if passes(solution, probability):
             words = f"telemetry left out: the {n} landmarks agree with one another, not with it{_odds(first)}"
@@ -157,6 +161,14 @@ def _assigned(marks: Marks, camera: Camera, expected: Expected) -> np.ndarray | 
     apart = marks.image_px - marks.image_px.mean(axis=0), seen - seen.mean(axis=0)
     distance = np.linalg.norm(apart[1][:, None] - apart[0][None], axis=2)
     return linear_sum_assignment(distance**2)[1]
+
+
+def _spread_out(marks: Marks) -> bool:
+    """Whether landmarks lie off one line by clearly more than their errors: on the ground and in the picture."""
+    return all(
+        np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] > APART * np.linalg.norm(sigma)
+        for points, sigma in ((marks.east_north_m, marks.sigma_m), (marks.image_px, marks.pixel_sigma))
+    )
 
 
 def _predicted(marks: Marks, camera: Camera, expected: Expected) -> tuple[np.ndarray, np.ndarray]:

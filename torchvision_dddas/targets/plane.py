@@ -53,11 +53,11 @@ def homography_fix(
     ids, n = marks.landmark, len(marks)
     if n < LEAST:
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=too_few(frame, n))
-    if paper:
-        return _as_printed(frame, marks, solver, degrees)
     cause = on_one_line(frame, marks, least_spread)
     if cause:
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
+    if paper:
+        return _as_printed(frame, marks, solver, degrees)
     # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
     middle = marks.east_north_m.mean(axis=0)
     ground, image = marks.east_north_m - middle, marks.image_px
@@ -108,7 +108,9 @@ def too_few(frame: int, n: int, without: str = "") -> str:
 
 
 def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
-    """The cause of a refusal where landmarks stand on one line; empty where they do not."""
+    """The cause of a refusal where landmarks stand on one line, or show in one spot; empty where they do not."""
+    if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
+        return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
     wide = spread(marks.east_north_m)
     if wide >= least_spread:
         return ""
