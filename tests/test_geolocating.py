@@ -15,6 +15,7 @@ from torchvision_dddas.sources.colours import read_colours
 from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.sources.landmarks import read_landmarks
 from torchvision_dddas.sources.telemetry import read_telemetry
+from torchvision_dddas.targets.pose import bare_prior
 from torchvision_dddas.types import Camera, Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision import load_colours, load_solver
 
@@ -210,6 +211,15 @@ def test_a_homography_says_that_it_leaves_a_bent_lens_aside():
     _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "homography"}))
     assert "takes the lens of camera mine for straight" in note
     assert camera_of(camera, None, None, Settings())[2] == []
+
+
+def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), focal_sigma=0.002)
+    for knobs, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
+        settings = with_knobs(Settings(), knobs)
+        found, known, _ = camera_of(camera, None, None, settings)
+        prior = bare_prior(found, settings.aerial, known)
+        assert prior.information[6, 6] == pytest.approx(sigma**-2)
 
 
 def test_places_over_the_date_line_are_near_each_other(prepared):

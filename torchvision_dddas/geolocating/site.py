@@ -138,7 +138,9 @@ def camera_of(
                 f"aerial.mode = {settings.aerial.mode} takes the lens of camera {camera.name} for straight: its k1 and "
                 "k2 count in mode pose alone"
             )
-        return camera, True, notes
+        sigma = settings.aerial.focal_sigma
+        # What is set by hand counts for more than the file.
+        return camera if sigma == Settings().aerial.focal_sigma else replace(camera, focal_sigma=sigma), True, notes
     if size is None and settings.aerial.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:

@@ -270,4 +270,4 @@ def _focal_of(hfov_rad: float, camera: Camera, knobs: AerialKnobs, known: bool) 
     """The focal length as a share of the camera's, and its standard deviation."""
     if np.isfinite(hfov_rad) and 0 < hfov_rad < np.pi:
         return float(camera.size_px[0] / 2 / np.tan(hfov_rad / 2) / camera.focal_px[0]), knobs.focal_sigma
-    return 1.0, knobs.focal_sigma if known else knobs.focal_guess_sigma
+    return 1.0, camera.focal_sigma if known else knobs.focal_guess_sigma
