@@ -528,7 +528,11 @@ class AerialKnobs(Group):
         90.0, "deg", -90, 90, meaning="how far the camera looks below the horizon where neither says it; 90: down"
     )
     focal_sigma: float = knob(
-        0.01, "-", 0, 1, meaning="standard deviation, as a share, of a focal length that is given; unless its file says it"
+        0.01,
+        "-",
+        0,
+        1,
+        meaning="standard deviation, as a share, of a focal length that is given, unless the camera's file says it",
     )
     focal_guess_sigma: float = knob(0.2, "-", 0, 1, meaning="the same where it is not given but hfov_deg guessed")
     tilt_sigma_deg: float = knob(1.0, "deg", 0, 90, meaning="standard deviation of the reported tilt, each way")
