@@ -58,6 +58,9 @@ TARGETS = 20
 ALIKE_S = 20.0
 """What the registrar takes the time constant of the errors of telemetry and receivers to be, in flights."""
 
+NO_TIME_S = 1e-3
+"""Errors alike over no longer than this are new in every frame."""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -314,7 +317,9 @@ def blind(batch: Scenes, method: str) -> Found:
     return Found(off, inside, np.zeros(len(off), bool), [])
 
 
-def over_time(case: Case, seeds: int, seconds: float, rate_hz: float, true_alike_s: float) -> dict[str, object]:
+def over_time(
+    case: Case, seeds: int, seconds: float, rate_hz: float, true_alike_s: tuple[float, float]
+) -> dict[str, object]:
     """Errors of each frame by itself and of the registrar's state over time, in the second half of the flights."""
     frames = round(seconds * rate_hz)
     batches = flights(case, seeds, frames, 1 / rate_hz, true_alike_s)
@@ -399,12 +404,15 @@ def main() -> None:
         "time": [
             partial(over_time, Case(landmarks=n, gps=gps), max(seeds // 10, 10), 20.0, 5.0, alike_s)
             for n, gps, alike_s in (
-                (4, "exact", 20.0),
-                (4, "1.5 m", 20.0),
-                (4, "3.5 m", 20.0),
-                (4, "3.5 m", 4.0),
-                (4, "3.5 m", 100.0),
-                (6, "3.5 m", 20.0),
+                (4, "exact", (20.0, 20.0)),
+                (4, "1.5 m", (20.0, 20.0)),
+                (4, "3.5 m", (20.0, 20.0)),
+                (4, "3.5 m", (4.0, 4.0)),
+                (4, "3.5 m", (100.0, 100.0)),
+                (4, "3.5 m", (NO_TIME_S, NO_TIME_S)),
+                (4, "3.5 m", (20.0, NO_TIME_S)),
+                (4, "3.5 m", (NO_TIME_S, 20.0)),
+                (6, "3.5 m", (20.0, 20.0)),
             )
         ],
     }

@@ -150,14 +150,17 @@ def outlying(batch: Scenes, away_m: float, seed: int = 0) -> Scenes:
     return replace(batch, marks=marks)
 
 
-def flights(case: Case, count: int, frames: int, step_s: float, alike_s: float, seed: int = 0) -> list[Scenes]:
+def flights(
+    case: Case, count: int, frames: int, step_s: float, alike_s: tuple[float, float], seed: int = 0
+) -> list[Scenes]:
     """Batches of frames that follow each other: frame f of flight s is row s of batch f.
 
-    The errors of telemetry and receivers stay alike over `alike_s`, and the focal length's for good; pixels err anew.
+    The errors of telemetry and of receivers stay alike over `alike_s` each, the focal length's for good; pixels err
+    anew.
     The team drives about the middle at 1 m/s, the camera drifts at 1 m/s and sways by a degree.
     """
     rng, first = np.random.default_rng([seed, 5]), scenes(case, count, 2, seed)
-    keep = np.exp(-step_s / alike_s)
+    keep, keep_team = np.exp(-step_s / np.array(alike_s))
     shape = first.marks.shape
     sigma = np.array(
         [TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m]
@@ -178,7 +181,7 @@ def flights(case: Case, count: int, frames: int, step_s: float, alike_s: float, 
         seen = [pixels(x, axes, place, first.true_focal) for x in (marks, targets)]
         if f:
             flight = keep * flight + np.sqrt(1 - keep**2) * rng.normal(0, 1, flight.shape)
-            team = keep * team + np.sqrt(1 - keep**2) * rng.normal(0, 1, shape)
+            team = keep_team * team + np.sqrt(1 - keep_team**2) * rng.normal(0, 1, shape)
         found.append(
             Scenes(
                 case, axes, place, first.true_focal, marks, targets,

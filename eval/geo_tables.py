@@ -82,11 +82,12 @@ def time_table(rows: list[Row]) -> str:
     """What memory of earlier frames gains."""
     lines = heading(
         "GPS",
-        "n | errors alike over | flights | single frames: mean (median) | in ellipses | over time: mean (median) "
-        "| in ellipses | over time − single",
+        "n | errors of telemetry, receivers alike over | flights | single frames: mean (median) | in ellipses "
+        "| over time: mean (median) | in ellipses | over time − single",
     )
     for row in rows:
-        cells = [row["gps"], row["landmarks"], f"{row['alike_s']:g} s", row["flights"]]
+        alike = ", ".join("no time" if one < 0.01 else f"{one:g} s" for one in row["alike_s"])
+        cells = [row["gps"], row["landmarks"], alike, row["flights"]]
         for part in (row["single frames"], row["over time"]):
             cells += [f"{metres(part['mean'])} ({metres(part['median'])})", percent(part["inside"])]
         lines.append(line([*cells, f"{row['gain'][0]:+.3f} ± {row['gain'][1]:.3f}"]))
