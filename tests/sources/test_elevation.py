@@ -2,6 +2,7 @@
 
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -118,6 +119,15 @@ def test_what_is_no_raster_of_heights_is_refused(tmp_path):
     degrees = write(tmp_path / "d.tif", slope(), "EPSG:4326", 1e-5)
     with pytest.raises(InputError, match="is in degrees, the landmarks in local metres"):
         read_elevation(degrees, HERE, None)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("origin", [ORIGIN, None])
+def test_a_picture_that_does_not_say_where_it_lies_is_refused_in_one_line(tmp_path, origin):
+    path = tmp_path / "bare.png"
+    cv2.imwrite(str(path), np.full((20, 20), 90, np.uint8))
+    with pytest.raises(InputError, match=r"bare\.png does not say where it lies"):
+        read_elevation(path, HERE, origin)
 
 
 def test_without_rasterio_the_extra_is_named(tmp_path, monkeypatch):

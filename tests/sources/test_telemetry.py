@@ -44,6 +44,7 @@ def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path: Pa
         (HEADER + "0,20,5\n2,20,5\n1,20,5\n", ["line 4", "runs back from 2 to 1"]),
         (HEADER + "0,20,5\n,20,5\n", ["line 3", "time_s is ''"]),
         (HEADER + "0,,\n1,,\n", ["tells a place, an altitude"]),
+        (HEADER + "0,20,5\n1e30,20,5\n", ["line 3", "time_s is '1e30'"]),
         ("time_s,speed_m_s\n0,1\n", ["lacks altitude_m"]),
         ("time_s,altitude_m,latitude_deg\n0,20,50\n", ["lacks longitude_deg"]),
         ("time_s,altitude_m,east_m\n0,20,50\n", ["lacks north_m"]),

@@ -1,6 +1,7 @@
 """A georeferenced raster laid on a grid of local metres."""
 
 import math
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,13 +30,19 @@ def opened(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
     """
     try:
         import rasterio
-        from rasterio.errors import RasterioError
+        from rasterio.errors import NotGeoreferencedWarning, RasterioError
     except ImportError:
         raise InputError(
             f"{what} {path} needs rasterio: pip install 'torchvision-dddas[elevation]', or leave it out"
         ) from None
     try:
-        with rasterio.open(path) as raster:
+        with warnings.catch_warnings():
+            # What it warns of is refused below, in one line.
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            raster = rasterio.open(path)
+        with raster:
+            if raster.crs is None and raster.transform.is_identity:
+                raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
             if geographic and raster.crs is None:
                 raise InputError(
                     f"{what} {path} has no CRS: where it lies is not known; wanted a georeferenced GeoTIFF"

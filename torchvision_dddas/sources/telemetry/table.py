@@ -29,6 +29,7 @@ FURTHER = (
     "vehicle_heading_deg",
 )
 LIMITS = {
+    "time_s": (-1e10, 1e10, "seconds since the clip's first frame"),
     # A gimbal that looks straight down reports 90.2 as well as 89.8.
     "pitch_deg": (-180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
     "hfov_deg": (0.0, 180.0, "the width of the field of view, 0 to 180"),
