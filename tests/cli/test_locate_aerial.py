@@ -143,6 +143,15 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(aerial, tmp_path):
     assert "note: 1 frames could not be located" in result.stdout
 
 
+def test_landmarks_that_are_too_few_for_most_frames_are_not_said_to_be_misplaced(aerial, tmp_path):
+    flight = Overflight()
+    few = flight.landmarks_csv(keep=lambda frame, k: frame < 3 or k < 3)
+    result = aerial(flight, landmarks=few, telemetry=None)
+    assert {int(row["frame"]) for row in located(result, tmp_path / "out")} == {1, 2}
+    assert "note: 8 frames could not be located" in result.stdout
+    assert "was left out" not in result.stdout
+
+
 def test_a_landmark_that_is_hardly_ever_where_it_is_expected_is_told_of(aerial, tmp_path):
     class Wrong(Overflight):
         def shown(self, frame, east_north, up_m=0.0):
@@ -237,6 +246,43 @@ def test_telemetry_of_another_time(aerial):
 
 def test_an_altitude_below_the_ground(aerial):
     assert "below ground" in bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(altitude_m=-3.0)))
+
+
+def test_an_altitude_below_the_ground_for_a_while_is_told_of_and_not_used(aerial, tmp_path):
+    flight = Overflight()
+    header, *lines = flight.telemetry_csv().splitlines()
+    k = header.split(",").index("altitude_m")
+    lines[:4] = [",".join([*(cells := line.split(","))[:k], "-3.0", *cells[k + 1 :]]) for line in lines[:4]]
+    result = aerial(flight, telemetry="\n".join([header, *lines]) + "\n")
+    assert flight.errors(located(result, tmp_path / "out")).max() < 0.05
+    assert "at or below ground in 4 of 10 samples, the first at 0.0 s: it is not used there" in result.stdout
+
+
+def test_telemetry_of_another_continent(aerial):
+    flight = Overflight(geographic=False)
+    header, *lines = flight.telemetry_csv().splitlines()
+    k = header.split(",").index("east_m")
+    away = [",".join([*(cells := line.split(","))[:k], "541000.0", *cells[k + 1 :]]) for line in lines]
+    assert "the vehicle is 541 km or more from the landmarks" in bad(
+        aerial(flight, telemetry="\n".join([header, *away]) + "\n")
+    )
+
+
+def test_landmarks_far_outside_the_cameras_pictures(aerial, tmp_path):
+    flight = Overflight()
+    small = flight.camera_toml().replace("1280", "320").replace("720", "180")
+    line = bad(aerial(flight, camera=small))
+    assert "l.csv, line " in line
+    assert "far outside the camera's pictures of 320 x 180 px" in line
+    flat = aerial(flight, "--set", "aerial.mode=homography", camera=small)
+    assert flight.errors(located(flat, tmp_path / "out")).max() < 0.05
+
+
+def test_boxes_far_outside_the_cameras_pictures_are_told_of(aerial):
+    flight = Overflight()
+    assert "lie far outside" not in aerial(flight).stdout
+    away = aerial(flight, table=flight.tracks_txt() + "10,9,3000,100,20,20,1,-1,-1,-1\n")
+    assert "note: 1 of 41 boxes lie far outside the camera's pictures of 1280 x 720 px" in away.stdout
 
 
 def test_no_frame_in_common(aerial):

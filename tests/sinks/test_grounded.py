@@ -180,7 +180,13 @@ def test_the_record_counts_by_what_frames_were_located_and_says_what_went_wrong(
     assert record["unreliable"] == [{"first": 4, "last": 5, "cause": "nothing in view"}]
     assert record["weak"] == [{"first": 2, "last": 3, "by": "telemetry", "cause": "2 of 4 landmarks"}]
     assert record["repairs"] == [{"first": 6, "last": 9, "cause": "swapped: chi2 81 for 8"}]
-    assert record["landmarks"]["alpha"] == {"seen": 6, "used": 4, "reassigned": [[6, 7]], "excluded": [[2, 3]]}
+    assert record["landmarks"]["alpha"] == {
+        "seen": 6,
+        "used": 4,
+        "left_out": 2,
+        "reassigned": [[6, 7]],
+        "excluded": [[2, 3]],
+    }
     text = (tmp_path / "report.html").read_text()
     for words in ("4 to 5", "nothing in view", "2 of 4 landmarks", "swapped: chi2 81 for 8", "detected &lt;poorly&gt;"):
         assert words in text

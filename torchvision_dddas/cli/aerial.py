@@ -118,7 +118,7 @@ def aerial_into(
 ) -> "GroundedJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.geolocating import check_table, locate
-    from torchvision_dddas.geolocating.table import frames_of
+    from torchvision_dddas.geolocating.table import frames_of, outside
     from torchvision_dddas.sinks.grounded import GroundedOutput
     from torchvision_dddas.sinks.whole import refuse_own_input
     from torchvision_dddas.sources import open_source
@@ -147,6 +147,12 @@ def aerial_into(
         elif read.identity is None or (read.identity < 1).all():
             journal.notes.append(
                 "the table has no identities: targets are numbered anew in every frame, tracks are none"
+            )
+        if beyond := int(outside(locator, read.box_px[:, :2] + read.box_px[:, 2:] / 2).sum()):
+            width, height = locator.camera.size_px
+            journal.notes.append(
+                f"{beyond} of {len(read)} boxes lie far outside the camera's pictures of {width} x {height} px: is its "
+                "file for this size?"
             )
         with progress("locate", len(frames_of(read, locator.site.landmarks)), quiet) as tick:
             for grounded in locate(read, locator):
@@ -260,9 +266,11 @@ def ground_lines(journal: "Record") -> list[str]:
     if gaps := counts["by"].get("nothing", 0):
         lines.append(f"note: {gaps} frames could not be located and have no positions; run.json says why")
     for name, kept in counts.get("landmarks", {}).items():
-        if kept["seen"] and kept["used"] < 0.5 * kept["seen"]:
+        # In a frame that could not be located no landmark was used: that tells nothing of this one.
+        tried = kept["used"] + kept["left_out"]
+        if kept["left_out"] > 0.5 * tried:
             lines.append(
-                f"note: {name} was left out in {kept['seen'] - kept['used']} of {kept['seen']} frames; is its place "
+                f"note: {name} was left out in {kept['left_out']} of {tried} frames; is its place "
                 "right, and does the ground rise or fall there (--dem)?"
             )
     return lines

@@ -15,6 +15,9 @@ from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 HOLDS_S = 1.0
 """So long before its first and after its last sample telemetry holds."""
 
+FARTHEST_M = 100_000.0
+"""No vehicle sees landmarks from further away: then the files are of two flights."""
+
 
 @dataclass(frozen=True)
 class Site:
@@ -52,6 +55,8 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
     if telemetry is not None:
         _above_ground(telemetry)
     if not landmarks.geographic:
+        if telemetry is not None:
+            _near(landmarks, telemetry)
         return Site(landmarks, telemetry, None)
     if telemetry is not None and flown:
         where = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
@@ -66,6 +71,7 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
     local = replace(landmarks, place=geodesy.east_north(landmarks.place, origin), geographic=False)
     if telemetry is not None:
         telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
+        _near(local, telemetry)
     return Site(local, telemetry, origin)
 
 
@@ -74,7 +80,20 @@ def _above_ground(telemetry: Telemetry) -> None:
     if len(altitude) and (altitude <= 0).all():
         raise InputError(
             f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
-            "wanted metres above ground"
+            "wanted metres above ground: correct it, or leave --telemetry out"
+        )
+
+
+def _near(landmarks: Landmarks, telemetry: Telemetry) -> None:
+    """Raises InputError for a vehicle that is never near the landmarks; both in local metres."""
+    flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
+    if not len(flown):
+        return
+    away = np.linalg.norm(flown - np.nanmedian(landmarks.place, axis=0), axis=1).min()
+    if away > FARTHEST_M:
+        raise InputError(
+            f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; wanted "
+            f"{FARTHEST_M / 1000:g} km at most: give the telemetry of this flight, its places counted as theirs"
         )
 
 
@@ -95,6 +114,11 @@ def unknown_heights(site: Site) -> list[str]:
         level = telemetry is not None and not np.isfinite(telemetry.altitude_m).any()
         if telemetry is not None and level and np.isfinite(telemetry.above_sea_m).any():
             notes.append("the telemetry says heights above sea alone: give --dem, the ground's, or they are of no use")
+        if telemetry is not None and (below := int((telemetry.altitude_m <= 0).sum())):
+            notes.append(
+                f"the altitude is at or below ground in {below} of {len(telemetry.time_s)} samples, the first at "
+                f"{telemetry.time_s[(telemetry.altitude_m <= 0).argmax()]:.1f} s: it is not used there"
+            )
         return notes
     for places, what in (
         (site.landmarks.place, "at {} of {} places of landmarks: they are not used there"),

@@ -10,6 +10,9 @@ from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets.plane import LEAST, spread
 from torchvision_dddas.types import Grounded, Landmarks
 
+OUTSIDE = 0.25
+"""A landmark or a target may show so far beyond the picture's edge, as a share of the picture's side."""
+
 
 def locate(table: DetectionTable, locator: Locator) -> Iterator[Grounded]:
     """Where the targets of a table stand, in each of its frames and in those between that show landmarks."""
@@ -38,8 +41,8 @@ def frames_of(table: DetectionTable, landmarks: Landmarks) -> list[int]:
 def check_table(table: DetectionTable, locator: Locator) -> None:
     """Raises InputError where the landmarks cannot place any frame of the table, and says what is missing.
 
-    That is: no place in a picture, no frame in common, and, without telemetry, fewer than four landmarks in every frame
-    or all of them on one line.
+    That is: no place in a picture, one far outside of it, no frame in common, and, without telemetry, fewer than four
+    landmarks in every frame or all of them on one line.
     """
     site, knobs = locator.site, locator.settings.aerial
     path = site.landmarks.path
@@ -47,6 +50,7 @@ def check_table(table: DetectionTable, locator: Locator) -> None:
     helped = site.telemetry is not None and knobs.mode == "pose"
     if not seen.any():
         raise InputError(f"landmarks {path} say no places in pictures; wanted columns u_px,v_px beside the places")
+    _check_pictured(locator)
     if not len(table):
         return
     frames = np.unique(table.frame).tolist()
@@ -72,4 +76,28 @@ def check_table(table: DetectionTable, locator: Locator) -> None:
         raise InputError(
             f"the {counts[enough[0]]} landmarks of frame {frames[enough[0]]} lie on one line, as in all others; "
             "give --telemetry, or a landmark away from it"
+        )
+
+
+def outside(locator: Locator, pixels: np.ndarray) -> np.ndarray:
+    """(N,) bool, which (N, 2) pixels lie beyond the picture's edges by more than OUTSIDE of its sides.
+
+    None does where the size need not be known: a homography needs no camera.
+    """
+    if locator.settings.aerial.mode != "pose":
+        return np.zeros(len(pixels), bool)
+    size = np.array(locator.camera.size_px, float)
+    beyond: np.ndarray = (pixels < -OUTSIDE * size) | (pixels > (1 + OUTSIDE) * size)
+    return np.any(beyond, axis=1)
+
+
+def _check_pictured(locator: Locator) -> None:
+    landmarks = locator.site.landmarks
+    away = outside(locator, landmarks.image_px)
+    if away.any():
+        k = int(np.where(away, landmarks.line, np.iinfo(np.int64).max).argmin())
+        (u, v), (width, height) = landmarks.image_px[k].tolist(), locator.camera.size_px
+        raise InputError(
+            f"landmarks {landmarks.path}, line {landmarks.line[k]}: u_px,v_px are {u:g}, {v:g}, far outside the "
+            f"camera's pictures of {width} x {height} px; give pixels, and the camera's file for this size"
         )

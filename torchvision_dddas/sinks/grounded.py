@@ -56,7 +56,8 @@ class GroundedJournal(Record):
 
     positions: rows of positions.csv. by: frames by what told where the camera was, `nothing` for those that could not
     be located. weak: spans of frames that were located, but with something amiss. repairs: what was changed and why.
-    landmarks: of each, in how many frames it was seen and used, and the spans where it was reassigned or excluded.
+    landmarks: of each, in how many frames it was seen, used, and left out of those located; and the spans where it was
+    reassigned or excluded.
     """
 
     made = ("positions.csv", "fixes.csv", GEOJSON, KML, COT, MAP, REPORT)
@@ -70,7 +71,7 @@ class GroundedJournal(Record):
         self.by = dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0)
         self.weak, self.repairs = Spans(), Spans()
         self.landmarks: dict[str, dict[str, Any]] = {
-            name: {"seen": 0, "used": 0, "reassigned": [], "excluded": []} for name in names
+            name: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for name in names
         }
         self._before = 0
 
@@ -93,6 +94,7 @@ class GroundedJournal(Record):
             kept = self.landmarks[self.names[which]]
             kept["seen"] += 1
             kept["used"] += state in USED
+            kept["left_out"] += bool(fix.by) and state not in USED
             if state in ("reassigned", "excluded"):
                 spans = kept[state]
                 if spans and spans[-1][1] == self._before:
