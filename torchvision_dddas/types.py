@@ -357,8 +357,9 @@ class Fix:
 
     by: what told it: pose, homography, paper, telemetry (no landmark could be used), or "" (nothing: see cause).
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
-    image_from_ground: (3, 3) on local metres, where there is no pose. matrix_covariance: (8, 8) of the first eight
-    elements, h33 = 1, of the same on metres from about_m, the landmarks' middle: from afar rounding would swallow it.
+    image_from_ground: (3, 3) from local metres to the picture of a lens without distortion (paper: as it is), where
+    there is no pose. matrix_covariance: (8, 8) of the first eight elements, h33 = 1, of the same on metres from
+    about_m, the landmarks' middle: from afar rounding would swallow it.
     landmark: (n,) which were seen; state: for each used, reassigned, excluded.
     chi2, freedom: of the landmarks against what was expected of them; NaN and 0 where nothing was expected.
     changes: what was repaired or excluded and why, in words. cause: why nothing could be concluded, or how little.

@@ -176,6 +176,17 @@ def test_the_bare_homography_is_by_landmarks_alone_and_telemetry_only_tests_them
     assert fixes[1].state == ("reassigned", "reassigned", "used", "used")
 
 
+def test_the_bare_homography_is_of_the_picture_that_a_straight_lens_would_show():
+    bent = replace(CAMERA, k1=-0.2)
+    seen = look(14, n=6, errors=0.0, sigma_m=0.02, camera=bent)
+    settings = with_aerial(mode="homography")
+    one = Registrar(bent, settings, SOLVER)
+    ground, _ = ground_points(one.step(1, 0.0, None, seen.marks), bent, seen.targets_px, 1.0)
+    assert np.abs(ground - seen.targets).max() < 1e-6
+    ground, _ = ground_points(registrar(settings).step(1, 0.0, None, seen.marks), CAMERA, seen.targets_px, 1.0)
+    assert np.abs(ground - seen.targets).max() > 0.1
+
+
 def test_paper_mode_takes_identities_as_they_come():
     seen = look(16, errors=0)
     swapped = replace(seen.marks, image_px=seen.marks.image_px[[1, 0, 2, 3]])

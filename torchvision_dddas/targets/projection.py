@@ -55,6 +55,11 @@ def lifted(pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera) -> Fl
     return np.stack(straight(bent[:, 0], bent[:, 1], camera), axis=1)
 
 
+def unbent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """Where a lens without distortion would show what is at these pixels."""
+    return lifted(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
+
+
 def slopes_of_lift(
     pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from torchvision_dddas.targets.integrity import Verdict, judge, passes, reordere
 from torchvision_dddas.targets.memory import Lasting, Memory, places_of
 from torchvision_dddas.targets.plane import LEAST, Solver, homography_fix, on_one_line, too_few
 from torchvision_dddas.targets.pose import Prior, Solution, bare_prior, expected_of, prior_of
+from torchvision_dddas.targets.projection import unbent
 from torchvision_dddas.types import Camera, Fix, Flight, Marks
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
@@ -180,12 +181,13 @@ class Registrar:
         knobs, n = self.settings.aerial, len(marks)
         paper = knobs.mode == "paper"
         if paper or prior is None or not prior.known.all() or n == 0:
-            return homography_fix(frame, marks, self.solver, knobs.least_spread, degrees, paper)
+            seen = marks if paper else self._unbent(marks)
+            return homography_fix(frame, seen, self.solver, knobs.least_spread, degrees, paper)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         expected = expected_of(prior, marks.sigma_m)
         verdict = judge(marks, self.camera, expected, knobs.gate_probability, names)
         kept = rows(reordered(marks, verdict.order), verdict.used)
-        fix = homography_fix(frame, kept, self.solver, knobs.least_spread)
+        fix = homography_fix(frame, self._unbent(kept), self.solver, knobs.least_spread)
         solution = verdict.solution
         return replace(
             fix,
@@ -196,6 +198,10 @@ class Registrar:
             changes=verdict.changes,
             cause=fix.cause or verdict.cause,
         )
+
+    def _unbent(self, marks: Marks) -> Marks:
+        """As a lens without distortion would show them: a bent picture of a plane is no homography's."""
+        return replace(marks, image_px=unbent(marks.image_px, self.camera))
 
     def _usable(self, marks: Marks) -> tuple[np.ndarray, tuple[str, ...]]:
         """Which rows count: those with pixel and place, each landmark once; and of those that do not, why."""
