@@ -7,7 +7,7 @@ import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring, within_95
 from torchvision_dddas.targets.geodesy import lonlat
-from torchvision_dddas.targets.plane import absolute, feet_px, ground_points, homography_fix
+from torchvision_dddas.targets.plane import absolute, ground_points, homography_fix
 from torchvision_dddas.targets.pose import moved
 from torchvision_dddas.targets.projection import project
 from torchvision_dddas.targets.projective import transfer
@@ -164,26 +164,13 @@ def test_rays_meet_a_slope_where_it_is():
     assert np.isnan(nowhere).all()
 
 
-def test_the_foot_is_below_the_middle_of_the_body():
+def test_the_middle_of_a_body_tells_where_it_stands_once_its_height_is_known():
     seen = look(8, errors=0, tilt_deg=35.0)
     middle = project(UPRIGHT + np.array([0, 0, 0.85]), seen.pose, CAMERA)
-    box = np.c_[middle - 20 + 0.5, np.full((3, 2), 40.0)]
-    feet = feet_px(posed(seen), CAMERA, box, 1.7)
-    assert np.allclose(feet, project(UPRIGHT, seen.pose, CAMERA), atol=1e-6)
+    feet, _ = ground_points(posed(seen), CAMERA, middle, 1.0, up_m=0.85)
+    assert np.allclose(feet, UPRIGHT[:, :2], atol=1e-6)
     body, _ = ground_points(posed(seen), CAMERA, middle, 1.0)
     assert (np.linalg.norm(body - UPRIGHT[:, :2], axis=1) > 0.4).all()
-
-
-def test_the_foot_is_no_further_from_the_middle_than_the_box_reaches():
-    seen = look(8, errors=0, tilt_deg=35.0)
-    box = np.array([[800.0, 500.0, 12.0, 6.0]])
-    step = feet_px(posed(seen), CAMERA, box, 1.7)[0] - [805.5, 502.5]
-    assert (np.abs(step) <= [6.0, 3.0]).all() and np.isclose(np.abs(step / [6.0, 3.0]).max(), 1.0)
-
-
-def test_without_a_pose_the_foot_is_the_middle():
-    fix = homography_fix(1, look(1, errors=0).marks, SOLVER)
-    assert np.allclose(feet_px(fix, CAMERA, np.array([[10.0, 20.0, 5.0, 9.0]]), 1.7), [[12.0, 24.0]])
 
 
 def test_the_error_common_to_the_team_is_added_to_the_absolute_covariance_only():

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from torchvision_dddas.targets.geodesy import lonlat
-from torchvision_dddas.targets.projection import inverse_2x2, project, slopes_of_lift
+from torchvision_dddas.targets.ground_rays import by_rays
+from torchvision_dddas.targets.projection import inverse_2x2, unbent
 from torchvision_dddas.targets.projective import transfer
-from torchvision_dddas.targets.rotation import cross
-from torchvision_dddas.targets.surface import Surface, met_surface
+from torchvision_dddas.targets.surface import Surface
 from torchvision_dddas.types import Camera, Fix, Marks
 
 LEAST = 4
@@ -142,34 +142,15 @@ def ground_points(
     """
     pixels = np.asarray(pixels, float).reshape(-1, 2)
     if fix.pose is not None and fix.covariance is not None:
-        return _by_rays(fix, camera, pixels, sigma_px, up_m, surface)
+        return by_rays(fix.pose, fix.covariance, camera, pixels, sigma_px, up_m, surface)
     if fix.image_from_ground is None:
         return np.full((len(pixels), 2), np.nan), np.full((len(pixels), 2, 2), np.nan)
+    if fix.by != "paper":
+        pixels = unbent(pixels, camera)
     middle = np.array(fix.about_m)
     matrix = _about(fix.image_from_ground, middle)
     ground, covariance = _by_inverse(matrix / matrix[2, 2], fix.matrix_covariance, pixels, sigma_px)
     return ground + middle, covariance
-
-
-def feet_px(
-    fix: Fix, camera: Camera, box_px: Float[np.ndarray, "N 4"], body_height_m: float | Float[np.ndarray, "N"]
-) -> Float[np.ndarray, "N 2"]:
-    """Pixels of the ground below upright bodies whose middles are the middles of their boxes.
-
-    The ray through the middle is met with the plane at half the body's height. The foot is never further from the
-    middle than the box reaches: a shadow's box, or a height that is too large, must not throw it off. Straight down,
-    and where no pose of the camera is known, it is the middle itself.
-    """
-    box = np.asarray(box_px, float).reshape(-1, 4)
-    middle = box[:, :2] + box[:, 2:] / 2 - 0.5
-    if fix.pose is None or fix.covariance is None or len(box) == 0:
-        return middle
-    half = np.broadcast_to(np.asarray(body_height_m, float) / 2, len(box))
-    below, _ = _by_rays(fix, camera, middle, 0.0, half, None)
-    step = project(np.column_stack([below, np.zeros(len(box))]), fix.pose, camera) - middle
-    step[~np.isfinite(step).all(axis=1)] = 0.0
-    share = np.minimum(box[:, 2:] / 2 / np.maximum(np.abs(step), 1e-9), 1.0).min(axis=1)
-    return middle + step * share[:, None]
 
 
 def absolute(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m: float) -> Float[np.ndarray, "N 2 2"]:
@@ -246,48 +227,3 @@ def _by_inverse(
         spread_m2 = by_pixel @ seen @ by_pixel.swapaxes(1, 2)
         spread_m2 = (spread_m2 + spread_m2.swapaxes(1, 2)) / 2
     return found, np.where(np.isfinite(found).all(axis=1)[:, None, None], spread_m2, np.nan)
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Rays.
-
-
-def _by_rays(
-    fix: Fix,
-    camera: Camera,
-    pixels: np.ndarray,
-    sigma_px: float,
-    up_m: float | np.ndarray,
-    surface: Surface | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    assert fix.pose is not None and fix.covariance is not None
-    pose = fix.pose
-    flat, by_pixel, by_focal = slopes_of_lift(pixels, pose.focal, camera)
-    way = np.c_[flat, np.ones(len(flat))] @ pose.axes.T
-    far, normal = _met(pose.place_m, way, np.broadcast_to(np.asarray(up_m, float), len(way)), surface)
-    offset = far[:, None] * way
-    # A change of the ray or of its start moves the place where it meets the ground along the ground.
-    steep = (way * normal).sum(axis=1)
-    along = np.eye(3) - way[:, :, None] * normal[:, None, :] / steep[:, None, None]
-    along = along[:, :2]
-    by_lift = far[:, None, None] * along @ pose.axes[:, :2]
-    by_pose = np.empty((len(way), 2, 7))
-    by_pose[:, :, :3] = -along @ cross(offset)
-    by_pose[:, :, 3:6] = along
-    by_pose[:, :, 6] = (by_lift @ by_focal[:, :, None])[:, :, 0]
-    by_pixel = by_lift @ by_pixel
-    spread_m2 = by_pose @ fix.covariance @ by_pose.swapaxes(1, 2)
-    spread_m2 += sigma_px**2 * by_pixel @ by_pixel.swapaxes(1, 2)
-    return (pose.place_m + offset)[:, :2], spread_m2
-
-
-def _met(
-    place_m: np.ndarray, way: np.ndarray, up_m: np.ndarray, surface: Surface | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far along rays the ground is (N,), and its normal there (N, 3), upward; NaN where a ray meets none."""
-    if surface is not None:
-        return met_surface(place_m, way, up_m, surface)
-    flat = np.broadcast_to(np.array([0.0, 0.0, 1.0]), way.shape)
-    down = np.where(way[:, 2] < -1e-9 * np.linalg.norm(way, axis=1), way[:, 2], np.nan)
-    far = (up_m - place_m[2]) / down
-    return np.where(far > 0, far, np.nan), flat
