@@ -22,7 +22,6 @@ _PAIR = re.compile(
     rf"([A-Za-z][A-Za-z_.]*)\s*[:=]?\s*({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])",
     re.IGNORECASE,
 )
-_LETTERED = re.compile(rf"([NSEWnsew])\s*:?\s*({_NUMBER})|({_NUMBER})\s*°?\s*([NSEWnsew])\b")
 _OPTICS = ("focal_len", "fnum", "dzoom_ratio")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 
