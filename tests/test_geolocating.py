@@ -206,9 +206,9 @@ def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
     assert "give --telemetry" in note
 
 
-def test_a_homography_says_that_it_leaves_a_bent_lens_aside():
+def test_paper_mode_says_that_it_leaves_a_bent_lens_aside():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
-    _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "homography"}))
+    _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "paper"}))
     assert "takes the lens of camera mine for straight" in note
     assert camera_of(camera, None, None, Settings())[2] == []
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -139,6 +141,8 @@ def test_the_view_of_a_homography_is_its_border_on_the_ground():
     image_from_ground = np.array([[20, 0, 960], [0, -20, 540], [0, 0, 1.0]])
     found = view_of(Fix(1, "homography", image_from_ground=image_from_ground), CAMERA)
     assert np.allclose(found[0], (-48, 27)) and np.allclose(found[16], (47.95, -26.95))
+    bent = view_of(Fix(1, "homography", image_from_ground=image_from_ground), replace(CAMERA, k1=-0.1))
+    assert bent[0, 0] < found[0, 0] - 1  # a barrel shows more than a straight lens
     horizon = np.array([[20, 0, 960], [0, -20, 540], [0, -0.1, 1.0]])
     assert len(view_of(Fix(1, "homography", image_from_ground=horizon), CAMERA)) == 0
     assert len(view_of(Fix(1, "homography", image_from_ground=np.zeros((3, 3))), CAMERA)) == 0

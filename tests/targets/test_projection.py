@@ -12,11 +12,13 @@ from torchvision_dddas.targets.pose import moved
 from torchvision_dddas.targets.projection import (
     angles_of,
     axes_of,
+    bent,
     lifted,
     project,
     project_with_slopes,
     rays,
     slopes_of_lift,
+    unbent,
 )
 from torchvision_dddas.targets.rotation import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import CameraPose
@@ -114,3 +116,12 @@ def test_the_slope_of_a_turn_is_its_differences():
 def test_what_turns_about_up_undone_leaves_a_tilt():
     rotation = turned(np.array([0.3, -0.1, 0.0])) @ turned(np.array([0.0, 0.0, 2.5]))
     assert np.allclose(about_up(rotation), turned(np.array([0.0, 0.0, 2.5])))
+
+
+def test_a_straight_lens_shows_points_at_unbent_pixels_and_bent_ones_are_the_lens_again():
+    seen = project(POINTS, ABOVE, BENT)
+    straight = project(POINTS, replace(ABOVE, focal=1.0), replace(BENT, k1=0.0, k2=0.0))
+    found = unbent(project(POINTS, replace(ABOVE, focal=1.0), BENT), BENT)
+    assert np.allclose(found, straight, atol=1e-6)
+    assert np.allclose(bent(unbent(seen, BENT), BENT), seen, atol=1e-6)
+    assert np.abs(unbent(seen, BENT) - seen).max() > 1

@@ -157,11 +157,8 @@ def camera_of(
         notes = []
         if math.isfinite(camera.height_m) and telemetry is None:
             notes.append(f"where camera {camera.name} stands is not looked at from the air: give --telemetry")
-        if settings.aerial.mode != "pose" and (camera.k1 or camera.k2):
-            notes.append(
-                f"aerial.mode = {settings.aerial.mode} takes the lens of camera {camera.name} for straight: its k1 and "
-                "k2 count in mode pose alone"
-            )
+        if settings.aerial.mode == "paper" and (camera.k1 or camera.k2):
+            notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         sigma = settings.aerial.focal_sigma
         # What is set by hand counts for more than the file.
         return camera if sigma == Settings().aerial.focal_sigma else replace(camera, focal_sigma=sigma), True, notes

@@ -9,7 +9,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geolocating.locator import Locator, Look
 from torchvision_dddas.targets.landmarks import LandmarkFollower
 from torchvision_dddas.targets.plane import LEAST
-from torchvision_dddas.targets.projection import project
+from torchvision_dddas.targets.projection import bent, project
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
 from torchvision_dddas.vision.protocol import ColourFinder
@@ -125,6 +125,7 @@ class Watch:
         else:
             assert fix.image_from_ground is not None
             before = transfer(fix.image_from_ground, beside)
+            before = before if fix.by == "paper" else bent(before, self.locator.camera)
         here, east, north = np.split(transfer(step, before), 3)
         return here, np.maximum(*(np.linalg.norm(there - here, axis=1) for there in (east, north)))
 

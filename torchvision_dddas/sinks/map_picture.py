@@ -97,6 +97,8 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
         return _seen(border, fix, camera)
     if fix.image_from_ground is None or not np.isfinite(np.linalg.cond(fix.image_from_ground)):
         return np.zeros((0, 2))
+    if fix.by != "paper":
+        border = _straight(border, camera) * camera.focal_px + camera.centre_px
     ground = np.c_[border, np.ones(len(border))] @ np.linalg.inv(fix.image_from_ground).T
     # Pixels on both sides of the horizon have scales of both signs.
     same = (ground[:, 2] > 0).all() or (ground[:, 2] < 0).all()
@@ -105,13 +107,18 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
 
 def _seen(border: np.ndarray, fix: Fix, camera: Camera) -> np.ndarray:
     assert fix.pose is not None
-    (fu, fv), (cu, cv) = np.array(camera.focal_px) * fix.pose.focal, camera.centre_px
-    lens = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, 1]])
-    straight = cv2.undistortPoints(border[:, None], lens, np.array([camera.k1, camera.k2, 0, 0]))[:, 0]
+    straight = _straight(border, camera, fix.pose.focal)
     rays = np.c_[straight, np.ones(len(straight))] @ fix.pose.axes.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     reach = fix.pose.place_m[2] / np.maximum(-rays[:, 2], LOWEST)
     return fix.pose.place_m[:2] + rays[:, :2] * reach[:, None]
+
+
+def _straight(pixels: np.ndarray, camera: Camera, focal: float = 1.0) -> np.ndarray:
+    """Pixels to right and down per depth, without the lens's distortion; focal: as a share of the camera's."""
+    (fu, fv), (cu, cv) = np.array(camera.focal_px) * focal, camera.centre_px
+    lens = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, 1]])
+    return cv2.undistortPoints(pixels[:, None], lens, np.array([camera.k1, camera.k2, 0, 0]))[:, 0]
 
 
 def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> np.ndarray:

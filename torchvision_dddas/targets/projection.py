@@ -60,6 +60,12 @@ def unbent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray
     return lifted(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
 
 
+def bent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """The other way: where the lens shows what one without distortion would show at these pixels; NaN where nowhere."""
+    flat = (np.asarray(pixels, float).reshape(-1, 2) - camera.centre_px) / camera.focal_px
+    return bend(flat, camera)[0] * camera.focal_px + camera.centre_px
+
+
 def slopes_of_lift(
     pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
