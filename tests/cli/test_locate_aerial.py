@@ -54,6 +54,23 @@ def test_exact_input_puts_every_target_where_it_is(aerial, tmp_path):
     np.testing.assert_allclose(velocity, way, atol=0.1)
 
 
+def test_a_landmark_without_reports_is_where_its_waypoints_say(aerial, tmp_path):
+    """Landmarks alone, four of them: without the plan of the one nothing could be located."""
+    flight = Overflight()
+    header, *lines = flight.landmarks_csv().splitlines()
+    told = [f"{header},planned"]
+    for line in lines:
+        frame, name, u, v, longitude, latitude, sigma = line.split(",")
+        silent = name == "ugv0"
+        told.append(",".join([frame, name, u, v, *(("", "") if silent else (longitude, latitude)), sigma, "0"]))
+        if silent and frame in ("1", "10"):
+            told.append(f"{frame},{name},,,{longitude},{latitude},{sigma},1")
+    found = located(aerial(flight, landmarks="\n".join(told) + "\n", telemetry=None), tmp_path / "out")
+    assert len(found) == 40
+    # The run's metres begin at the first place in the table, here the plan's: the same.
+    assert flight.errors(found).max() < 0.001
+
+
 def test_longitudes_and_latitudes_are_those_of_the_metres(aerial, tmp_path):
     from tests.overflight import ORIGIN
     from torchvision_dddas.targets.geodesy import lonlat
