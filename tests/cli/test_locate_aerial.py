@@ -265,6 +265,11 @@ def test_an_altitude_below_the_ground(aerial):
     assert "below ground" in bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(altitude_m=-3.0)))
 
 
+def test_a_pitch_that_is_counted_upward(aerial):
+    said = bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(pitch_deg=-90.0)))
+    assert "looks into the sky" in said and "turn the sign of pitch_deg" in said
+
+
 def test_an_altitude_below_the_ground_for_a_while_is_told_of_and_not_used(aerial, tmp_path):
     flight = Overflight()
     header, *lines = flight.telemetry_csv().splitlines()

@@ -15,6 +15,9 @@ from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 HOLDS_S = 1.0
 """So long before its first and after its last sample telemetry holds."""
 
+HIGHEST_DEG = 20.0
+"""No camera that looks higher than this above the horizon, as a rule, shows landmarks: its angles go the other way."""
+
 FARTHEST_M = 100_000.0
 """No vehicle sees landmarks from further away: then the files are of two flights."""
 
@@ -54,6 +57,7 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
         raise InputError(f"the landmarks are in {first}, the telemetry in {second}; give both in one kind")
     if telemetry is not None:
         _above_ground(telemetry)
+        _looks_down(telemetry)
     if not landmarks.geographic:
         if telemetry is not None:
             _near(landmarks, telemetry)
@@ -73,6 +77,16 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
         telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
         _near(local, telemetry)
     return Site(local, telemetry, origin)
+
+
+def _looks_down(telemetry: Telemetry) -> None:
+    """Raises InputError for angles that are counted upward, as some gimbals do."""
+    pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
+    if len(pitch) and np.median(pitch) < -HIGHEST_DEG:
+        raise InputError(
+            f"by the telemetry's pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
+            "below the horizon, 90 for straight down: turn the sign of pitch_deg"
+        )
 
 
 def _above_ground(telemetry: Telemetry) -> None:
