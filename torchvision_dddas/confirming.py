@@ -152,6 +152,11 @@ def _origin(blobs: Positions, vehicles: Sequence[Vehicle]) -> tuple[float, float
             f"the cameras stand at longitude and latitude, and {which} have no longitude_deg and latitude_deg; "
             "give cameras in the local metres (east_m, north_m) of the tables"
         )
+    if not geographic and 0 < len(lacking) < len(tables):
+        raise InputError(
+            "some tables have longitude_deg and latitude_deg, others local metres alone, whose origin nothing tells; "
+            "give all in one kind, as one kind of landmarks and cameras makes them"
+        )
     if geographic == {False} or lacking or not len(blobs):
         return None
     assert blobs.lonlat_deg is not None

@@ -236,3 +236,10 @@ def test_an_input_is_not_overwritten(dddas, scene, tmp_path):
     dddas("confirm", blobs, people, "--out", tmp_path / "out")
     line = bad(dddas("confirm", tmp_path / "out" / "confirmed.csv", people, "--out", tmp_path / "out"))
     assert "is a file that this run writes" in line
+
+
+def test_tables_in_degrees_and_in_metres_of_an_unknown_origin_are_not_compared(dddas, scene, tmp_path):
+    blobs, _, _ = scene
+    degrees = write(tmp_path / "p.csv", HEADER + ",longitude_deg,latitude_deg", place(1, 1, 0, 0, 0.3, 7.0, 50.0))
+    line = bad(dddas("confirm", blobs, degrees, "--out", tmp_path / "out"))
+    assert "some tables have longitude_deg and latitude_deg, others local metres" in line
