@@ -230,6 +230,16 @@ def test_landmarks_on_one_line(aerial):
     assert "lie on one line" in bad(aerial(Row(), telemetry=None))
 
 
+def test_landmarks_on_one_line_that_receivers_errors_widen(aerial, tmp_path):
+    class Row(Overflight):
+        def marks(self, frame):
+            return np.outer(np.arange(4) - 1.5, [8.0, 3.0])
+
+    flight = Row(gps_m=1.43, pixel=1.0, frames=2)
+    assert "lie on one line" in bad(aerial(flight, telemetry=None))
+    assert flight.errors(located(aerial(flight), tmp_path / "out")).max() < 3.0
+
+
 def test_degrees_and_metres_mixed(aerial):
     metres, degrees = Overflight(geographic=False), Overflight()
     line = bad(aerial(metres, telemetry=degrees.telemetry_csv()))

@@ -7,7 +7,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geolocating.locator import Locator, Targets, chosen_rows
 from torchvision_dddas.sources.detections import DetectionTable
-from torchvision_dddas.targets.plane import LEAST, spread
+from torchvision_dddas.targets.plane import LEAST, width
 from torchvision_dddas.types import Grounded, Landmarks
 
 OUTSIDE = 0.25
@@ -72,7 +72,7 @@ def check_table(table: DetectionTable, locator: Locator) -> None:
             f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
         )
     enough = [k for k, count in enumerate(counts.tolist()) if count >= LEAST]
-    if all(spread(marks[k].east_north_m) < knobs.least_spread for k in enough):
+    if all(width(marks[k]) < knobs.least_spread for k in enough):
         raise InputError(
             f"the {counts[enough[0]]} landmarks of frame {frames[enough[0]]} lie on one line, as in all others; "
             "give --telemetry, or a landmark away from it"
@@ -96,8 +96,8 @@ def _check_pictured(locator: Locator) -> None:
     away = outside(locator, landmarks.image_px)
     if away.any():
         k = int(np.where(away, landmarks.line, np.iinfo(np.int64).max).argmin())
-        (u, v), (width, height) = landmarks.image_px[k].tolist(), locator.camera.size_px
+        (u, v), (columns, rows) = landmarks.image_px[k].tolist(), locator.camera.size_px
         raise InputError(
             f"landmarks {landmarks.path}, line {landmarks.line[k]}: u_px,v_px are {u:g}, {v:g}, far outside the "
-            f"camera's pictures of {width} x {height} px; give pixels, and the camera's file for this size"
+            f"camera's pictures of {columns} x {rows} px; give pixels, and the camera's file for this size"
         )

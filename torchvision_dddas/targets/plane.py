@@ -111,7 +111,7 @@ def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
     """The cause of a refusal where landmarks stand on one line, or show in one spot; empty where they do not."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
-    wide = spread(marks.east_north_m)
+    wide = width(marks)
     if wide >= least_spread:
         return ""
     return (
@@ -120,9 +120,17 @@ def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
     )
 
 
-def spread(east_north_m: Float[np.ndarray, "n 2"]) -> float:
+def width(marks: Marks) -> float:
+    """How wide landmarks lie, as a share of how long, on the ground or in the picture, whichever is less.
+
+    Receivers' errors make a row on the ground wider than it is; a picture shows a row as one whatever they err.
+    """
+    return min(spread(marks.east_north_m), spread(marks.image_px))
+
+
+def spread(points: Float[np.ndarray, "n 2"]) -> float:
     """How wide points lie, as a share of how long."""
-    apart = east_north_m - east_north_m.mean(axis=0)
+    apart = points - points.mean(axis=0)
     length, width = np.linalg.svd(apart, compute_uv=False)[:2]
     return float(width / length) if length > 0 else 0.0
 
