@@ -6,6 +6,7 @@ by what is independent, pixels and motion, and no confidence grows beyond what s
 """
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -60,26 +61,11 @@ class Memory:
         correlation_s /= self.lasting.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
-        known = np.flatnonzero(prior.known)
-        old_ids = self.ids.tolist()
-        staying = [
-            row
-            for row, identity in enumerate(old_ids)
-            if identity in marks.landmark or time_s - self.seen_s[row] <= FORGOTTEN * correlation_s
-        ]
-        new = [row for row, identity in enumerate(marks.landmark.tolist()) if identity not in old_ids]
-        ids = np.concatenate([self.ids[staying], marks.landmark[new]]).astype(np.int64)
-        seen_s = np.concatenate([self.seen_s[staying], np.full(len(new), time_s)])
-        from_old = np.concatenate([np.arange(7), *(7 + 2 * row + np.arange(2) for row in staying)]).astype(int)
-        size, kept = 7 + 2 * len(ids), len(from_old)
-        mean, covariance = np.zeros(size), np.zeros((size, size))
-        was, sigma = np.full(size, np.nan), np.full(size, np.nan)
-        mean[:kept], was[:kept] = self.mean[from_old], self.sigma[from_old]
-        covariance[:kept, :kept] = self.covariance[np.ix_(from_old, from_old)]
-        sigma[:] = was
+        known, before = np.flatnonzero(prior.known), self._of(time_s, marks, FORGOTTEN * correlation_s)
+        was, size = before.sigma, len(before.mean)
+        sigma = was.copy()
         sigma[known] = 1 / np.sqrt(np.diag(prior.information)[known])
-        own = places_of(ids, marks.landmark)
-        sigma[own] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
+        sigma[places_of(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
         with np.errstate(invalid="ignore"):
             grown = sigma / was
         # The telemetry's may be a share of the altitude, and grow with it.
@@ -87,10 +73,29 @@ class Memory:
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
         filled = np.where(np.isfinite(sigma), sigma, 0.0) * self._slow(size)
         was = was * self._slow(size)
-        mean, covariance = mean * factor, covariance * np.outer(factor, factor)
+        covariance = before.covariance * np.outer(factor, factor)
         # What is new of each: all that it has beyond what it keeps of its standard deviation.
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
-        return replace(self, time_s=time_s, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
+        return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
+
+    def _of(self, time_s: float, marks: Marks, forgotten_s: float) -> "Memory":
+        """The same with the landmarks that are new, and without those not seen for too long."""
+        seen, old = marks.landmark.tolist(), self.ids.tolist()
+        staying = [
+            row for row, identity in enumerate(old) if identity in seen or time_s - self.seen_s[row] <= forgotten_s
+        ]
+        new = [row for row, identity in enumerate(seen) if identity not in old]
+        if len(staying) == len(old) and not new:
+            return self
+        from_old = np.concatenate([np.arange(7), *(7 + 2 * row + np.arange(2) for row in staying)]).astype(int)
+        kept = len(from_old)
+        size = kept + 2 * len(new)
+        mean, covariance, sigma = np.zeros(size), np.zeros((size, size)), np.full(size, np.nan)
+        mean[:kept], sigma[:kept] = self.mean[from_old], self.sigma[from_old]
+        covariance[:kept, :kept] = self.covariance[np.ix_(from_old, from_old)]
+        ids = np.concatenate([self.ids[staying], marks.landmark[new]]).astype(np.int64)
+        seen_s = np.concatenate([self.seen_s[staying], np.full(len(new), time_s)])
+        return replace(self, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
 
     def expected(self, prior: Prior, marks: Marks) -> Expected:
         """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
@@ -152,10 +157,16 @@ class Memory:
         return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - self._slow(len(self.mean))[rows] ** 2))
 
     def _slow(self, size: int) -> np.ndarray:
-        """Share of each standard deviation that lasts; a focal length does."""
-        share = np.full(size, np.sqrt(self.lasting.landmarks))
-        share[:6], share[6] = np.sqrt(self.lasting.telemetry), 1.0
-        return share
+        return _slow(self.lasting, size)
+
+
+@lru_cache(maxsize=256)
+def _slow(lasting: Lasting, size: int) -> np.ndarray:
+    """Share of each standard deviation that lasts; a focal length does. It is shared, and not to be written to."""
+    share = np.full(size, np.sqrt(lasting.landmarks))
+    share[:6], share[6] = np.sqrt(lasting.telemetry), 1.0
+    share.flags.writeable = False
+    return share
 
 
 def places_of(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
