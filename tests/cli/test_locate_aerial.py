@@ -71,6 +71,18 @@ def test_a_landmark_without_reports_is_where_its_waypoints_say(aerial, tmp_path)
     assert flight.errors(found).max() < 0.001
 
 
+def test_what_is_amiss_and_what_was_repaired_is_said_at_the_end(aerial):
+    flight = Overflight()
+    assert "note: repaired" not in aerial(flight).stdout
+    up = aerial(flight, telemetry=flight.telemetry_csv(heading_deg=-150)).stdout
+    assert "note: located with something amiss, frames 1 to 10: landmarks and telemetry disagree" in up
+    header, *lines = (line.split(",") for line in flight.landmarks_csv().splitlines())
+    for one, other in zip(lines[::4], lines[1::4], strict=True):
+        one[2:4], other[2:4] = other[2:4], one[2:4]
+    swapped = "\n".join(map(",".join, [header, *lines])) + "\n"
+    assert "note: repaired, frames 1 to 10: identities" in aerial(flight, landmarks=swapped).stdout
+
+
 def test_longitudes_and_latitudes_are_those_of_the_metres(aerial, tmp_path):
     from tests.overflight import ORIGIN
     from torchvision_dddas.targets.geodesy import lonlat

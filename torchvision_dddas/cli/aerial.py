@@ -265,6 +265,9 @@ def ground_lines(journal: "Record") -> list[str]:
     lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
     if gaps := counts["by"].get("nothing", 0):
         lines.append(f"note: {gaps} frames could not be located and have no positions; run.json says why")
+    for what, words in (("weak", "located with something amiss"), ("repairs", "repaired")):
+        if spans := counts.get(what):
+            lines.append(f"note: {words}, {_longest(spans)}")
     for name, kept in counts.get("landmarks", {}).items():
         # In a frame that could not be located no landmark was used: that tells nothing of this one.
         tried = kept["used"] + kept["left_out"]
@@ -274,3 +277,11 @@ def ground_lines(journal: "Record") -> list[str]:
                 "right, and does the ground rise or fall there (--dem)?"
             )
     return lines
+
+
+def _longest(spans: Sequence[dict[str, Any]]) -> str:
+    """The longest of the spans of frames of which the record says something, and how many more there are."""
+    most = max(spans, key=lambda row: row["last"] - row["first"])
+    first, last = most["first"], most["last"]
+    where = f"frame {first}" if first == last else f"frames {first} to {last}"
+    return f"{where}: {most['cause']}" + (f"; {len(spans) - 1} more such in run.json" if len(spans) > 1 else "")
