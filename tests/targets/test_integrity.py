@@ -133,3 +133,10 @@ def test_repairs_do_not_depend_on_the_order_of_the_landmarks():
     first, second = judged(seen, swapped), judged(seen, other)
     assert same_pose(first, second)
     assert [first.state[row] for row in order] == list(second.state)
+
+
+def test_without_telemetry_four_of_six_landmarks_whose_names_are_all_wrong_are_not_believed():
+    for seed in SEEDS:
+        seen = look(seed, n=6)
+        wrong = judged(seen, with_pixels_of(seen.marks, np.roll(np.arange(6), 3)), telemetry=False)
+        assert wrong.used.sum() != 4

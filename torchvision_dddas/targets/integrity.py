@@ -5,7 +5,7 @@ telemetry and reports expect, with the errors of both. Above the gate something 
 and the likeliest that passes is taken:
   one change: two identities swapped, or one landmark left out;
   identities by assignment of the pixels to where they are expected, less the shift that all have in common;
-  two landmarks left out, or one with identities by assignment;
+  two landmarks left out, or one with identities by assignment; without telemetry where ENOUGH_ALONE remain;
   the telemetry left out, where five landmarks or more, not on one line, agree among themselves.
 Where nothing passes the errors are taken to be as much larger as they were seen to be.
 """
@@ -94,6 +94,9 @@ def judge(
     for hypotheses in (lambda *_: iter(as_before), *others):
         tried = []
         for order, used in hypotheses(marks, camera, expected):
+            if not expected.known[:6].any() and used.sum() < min(ENOUGH_ALONE, n - 1):
+                # Of six whose names are all wrong, some four fit a pose that is wrong as well.
+                continue
             solution = find_pose(reordered(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
                 tried.append((float(chdtrc(solution.freedom, solution.cost)), solution, order, used))
