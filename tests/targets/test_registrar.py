@@ -199,3 +199,12 @@ def test_nothing_at_all_is_refused():
         for mode in ("pose", "homography", "paper"):
             fix = registrar(mode=mode).step(2, 0.0, flight, Marks())
             assert fix.by == "" and "frame 2 has no landmark" in fix.cause
+
+
+def test_landmarks_that_fit_hopelessly_leave_a_gap_and_no_place():
+    """All six names went round: no change of one or two explains it."""
+    seen = look(8, n=6)
+    turned = replace(seen.marks, image_px=seen.marks.image_px[[4, 2, 1, 0, 5, 3]])
+    fix = registrar().step(7, 0.0, None, turned)
+    assert fix.by == "" and fix.pose is None and fix.state == ("excluded",) * 6
+    assert "the landmarks disagree" in fix.cause and "10 times as large" in fix.cause

@@ -33,6 +33,10 @@ FITTED = 6
 ENOUGH_ALONE = 5
 """Landmarks that may overrule the telemetry: fewer fit anything too easily."""
 
+HOPELESS = 8.0
+"""Landmarks alone that fit no better than so many times their errors are not what they are said to be, and tell
+nothing. Beside telemetry, which may be what is wrong, they still do."""
+
 APART = 3.0
 """They do so only where they lie this many standard deviations off their own best line, on the ground and in the
 picture: a row of them agrees with poses of all kinds."""
@@ -42,7 +46,8 @@ picture: a row of them agrees with poses of all kinds."""
 class Verdict:
     """What came of the test. order: (n,) whose pixel each landmark has got; used: (n,) whether it counts.
 
-    solution: None where no pose explains anything. changes: in words. cause: why the result is not to be trusted.
+    solution: None where no pose explains anything, or all fit hopelessly. changes: in words. cause: why the result is
+    not to be trusted.
     passed: the test, with or without a repair. alone: the telemetry was left out.
     """
 
@@ -108,9 +113,15 @@ def judge(
         if passes(solution, probability):
             words = f"telemetry left out: the {n} landmarks agree with one another, not with it{_odds(first)}"
             return Verdict(solution, itself, everyone, (words,), alone=True)
-    cause = f"landmarks and telemetry disagree{_odds(first)}, and no change explains it"
+    beside = bool(expected.known[:6].any())
+    cause = (
+        f"{'landmarks and telemetry' if beside else 'the landmarks'} disagree{_odds(first)}, and no change explains it"
+    )
     if first is not None:
         worse = first.cost / first.freedom
+        if not beside and worse > HOPELESS**2:
+            cause += f": their errors would have to be {np.sqrt(worse):.0f} times as large"
+            return Verdict(None, itself, ~everyone, cause=cause, passed=False)
         first = replace(first, covariance=first.covariance * worse)
         cause += f": errors taken {np.sqrt(worse):.1f} times as large"
     return Verdict(first, itself, everyone if first is not None else ~everyone, cause=cause, passed=False)

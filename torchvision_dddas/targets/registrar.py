@@ -104,7 +104,8 @@ class Registrar:
         verdict, before = self._judged(before, prior or bare, marks, None if prior is None else bare)
         solution = verdict.solution
         if solution is None:
-            cause = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
+            no_pose = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
+            cause = verdict.cause or no_pose
             return _nothing(frame, marks, cause)
         if prior is not None and verdict.passed and not verdict.alone:
             self._learn(prior, reordered(marks, verdict.order), verdict.used, solution)
@@ -186,13 +187,14 @@ class Registrar:
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         expected = expected_of(prior, marks.sigma_m)
         verdict = judge(marks, self.camera, expected, knobs.gate_probability, names)
-        kept = rows(reordered(marks, verdict.order), verdict.used)
+        # Where nothing explains the disagreement the telemetry may be wrong: the landmarks are taken at their word.
+        kept = rows(reordered(marks, verdict.order), verdict.used) if verdict.passed else marks
         fix = homography_fix(frame, self._unbent(kept), self.solver, knobs.least_spread)
         solution = verdict.solution
         return replace(
             fix,
             landmark=marks.landmark,
-            state=verdict.state if fix.by else ("excluded",) * n,
+            state=(verdict.state if verdict.passed else ("used",) * n) if fix.by else ("excluded",) * n,
             chi2=float("nan") if solution is None else solution.cost,
             freedom=0 if solution is None else solution.freedom,
             changes=verdict.changes,
