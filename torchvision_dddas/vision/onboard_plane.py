@@ -24,7 +24,8 @@ class OnboardSolver:
         ground, image, weight = _wide(ground), _wide(image), _wide(weight)
         if weight.shape[1] < LEAST or not len(weight):
             return _nothing(len(weight))
-        if np.count_nonzero(weight) < weight.size:  # what is not there may hold anything, and zero times NaN is not zero
+        if np.count_nonzero(weight) < weight.size:
+            # What is not there may hold anything, and zero times NaN is not zero.
             ground, image = (np.where(weight[..., None] > 0, points, 0.0) for points in (ground, image))
         matrix, valid = self.fit.run(None, {"ground": ground, "image": image, "weight": weight})
         return matrix, valid
