@@ -11,7 +11,6 @@ latitude_deg = 32.23
 """
 
 import math
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -22,6 +21,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.csv_text import Line, opened
+from torchvision_dddas.sources.toml_text import toml_of
 from torchvision_dddas.types import Camera, Poses
 
 LIMITS: dict[str, tuple[float, float]] = {
@@ -71,14 +71,7 @@ def camera_keys(path: str | Path) -> dict[str, Any]:
 
     Raises InputError with the file and the key: unreadable, no TOML, a key that no camera has, a value out of range.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"camera {path} cannot be read: {error.strerror}") from None
-    except RecursionError:
-        raise InputError(f"camera {path} is no camera's TOML: its brackets go too deep") from None
-    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
-        raise InputError(f"camera {path} is no TOML: {str(error).split(';')[0]}") from None
+    content = toml_of(path, "camera")
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)

@@ -5,7 +5,6 @@ low = [172, 90, 60]       # a hue above the one of `high`: the range goes over 0
 high = [8, 255, 255]
 """
 
-import tomllib
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sources.toml_text import toml_of
 from torchvision_dddas.types import Colours
 
 HIGHEST = (180, 255, 255)
@@ -27,14 +27,7 @@ def read_colours(path: str | Path) -> Colours:
     Raises InputError with the file and the name: unreadable, no TOML, no colours, low or high missing or no three whole
     numbers in range, lowest saturation or value above the highest, two ranges that overlap.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"colours {path} cannot be read: {error.strerror}") from None
-    except RecursionError:
-        raise InputError(f"colours {path} is no colours' TOML: its brackets go too deep") from None
-    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
-        raise InputError(f"colours {path} is no TOML: {str(error).split(';')[0]}") from None
+    content = toml_of(path, "colours")
     if not content:
         raise InputError(f"colours {path} names no colour; wanted [name] with low and high, as `dddas colours` writes")
     ends = np.array([_range(name, given, path) for name, given in content.items()], np.int64).reshape(-1, 2, 3)
