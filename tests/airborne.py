@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.settings import AerialKnobs, Settings
-from torchvision_dddas.targets.projection import angles_of, axes_of, project
+from torchvision_dddas.targets.projection import axes_of, project
 from torchvision_dddas.targets.rotation import turned
 from torchvision_dddas.types import Camera, CameraPose, Flight, Marks
 
@@ -52,7 +52,7 @@ def look(
     knobs = AerialKnobs()
     off = errors * rng.normal(0, 1, 7)
     turn = off[:3] * np.radians([knobs.tilt_sigma_deg, knobs.tilt_sigma_deg, knobs.heading_sigma_deg])
-    heading, pitch, roll = angles_of(turned(-turn) @ axes)
+    heading, pitch, roll = CameraPose(np.zeros(3), turned(-turn) @ axes).angles_rad
     told = place - off[3:6] * [knobs.position_sigma_m, knobs.position_sigma_m, knobs.altitude_sigma * altitude_m]
     flight = Flight(told[2], place=(told[0], told[1]), heading_rad=heading, pitch_rad=pitch, roll_rad=roll)
     pose = CameraPose(place, axes, float(np.exp(knobs.focal_sigma * off[6])))

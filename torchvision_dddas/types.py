@@ -350,6 +350,18 @@ class CameraPose:
     axes: np.ndarray
     focal: float = 1.0
 
+    @property
+    def angles_rad(self) -> tuple[float, float, float]:
+        """Heading in [0, 2 pi), pitch, roll, as in Camera; straight up or down all that turns is the heading."""
+        right, down, forward = np.asarray(self.axes, float).T
+        level = float(np.hypot(forward[0], forward[1]))
+        pitch = float(np.arctan2(-forward[2], level))
+        if level < 1e-9:
+            upper = -down if forward[2] < 0 else down
+            return float(np.mod(np.arctan2(upper[0], upper[1]), 2 * np.pi)), pitch, 0.0
+        heading = float(np.mod(np.arctan2(forward[0], forward[1]), 2 * np.pi))
+        return heading, pitch, float(np.arctan2(-right[2], -down[2]))
+
 
 @dataclass(frozen=True)
 class Fix:

@@ -11,6 +11,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.telemetry import at, read_telemetry
 from torchvision_dddas.sources.telemetry.attitude import angles, axes, axes_of_quaternion
 from torchvision_dddas.sources.telemetry.klv import imap, local_sets, mapped
+from torchvision_dddas.targets.projection import axes_of
 
 START_US = 1_340_980_354_100_000
 PLACE = {13: spread(34.7211, 0, 90, 4, True), 14: spread(-86.6891, 0, 180, 4, True), 15: spread(3048, -900, 19000, 2)}
@@ -168,3 +169,10 @@ def test_a_stream_without_metadata_or_with_none_whole_is_refused(tmp_path: Path)
     wrong = packet(0)[:-1] + b"\0"
     with pytest.raises(InputError, match="none of 9 MISB ST 0601 packets is whole"):
         read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, wrong)] * 9)))
+
+
+def test_a_camera_is_turned_as_the_projection_has_it_in_other_axes_of_the_same_world():
+    heading, pitch, roll = np.random.default_rng(0).uniform(-1.5, 1.5, (3, 20))
+    enu_from_ned = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
+    for turned, *given in zip(axes(heading, pitch, roll), heading, pitch, roll, strict=True):
+        assert np.allclose(enu_from_ned @ turned[:, [1, 2, 0]], axes_of(*given))

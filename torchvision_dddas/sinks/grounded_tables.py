@@ -76,14 +76,7 @@ def used(fix: Fix) -> int:
 
 def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
     """Heading in [0, 360), pitch below the horizon, roll clockwise; straight down the upper edge gives the heading."""
-    right, down, forward = np.asarray(pose.axes, float).T
-    level = math.hypot(forward[0], forward[1])
-    pitch = math.atan2(-forward[2], level)
-    if level < 1e-9:
-        upper = -down if pitch > 0 else down
-        heading, roll = math.atan2(upper[0], upper[1]), 0.0
-    else:
-        heading, roll = math.atan2(forward[0], forward[1]), math.atan2(-right[2], -down[2])
+    heading, pitch, roll = pose.angles_rad
     # Rounded first, so that a hair below north is not written as 360.
     return round(math.degrees(heading), 4) % 360, math.degrees(pitch), math.degrees(roll)
 

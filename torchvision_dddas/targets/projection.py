@@ -23,18 +23,6 @@ def axes_of(heading_rad: float, pitch_rad: float, roll_rad: float) -> Float[np.n
     return np.stack([cr * right + sr * down, cr * down - sr * right, forward], axis=1)
 
 
-def angles_of(axes: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Heading in [0, 2 pi), pitch and roll of a camera's axes; straight up or down all that turns is the heading."""
-    right, down, forward = axes[:, 0], axes[:, 1], axes[:, 2]
-    level = float(np.hypot(forward[0], forward[1]))
-    pitch = float(np.arctan2(-forward[2], level))
-    if level < 1e-9:
-        upper = -down if forward[2] < 0 else down
-        return float(np.mod(np.arctan2(upper[0], upper[1]), 2 * np.pi)), pitch, 0.0
-    heading = float(np.mod(np.arctan2(forward[0], forward[1]), 2 * np.pi))
-    return heading, pitch, float(np.arctan2(-right[2], -down[2]))
-
-
 def project(points_m: Float[np.ndarray, "N 3"], pose: CameraPose, camera: Camera) -> Float[np.ndarray, "N 2"]:
     """Pixels (u, v) of points in east, north, up; NaN for a point behind the camera, or that the lens cannot show."""
     return project_with_slopes(points_m, pose, camera)[0]
