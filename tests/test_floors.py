@@ -58,6 +58,8 @@ FLOORS: dict[str, set[str]] = {
     "sources.elevation": {"numpy", "rasterio", "types", "errors"},
     "sinks": {"numpy", "cv2", "av", "types", "errors", "__init__"},
     "simulation": {"numpy", "cv2", "types", "targets.geodesy", "errors"},
+    # A scenario is knobs: the same machinery reads, checks and describes them.
+    "simulation.scenario": {"pydantic", "settings", "errors"},
     "metrics": {"numpy", "scipy", "cv2", "types", "errors"},
     "demo": {"numpy", "cv2", "simulation", "sinks", "errors"},
     "evaluate": {"numpy", "cv2", "metrics", "sources", "errors"},

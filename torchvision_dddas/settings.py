@@ -574,6 +574,37 @@ class AerialKnobs(Group):
     )
 
 
+class CrowdKnobs(Group):
+    """Moving targets that go together as one crowd."""
+
+    join_m: float = knob(
+        0.0, "m", 0, 100, meaning="targets located from the air with gaps up to this are one crowd; 0: each on its own"
+    )
+    speed_m_s: float = knob(
+        1.5, "m/s", 0.01, 100, meaning="targets whose velocities over ground differ by more do not go together"
+    )
+
+
+class SteeringKnobs(Group):
+    """How what is found steers where the instruments go and look, in a run whose source can be steered."""
+
+    on: bool = knob(True, "-", meaning="steer the instruments; false flies as planned, whatever is found")
+    sampling: bool = knob(
+        False, "-", meaning="look at every k-th frame only, k by the rule of the interval; the clip must be in order"
+    )
+    sampling_share: float = knob(
+        0.5, "-", 0.01, 10, meaning="k as a share of the interval that the rule gives before its bounds"
+    )
+    maximum_every: int = knob(5, "frames", 1, 60, meaning="largest k, however slow the scene")
+    follow: bool = knob(True, "-", meaning="the aerial vehicle keeps the crowds in view; false: it flies as planned")
+    look: bool = knob(True, "-", meaning="ground vehicles go where targets need a closer look; false: as planned")
+    fast_m_s: float = knob(3.0, "m/s", 0, 30, meaning="speed of a ground vehicle far from its goal")
+    slow_m_s: float = knob(1.0, "m/s", 0, 30, meaning="and near it, where its own motion must not spoil its place")
+    near_m: float = knob(6.0, "m", 0, 1000, meaning="what counts as near")
+    station_m: float = knob(12.0, "m", 2, 1000, meaning="how far from a crowd ground vehicles stand about it")
+    picture_s: float = knob(1.0, "s", 0.01, 3600, meaning="time between two pictures of one ground vehicle")
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -593,6 +624,8 @@ class Settings(Group):
     confirm: ConfirmKnobs = ConfirmKnobs()
     landmarks: LandmarkKnobs = LandmarkKnobs()
     aerial: AerialKnobs = AerialKnobs()
+    crowds: CrowdKnobs = CrowdKnobs()
+    steering: SteeringKnobs = SteeringKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -11,11 +11,13 @@ class Frame:
 
     number: 1-based position in the clip. time_s: seconds since the clip's first frame.
     image: uint8, (H, W) grey or (H, W, 3) in OpenCV's BGR order.
+    skipped: how many frames just before it were left out on purpose: they are not missing.
     """
 
     number: int
     time_s: float
     image: np.ndarray
+    skipped: int = 0
 
 
 @dataclass(frozen=True)
@@ -584,3 +586,91 @@ class Surveyed:
     grounded: Grounded | None = None
     sighted_by: tuple[str, ...] = ()
     mark_lonlat_deg: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a ground vehicle is asked to do: to go to a place at a speed and to look at another.
+
+    vehicle: its name. goal, look_at: (2,), in the kind of place in which the vehicles report theirs, longitude and
+    latitude or local metres; look_at None: ahead. picture: whether a picture of what it sees is wanted.
+    """
+
+    vehicle: str
+    goal: np.ndarray
+    speed_m_s: float
+    look_at: np.ndarray | None = None
+    picture: bool = False
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the instruments are asked to do from now on; a simulator flies, a recording ignores it.
+
+    every: of so many frames one is wanted. fly_to: (2,), where the aerial vehicle should be, and look_at: (2,), the
+    ground that should be in the middle of its picture; as in Order. None: go on as now.
+    """
+
+    every: int = 1
+    fly_to: np.ndarray | None = None
+    look_at: np.ndarray | None = None
+    altitude_m: float | None = None
+    orders: tuple[Order, ...] = ()
+
+
+@dataclass(frozen=True)
+class GroundPicture:
+    """What a ground vehicle saw at a frame of the aerial camera.
+
+    camera: with the place, heading and pitch that the vehicle reports for this moment, and how well it knows them.
+    """
+
+    vehicle: str
+    frame: int
+    image: np.ndarray
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """All that can move in a simulated world, at one moment, one row a body.
+
+    number: (N,) int64 from 1, lasting. kind: (N,) of str: person, car or ugv. target: (N,) int64 from 1, what it is
+    part of or is: people of one crowd share it; a vehicle has its own. place_m: (N, 3) of the feet, local metres east,
+    north, up. velocity_m_s: (N, 2). facing_rad: (N,) clockwise from north. height_m: (N,) of a person. phase: (N,) of
+    the gait, in strides. colour: (N, 3) BGR, 0 to 255, of the clothes or the paint; plate: (N, 3) BGR of the marker on
+    top of a landmark, NaN where there is none. hidden: (N,) bool, the marker is covered.
+    """
+
+    number: np.ndarray
+    kind: np.ndarray
+    target: np.ndarray
+    place_m: np.ndarray
+    velocity_m_s: np.ndarray
+    facing_rad: np.ndarray
+    height_m: np.ndarray
+    phase: np.ndarray
+    colour: np.ndarray
+    plate: np.ndarray
+    hidden: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulated frame truly shows.
+
+    mask: (H, W) uint16, 0 or the number of the target whose pixel it is. people: the same with the number of the body.
+    bodies: all of the world, in the picture or not. pose: of the camera in the middle of the exposure.
+    events: what happened in the world at this frame, in words: faults, crowds that joined or split.
+    """
+
+    frame: int
+    time_s: float
+    mask: np.ndarray
+    people: np.ndarray
+    bodies: Bodies
+    pose: CameraPose
+    events: tuple[str, ...] = ()

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchvision_dddas.types import Camera, CameraPose
+
 
 @dataclass(frozen=True)
 class View:
@@ -31,13 +33,30 @@ class View:
         return float(np.linalg.norm(self.image_from_world[0, :3]) / depth)
 
 
+def axes(heading_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
+    """(3, 3), the columns a camera's right, down and forward in east, north, up; the angles as in types.Camera.
+
+    Straight down the heading is that of the picture's upper edge.
+    """
+    level, sunk = np.cos(pitch_rad), np.sin(pitch_rad)
+    ahead = np.array([np.sin(heading_rad) * level, np.cos(heading_rad) * level, -sunk])
+    right = np.array([np.cos(heading_rad), -np.sin(heading_rad), 0.0])
+    down = np.cross(ahead, right)
+    turned = right * np.cos(roll_rad) + down * np.sin(roll_rad), down * np.cos(roll_rad) - right * np.sin(roll_rad)
+    return np.stack([*turned, ahead], axis=1)
+
+
+def view_of(pose: CameraPose, camera: Camera) -> View:
+    """The view of a camera without distortion from a pose in local metres."""
+    focal = np.array(camera.focal_px) * pose.focal
+    inner = np.array([[focal[0], 0, camera.centre_px[0]], [0, focal[1], camera.centre_px[1]], [0, 0, 1.0]])
+    rotation = pose.axes.T
+    return View(inner @ np.c_[rotation, -rotation @ pose.place_m], pose.place_m)
+
+
 def look(position_m: np.ndarray, yaw: float, pitch: float, roll: float, focal_px: float, size: tuple[int, int]) -> View:
     """The view from a place. Angles in radians: yaw clockwise from ahead, pitch below the horizon, roll clockwise."""
-    ahead = np.array([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), -np.sin(pitch)])
-    right = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
-    down = np.cross(ahead, right)
-    right, down = right * np.cos(roll) + down * np.sin(roll), down * np.cos(roll) - right * np.sin(roll)
-    rotation = np.stack([right, down, ahead])
+    rotation = axes(yaw, pitch, roll).T
     inner = np.array([[focal_px, 0, (size[0] - 1) / 2], [0, focal_px, (size[1] - 1) / 2], [0, 0, 1.0]])
     return View(inner @ np.c_[rotation, -rotation @ position_m], position_m)
 
