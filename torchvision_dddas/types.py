@@ -580,12 +580,16 @@ class Surveyed:
 
     followed: its targets, without the landmarks. sighted_by: (n,) what showed each of the landmarks of grounded.marks:
     motion, colour or table. mark_lonlat_deg: (n, 2) where they were; None where there is no geographic origin.
+    confirmed: what ground vehicles say of the targets, row = that of grounded.positions; None where none looks.
+    command: what the instruments were asked to do after this frame; None where they stay as they are.
     """
 
     followed: Followed
     grounded: Grounded | None = None
     sighted_by: tuple[str, ...] = ()
     mark_lonlat_deg: np.ndarray | None = None
+    confirmed: Confirmed | None = None
+    command: "Command | None" = None
 
 
 @dataclass(frozen=True)

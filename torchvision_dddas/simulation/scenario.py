@@ -75,7 +75,7 @@ class Happening(Group):
 class TeamKnobs(Group):
     """The ground vehicles: landmarks for the aerial camera, and eyes on the ground."""
 
-    ugvs: int = knob(4, "vehicles", 0, 64, meaning="how many there are")
+    ugvs: int = knob(4, "vehicles", 0, 12, meaning="how many there are; each wears a colour of its own")
     ring_m: float = knob(14.0, "m", 0, 1000, meaning="radius of the ring about middle_m on which they stand at first")
     middle_m: Place = knob((0.0, 0.0), "m", meaning="middle of that ring")
     patrol_m_s: float = knob(1.0, "m/s", 0, 10, meaning="speed along their planned ways, while nobody steers them")
@@ -149,7 +149,7 @@ class Fault(Group):
     )
     time_s: float = knob(10.0, "s", 0, 86400, meaning="when it begins")
     seconds: float = knob(5.0, "s", 0, 86400, meaning="how long it lasts")
-    vehicle: int = knob(1, "-", 1, 64, meaning="which ground vehicle, counted from 1")
+    vehicle: int = knob(1, "-", 1, 12, meaning="which ground vehicle, counted from 1")
     size: float = knob(10.0, "-", 0, 1000, meaning="how far or fast, in metres or metres a second")
 
 
