@@ -700,8 +700,8 @@ def load(config: str | Path | None = None, overrides: Sequence[str] = ()) -> Set
     settings = Settings()
     if config is not None:
         path = _config_file(config)
-        settings = with_knobs(settings, _flat(_read_toml(path), str(path)), origin=str(path))
-    return with_knobs(settings, dict(_parse_override(text) for text in overrides))
+        settings = with_knobs(settings, _flat(read_toml(path), str(path)), origin=str(path))
+    return with_knobs(settings, dict(parse_override(text) for text in overrides))
 
 
 def with_knobs(settings: Settings, values: Mapping[str, object], origin: str = "") -> Settings:
@@ -714,7 +714,7 @@ def with_knobs(settings: Settings, values: Mapping[str, object], origin: str = "
     content = settings.model_dump()
     for name, value in values.items():
         if name not in fields:
-            raise InputError(f"{before}unknown knob '{name}'; {_nearest(name, list(fields))}")
+            raise InputError(f"{before}unknown knob '{name}'; {nearest(name, list(fields))}")
         group, key = name.split(".")
         content[group][key] = tuple(value) if isinstance(value, list) else value
     try:
@@ -725,11 +725,11 @@ def with_knobs(settings: Settings, values: Mapping[str, object], origin: str = "
 
 def config_names() -> list[str]:
     """The shipped configurations that `--config` takes by name."""
-    return sorted(path.stem for path in _config_folder().glob("*.toml"))
+    return sorted(path.stem for path in config_folder().glob("*.toml"))
 
 
-def _config_folder() -> Path:
-    """Inside the package when installed from a wheel; at the top of the tree in a checkout."""
+def config_folder() -> Path:
+    """Of the shipped ones: inside the package when installed from a wheel; at the top of the tree in a checkout."""
     package = Path(__file__).resolve().parent
     return next((p for p in (package / "configs", package.parent / "configs") if p.is_dir()), package / "configs")
 
@@ -740,7 +740,7 @@ def _config_file(config: str | Path) -> Path:
         return path
     if path.suffix == ".toml" or len(path.parts) > 1:
         raise InputError(f"no such configuration file: {path}")
-    shipped = _config_folder() / f"{config}.toml"
+    shipped = config_folder() / f"{config}.toml"
     if not shipped.is_file():
         raise InputError(
             f"no configuration is named '{config}'; give one of {', '.join(config_names())}, or a TOML file"
@@ -748,7 +748,8 @@ def _config_file(config: str | Path) -> Path:
     return shipped
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file holds. Raises InputError with file and line."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
@@ -764,13 +765,14 @@ def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:
     flat: dict[str, object] = {}
     for group, knobs in content.items():
         if not isinstance(knobs, dict):
-            hint = _nearest(group, [name for name, _ in _knob_fields()])
+            hint = nearest(group, [name for name, _ in _knob_fields()])
             raise InputError(f"{origin}: '{group}' stands outside a [group]; {hint}")
         flat |= {f"{group}.{name}": value for name, value in knobs.items()}
     return flat
 
 
-def _parse_override(text: str) -> tuple[str, object]:
+def parse_override(text: str) -> tuple[str, object]:
+    """`group.knob=value` as name and value. Raises InputError where it is none."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not name or not value:
         raise InputError(f"'{text}' is no override; wanted group.knob=value, such as registration.keypoints=500")
@@ -780,14 +782,14 @@ def _parse_override(text: str) -> tuple[str, object]:
         return name, value  # a bare word: a choice such as affine
 
 
-def _nearest(name: str, known: list[str]) -> str:
+def nearest(name: str, known: list[str], where: str = "`dddas settings` lists them all") -> str:
     """Names that look like it, by their whole or by the knob alone; otherwise where to find the list."""
     key = name.rpartition(".")[2]
     same = [full for full in known if full.rpartition(".")[2] == key]
     alike = get_close_matches(key, [full.rpartition(".")[2] for full in known], n=2)
     near = same + get_close_matches(name, known, n=3) + [k for k in known if k.rpartition(".")[2] in alike]
     near = list(dict.fromkeys(near))[:3]
-    return f"did you mean {' or '.join(near)}?" if near else "`dddas settings` lists them all"
+    return f"did you mean {' or '.join(near)}?" if near else where
 
 
 def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
@@ -796,8 +798,12 @@ def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
     name = ".".join(str(part) for part in first["loc"][:2])
     if name not in fields:  # a rule across two knobs of one group
         return f"{name}: {str(first['msg']).removeprefix('Value error, ')}"
-    field = fields[name]
+    return will_not_do(name, first["input"], fields[name])
+
+
+def will_not_do(name: str, value: object, field: FieldInfo) -> str:
+    """What came, and what was wanted: range and unit of a knob."""
     low_to_high, comma, odd = range_of(field).partition(",")
-    unit = "" if _unit(field) == "-" else f" {_unit(field)}"
+    unit = "" if _unit(field) in ("-", "") else f" {_unit(field)}"
     whole = "a whole number, " if field.annotation is int else ""
-    return f"{name} = {first['input']!r} will not do; wanted {whole}{low_to_high}{unit}{comma}{odd}"
+    return f"{name} = {value!r} will not do; wanted {whole}{low_to_high}{unit}{comma}{odd}"
