@@ -148,6 +148,7 @@ class Follower:
         self, settings: Settings, interval: int, size: tuple[float, float] | None, certain: bool = False
     ) -> None:
         """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all."""
+        self.interval = interval
         self.tracker = _tracker(settings, interval, size)
         self.likeness = _likeness(settings)
         self.certain = certain
@@ -168,8 +169,9 @@ class Follower:
             return found
 
         start = time.perf_counter()
+        apart = max(self.interval, frame.skipped + 1) if frame is not None and frame.skipped else None
         settled = self.tracker.feed(
-            followed.number, detections, followed.now_from_before, appearance if frame is not None else None
+            followed.number, detections, followed.now_from_before, appearance if frame is not None else None, apart
         )
         spent = self.spent - before
         took = {"appearance": spent, "track": time.perf_counter() - start - spent}

@@ -50,10 +50,14 @@ def _memory(settings: Settings) -> int:
 
 @dataclass
 class _Slot:
-    """One frame on its way through the loop. step: registration to the next frame; None until known or at the end."""
+    """One frame on its way through the loop. step: registration to the next frame; None until known or at the end.
+
+    look: its number, were the frames that are left out on purpose not there.
+    """
 
     frame: Frame
     view: View
+    look: int
     step: Registration | None = None
     interval: int = 0
     regime: control.Regime | None = None
@@ -71,6 +75,7 @@ def run(
 
     Frames that could not be read, or whose registration cannot be trusted, give empty scenes flagged unreliable.
     batch: windows given to the back end at once; the result does not depend on it. None takes 8 for torch, else 1.
+    A source that can be steered has a method `telemetry` that tells what was reported so far, in place of a whole log.
     Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
     """
     count = getattr(source, "count", None)
@@ -78,8 +83,11 @@ def run(
         check_overlap(telemetry, (count - 1) / source.rate_hz)
     loop = Loop(vision, settings, source.rate_hz, telemetry, batch or (8 if vision.name == "torch" else 1))
     last_s = 0.0
+    live = getattr(source, "telemetry", None)
     for frame in source:
         last_s = frame.time_s
+        if live is not None:
+            loop.telemetry = live()
         yield from loop.feed(frame)
     if telemetry is not None:
         check_overlap(telemetry, last_s)
@@ -104,6 +112,7 @@ class Loop:
         self.emitted = 0
         self.total = 0
         self.last_number = 0
+        self.skipped = 0  # frames left out on purpose so far
         self.ended = False
         self.interval = settings.interval.frames
         self.flows: deque[float] = deque(maxlen=settings.interval.memory_frames)
@@ -116,7 +125,8 @@ class Loop:
     def feed(self, frame: Frame) -> Iterator[Scene]:
         """Take one frame; yields the scenes that are settled by it."""
         start = time.perf_counter()
-        slot = _Slot(frame, self.vision.prepare(frame.image))
+        self.skipped += frame.skipped
+        slot = _Slot(frame, self.vision.prepare(frame.image), frame.number - self.skipped)
         slot.seconds["prepare"] = time.perf_counter() - start
         self.shape = frame.image.shape
         self.slots.append(slot)
@@ -206,8 +216,10 @@ class Loop:
         number = slot.frame.number
         self.regime, slot.adjustments = control.steered(number, self.regime, altitude, self.rate_hz, self.settings)
         slot.regime = self.regime
+        apart = slot.frame.skipped + 1  # frames from look to look
         if slot.step is not None and slot.step.reliable:
-            self.flows.append(slot.step.flow_px)
+            after = self._at(index + 1).frame.skipped + 1
+            self.flows.append(slot.step.flow_px / after)
         if knobs.rule:
             wanted, why = None, ""
             if flight is not None and altitude is not None and np.isfinite(flight.speed_m_s):
@@ -217,7 +229,7 @@ class Loop:
                 wanted = control.interval_from_flow(self.flows, slot.view.size[0], knobs)
                 why = f"background flow {np.median(self.flows):.2f} px a frame"
             if wanted is not None:
-                self.interval, moved = control.adjusted(number, self.interval, wanted, why, knobs)
+                self.interval, moved = control.adjusted(number, self.interval, wanted / apart, why, knobs)
                 slot.adjustments += moved
         slot.interval = self.interval
 
@@ -256,7 +268,7 @@ class Loop:
         if not self.settings.history.on:
             return None
         for i in range(max(self.remembered, self.first), index + 1):
-            self.history.move(self._at(i).frame.number, self._step(i - 1) if i > self.first else None)
+            self.history.move(self._at(i).look, self._step(i - 1) if i > self.first else None)
         self.remembered = index + 1
         return self.history
 
@@ -344,7 +356,8 @@ class Loop:
             slot = self._at(self.emitted)
             if not self._all_observed() and self.emitted + windows.delay(slot.interval, self.settings) >= self.observed:
                 break
-            yield from self._gap(slot.frame.number)
+            yield from self._gap(slot.frame.number - slot.frame.skipped)
+            self.last_number = slot.frame.number
             yield self._scene(slot, self.emitted)
             # Colour is most of a run's memory: who took the scene has it, and windows look at the view's only.
             slot.frame = replace(slot.frame, image=slot.view.grey)
@@ -373,6 +386,8 @@ class Loop:
         assert observation is not None
         found = list(observation.targets or [])
         found += self._small_targets(index, found)
+        if slot.frame.skipped:  # what moved from look to look, for each frame of it
+            found = [replace(f, velocity_px=f.velocity_px / (slot.frame.skipped + 1)) for f in found]
         found = admitted(found, slot.regime.gates if slot.regime else None)
         detections, mask = table(found, slot.view.size)
         return Scene(

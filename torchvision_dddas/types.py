@@ -111,7 +111,8 @@ class Detections:
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion over the ground, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels a frame relative to the background. Both NaN when unknown.
-    kind: what it was found to be. Row i has value i + 1 in the frame's mask.
+    kind: what it was found to be. Row i has value i + 1 in the frame's mask. middle_px: (N, 2) u, v of the mean of the
+    foreground pixels; NaN where it is not known.
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -120,6 +121,11 @@ class Detections:
     heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
     kind: str = "moving"
+    middle_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        if len(self.middle_px) == 0 < len(self.box_px):
+            object.__setattr__(self, "middle_px", np.full((len(self.box_px), 2), np.nan))
 
     def __len__(self) -> int:
         return len(self.box_px)

@@ -1,5 +1,6 @@
 """From the picture to the ground, seen from the air: landmarks and telemetry on one plane, then frame by frame."""
 
+from torchvision_dddas.geolocating.gathering import gathered
 from torchvision_dddas.geolocating.locator import Locator, Targets
 from torchvision_dddas.geolocating.site import Site, camera_of, check_span, site_of, unknown_heights
 from torchvision_dddas.geolocating.table import check_table, locate
@@ -15,6 +16,7 @@ __all__ = [
     "check_colours",
     "check_span",
     "check_table",
+    "gathered",
     "locate",
     "site_of",
     "unknown_heights",

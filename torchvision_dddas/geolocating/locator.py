@@ -28,7 +28,8 @@ class Targets:
 
     target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is an identity.
     score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; None: of none.
-    bodies: whether a box's centre is the middle of a body.
+    bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v of what stands for it in place of the
+    box's centre, NaN where it does; None: for all.
     """
 
     box_px: np.ndarray
@@ -37,6 +38,7 @@ class Targets:
     score: np.ndarray
     feet_px: np.ndarray | None = None
     bodies: bool = False
+    middle_px: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,15 @@ class Locator:
         self._movers = Movers()
         self._use = LandmarkUse()
         self._ground = surface(site.elevation) if site.elevation is not None else None
+
+    def learn(self, site: Site) -> None:
+        """What landmarks and vehicle have reported by now, in the metres of the site so far."""
+        self.site = site
+        self.courses = Courses(site.landmarks, self.settings.landmarks, self.rate_hz)
+
+    def places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
+        """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
+        return ground_points(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
 
     def time_s(self, frame: int) -> float:
         """Of a frame, since the clip's first."""
@@ -181,6 +192,8 @@ def points_of(targets: Targets, knobs: AerialKnobs, posed: bool) -> tuple[np.nda
     A body's foot is where its middle, half its height up, has its place: that takes a pose of the camera (posed).
     """
     centre = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
+    if targets.middle_px is not None:
+        centre = np.where(np.isfinite(targets.middle_px).all(axis=1)[:, None], targets.middle_px, centre)
     lift = np.zeros(len(centre))
     if knobs.point == "auto" and targets.feet_px is not None:
         named = np.isfinite(targets.feet_px).all(axis=1)

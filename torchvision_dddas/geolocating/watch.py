@@ -165,5 +165,6 @@ def _without(scene: Scene, rows: np.ndarray) -> Scene:
         found.heading_rad[kept],
         found.speed_px[kept],
         found.kind,
+        found.middle_px[kept],
     )
     return replace(scene, detections=detections, mask=value[scene.mask])

@@ -138,10 +138,12 @@ class PaperTracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
+        interval_frames: int | None = None,
     ) -> list[Tracks]:
         """Take the detections of a frame and give them identities at once.
 
-        now_from_before: not used; the source compares positions in the picture, whatever the camera did.
+        now_from_before, interval_frames: not used; the source compares positions in the picture, whatever the camera
+        did, and however long it took.
         appearance: gives (N, 768) histograms of the boxes. It is called only where the dispersion of the locations asks
         for it, which may be while one of the next frames is fed, and at most once.
         """

@@ -27,6 +27,7 @@ class _Look:
     """A frame and those of its detections that count. row: of the frame's detections. step: now from the look before.
 
     appearance: gives the (M, D) histograms. signature: these, (M, 0) until asked for, and visible: share of each box.
+    interval: frames from the look before, were none missing.
     """
 
     frame: int
@@ -37,6 +38,7 @@ class _Look:
     appearance: Callable[[], np.ndarray] | None
     signature: np.ndarray
     visible: np.ndarray
+    interval: int = 1
 
     def examine(self) -> None:
         """Look at the picture, once."""
@@ -73,18 +75,20 @@ class Tracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
+        interval_frames: int | None = None,
     ) -> list[Tracks]:
         """Take the detections of a frame, whose number is above the last one's.
 
         now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
         appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, and maybe with
-        the next frame.
+        the next frame. interval_frames: from the frame before, where that is not the usual distance.
         """
         row = np.flatnonzero(detections.score >= self.knobs.min_score)
         box = detections.box_px[row]
         asked = None if self.knobs.appearance == "never" else appearance
         unknown = np.zeros((len(row), 0), np.float32), np.ones(len(row))
-        look = _Look(frame, box, detections.score[row], row, now_from_before, asked, *unknown)
+        interval = self.interval if interval_frames is None else interval_frames
+        look = _Look(frame, box, detections.score[row], row, now_from_before, asked, *unknown, interval)
         if self.knobs.appearance == "always":
             look.examine()
         if not self.knobs.look_ahead:
@@ -130,7 +134,7 @@ class Tracker:
         self._commit(look, tracks[chosen], now[chosen], followed.only(chosen), born)
         self.before = look
 
-    def _sight(self, frame: int) -> Sight:
+    def _sight(self, look: _Look) -> Sight:
         doubt = self.doubtful / max(self.seen, 1)
         # Who misses targets loses tracks and begins new ones for them: such births are no sign of new targets.
         births = (
@@ -138,18 +142,18 @@ class Tracker:
             if self.seen > _ENOUGH
             else 0.0
         )
-        return Sight(frame, self.interval, self.pace.speed, births, doubt, self.size)
+        return Sight(look.frame, look.interval, self.pace.speed, births, doubt, self.size)
 
     def _scores(self, roster: Roster, look: _Look, box_px: np.ndarray) -> np.ndarray:
         """(N, M) scores of links to a look's detections, whose boxes are given in the roster's coordinates."""
-        scores = link_scores(roster.state, roster.at_border, box_px, self._sight(look.frame), self.knobs)
+        scores = link_scores(roster.state, roster.at_border, box_px, self._sight(look), self.knobs)
         if roster.signature.shape[1] and look.signature.shape[1]:
             scores += likeness_scores(roster.signature, look.signature, look.visible, self.knobs)
         return scores
 
     def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray, at_border: np.ndarray) -> Roster:
         """The tracks (K,) after a detection (K,) each. at_border: (M,) which of the look's detections are."""
-        old, box, sight = self.roster, look.box_px[now], self._sight(look.frame)
+        old, box, sight = self.roster, look.box_px[now], self._sight(look)
         later = kalman.predicted(old.state[tracks], look.frame, sight.agility(self.knobs))
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], look.signature.shape[1])
@@ -188,19 +192,19 @@ class Tracker:
         self.roster = self.roster.only(unseen).plus(followed).plus(begun)
         number, at = np.concatenate([followed.number, begun.number]), np.concatenate([now, new])
         self.ledger.write(look.frame, number, look.box_px[at], look.score[at], look.row[at], look.step)
-        self._forget(look.frame)
+        self._forget(look)
 
-    def _forget(self, frame: int) -> None:
+    def _forget(self, look: _Look) -> None:
         """Drop the tracks that were lost too long ago, or left, or were seen too seldom to be anything."""
         state = self.roster.state
-        age = frame - state[:, SEEN]
+        age = look.frame - state[:, SEEN]
         keep = age <= self.knobs.memory_frames
         if self.size is not None:
             # Later a target may as well have stopped or turned before it reached the border.
             place = state[:, X : Y + 1] + np.minimum(age, _LEAVING)[:, None] * state[:, VX : VY + 1]
             outside = ((place < 0) | (place > np.array(self.size))).any(axis=1)
-            keep &= ~outside | (age <= max(self.knobs.memory_outside_frames, self.interval))
-        late = age > (FILLED + 1) * self.interval
+            keep &= ~outside | (age <= max(self.knobs.memory_outside_frames, look.interval))
+        late = age > (FILLED + 1) * look.interval
         if late.any():
             keep &= ~late | self.ledger.confirmed(self.roster.number)
         if not keep.all():
