@@ -361,9 +361,10 @@ def _explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) 
         return f"{name} = {_shown(value)} will not do; wanted {wanted}"
     if name == "seed":
         return f"seed = {value!r} will not do; wanted a whole number, 0 to {2**31 - 1}"
-    if field.annotation == Place:
+    annotation: Any = field.annotation
+    if annotation == Place:
         return f"{name} = {_shown(value)} will not do; wanted two numbers, [east, north]"
-    if field.annotation == tuple[Place, ...]:
+    if annotation == tuple[Place, ...]:
         return f"{name} = {_shown(value)} will not do; wanted a list of places, [[east, north], ...]"
     return will_not_do(name, _shown(value) if isinstance(value, (tuple, dict)) else value, field)
 

@@ -1,4 +1,4 @@
-"""Where frames come from: video files, image folders and globs, cameras and streams; and what the vehicle reports."""
+"""Where frames come from: files, folders, cameras, streams, simulated worlds; and what the vehicle reports."""
 
 from pathlib import Path
 
@@ -13,7 +13,8 @@ __all__ = ["Problem", "Source", "open_source"]
 def open_source(
     spec: str | Path, *, rate_hz: float | None = None, full_scale: int | None = None, single: bool = False
 ) -> Source:
-    """A clip from what the user typed: a video file, a folder or glob of images, `camera:0`, `rtsp://...`.
+    """A clip from what the user typed: a video file, a folder or glob of images, `camera:0`, `rtsp://...`,
+    `sim:joining` (a scenario's name or file).
 
     rate_hz: frames a second; None takes the video's own, and 10 for images. full_scale: see ImageSource.
     single: a file that is one image is a clip of one frame; else it is refused, as nothing can be seen to move in it.
@@ -24,6 +25,12 @@ def open_source(
         raise InputError(f"a frame rate of {rate_hz} per second will not do; wanted more than 0, at most 1000")
     if full_scale is not None and not 1 <= full_scale <= 65535:
         raise InputError(f"a full scale of {full_scale} will not do; wanted 1 to 65535")
+    if text.startswith("sim:"):
+        from torchvision_dddas.sources.simulator import open_scenario
+
+        if rate_hz is not None:
+            raise InputError(f"{text} says how many frames a second it has (clip.rate_hz): leave --rate out")
+        return open_scenario(text.removeprefix("sim:"))
     if text.startswith("camera:"):
         index = text.removeprefix("camera:")
         if not index.isdigit():
