@@ -1,0 +1,90 @@
+"""The shape of the ground: smooth hills, or those of an elevation raster, on one grid that spans the world."""
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Elevation
+
+_COARSEST_M = 2.0  # step of the grid of heights
+_MOST = 1000  # steps along a side
+_HILLS_M = (60.0, 200.0)  # wavelengths of the synthetic relief
+
+
+def hills(side_m: float, relief_m: float, rng: np.random.Generator) -> Elevation:
+    """Synthetic hills, relief_m from the lowest to the highest place, 0 at the origin.
+
+    Waves of 60 to 200 m from all directions, none longer than the world; the longer, the higher.
+    """
+    steps, step = _grid(side_m)
+    metres = np.linspace(-side_m / 2, side_m / 2, steps + 1)
+    east, north = np.meshgrid(metres, metres)
+    up = np.zeros_like(east)
+    for length in np.geomspace(_HILLS_M[0], min(_HILLS_M[1], max(side_m, _HILLS_M[0])), 12):
+        turn, phase = rng.uniform(0, 2 * np.pi, 2)
+        up += length**1.5 * np.sin(2 * np.pi / length * (east * np.cos(turn) + north * np.sin(turn)) + phase)
+    spread = float(np.ptp(up))
+    return _about_origin(up * (relief_m / spread), side_m, step, 0.0)
+
+
+def of_raster(given: Elevation, side_m: float) -> Elevation:
+    """Heights of an elevation raster on the world's grid, 0 at the origin.
+
+    Raises InputError where it does not cover the whole world: says which part of it does.
+    """
+    steps, step = _grid(side_m)
+    metres = np.linspace(-side_m / 2, side_m / 2, steps + 1)
+    column = ((metres - given.corner_m[0]) / given.step_m).astype(np.float32)
+    row = ((metres - given.corner_m[1]) / given.step_m).astype(np.float32)
+    heights = np.asarray(given.up_m, np.float64)
+    slack = 1e-3
+    on_column = (column >= -slack) & (column <= heights.shape[1] - 1 + slack)
+    on_row = (row >= -slack) & (row <= heights.shape[0] - 1 + slack)
+    inside = on_row[:, None] & on_column[None]
+    known = np.isfinite(heights)
+    u, v = np.meshgrid(column, row)
+    sure = cv2.remap(known.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    covered = inside & (sure > 1 - slack)
+    if not covered.all():
+        low = given.corner_m
+        high = [low[k] + given.step_m * (heights.shape[1 - k] - 1) for k in (0, 1)]
+        raise InputError(
+            f"the elevation covers {np.floor(100 * covered.mean()):.0f} % of the world: it has heights from "
+            f"{low[0]:.0f} m to {high[0]:.0f} m east and {low[1]:.0f} m to {high[1]:.0f} m north of world.origin_deg, "
+            f"and the world needs {-side_m / 2:.0f} m to {side_m / 2:.0f} m without holes; "
+            "set world.side_m or world.origin_deg, or give a larger raster"
+        )
+    base = float(np.median(heights[known]))
+    filled = np.where(known, heights - base, 0).astype(np.float32)
+    up = cv2.remap(filled, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    return _about_origin(up, side_m, step, base + given.base_m)
+
+
+def up(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
+    """(N,) metres of height at places (N, 2), bilinear; beyond the grid as if mirrored at its edges."""
+    places = np.asarray(east_north_m, float).reshape(-1, 2)
+    steps = relief.up_m.shape[0] - 1
+    at = mirrored((places - relief.corner_m) / relief.step_m, steps)
+    cell = np.minimum(at.astype(np.int64), steps - 1)
+    x, y = (at - cell).T
+    column, row = cell.T
+    low = relief.up_m[row, column] * (1 - x) + relief.up_m[row, column + 1] * x
+    high = relief.up_m[row + 1, column] * (1 - x) + relief.up_m[row + 1, column + 1] * x
+    return np.asarray(low * (1 - y) + high * y)
+
+
+def mirrored(at: np.ndarray, length: float) -> np.ndarray:
+    """Coordinates folded into [0, length] as by mirrors at both ends."""
+    return length - np.abs(np.mod(at, 2 * length) - length)
+
+
+def _grid(side_m: float) -> tuple[int, float]:
+    """Steps along a side, even so that the origin lies on the grid, and their length."""
+    steps = 2 * int(np.ceil(min(side_m / _COARSEST_M, _MOST) / 2))
+    return steps, side_m / steps
+
+
+def _about_origin(up_m: np.ndarray, side_m: float, step_m: float, base_m: float) -> Elevation:
+    middle = up_m.shape[0] // 2
+    at_origin = float(up_m[middle, middle])
+    return Elevation(up_m - at_origin, (-side_m / 2, -side_m / 2), step_m, base_m + at_origin)
