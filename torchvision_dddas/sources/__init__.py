@@ -13,9 +13,9 @@ __all__ = ["Problem", "Source", "open_source"]
 def open_source(
     spec: str | Path, *, rate_hz: float | None = None, full_scale: int | None = None, single: bool = False
 ) -> Source:
-    """A clip from what the user typed: a video file, a folder or glob of images, `camera:0`, `rtsp://...`,
-    `sim:joining` (a scenario's name or file).
+    """A clip from what the user typed: a video file, a folder or glob of images, `camera:0`, `rtsp://...`, `sim:four`.
 
+    sim: and the name or file of a scenario is a SimulatorSource, which can be steered.
     rate_hz: frames a second; None takes the video's own, and 10 for images. full_scale: see ImageSource.
     single: a file that is one image is a clip of one frame; else it is refused, as nothing can be seen to move in it.
     Raises InputError with one line when it cannot be read.

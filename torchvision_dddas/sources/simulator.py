@@ -64,7 +64,10 @@ class SimulatorSource:
                 self._heard(moment)
             self._truths.append(shot.truth)
             # Vehicles look when the picture from the air is taken, dropped or not: each order is for one look.
-    XX._pictures += [seen for name in wanted if (seen := self._simulator.picture(name)) is not None]
+            for name in self._wanted:
+                if (seen := self._simulator.picture(name)) is not None:
+                    self._pictures.append(seen)
+            self._wanted.clear()
             if shot.frame is None:
                 self.problems.append(Problem(self.last, f"frame {self.last} was dropped by the camera"))
                 continue
