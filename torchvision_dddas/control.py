@@ -6,12 +6,15 @@ from itertools import combinations
 
 import numpy as np
 
-from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, with_knobs
+from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
 from torchvision_dddas.targets.gates import Gates, gates_at, pixels_per_metre
 from torchvision_dddas.types import Adjustment, Marks
 
 # A change of altitude by this share moves the gates: less is not worth a line in the record.
 _ALTITUDE_STEP = 0.2
+
+# Between two looks a target moves by this share of its size at most.
+_MOVED_SHARE = 0.5
 
 # Landmarks count as well detected again once they are slower than this share of the speed at which they are not.
 _CALM = 0.8
@@ -55,6 +58,36 @@ def adjusted(frame: int, now: int, wanted: float, why: str, knobs: IntervalKnobs
     if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75 and knobs.minimum_frames <= now):
         return now, ()
     return new, (Adjustment(frame, "interval.frames", now, new, why),)
+
+
+def every_wanted(
+    interval: float, rate_hz: float, speed_m_s: np.ndarray, size_m: np.ndarray, knobs: SteeringKnobs
+) -> tuple[float, str]:
+    """Of how many frames one is worth a look, before rounding and bounds; in words what limits it beside the rule.
+
+    interval: as the rule gives it, before its bounds; sampling_share of it is taken. speed_m_s, size_m: (N,) of the
+    targets that are known. Between two looks none may move by more than half its size: the two places then still share
+    half of it, and are nearer to each other than to any other target, since two that part are a size apart.
+    """
+    wanted = knobs.sampling_share * interval
+    known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
+    if not known.any():
+        return wanted, ""
+    frames = _MOVED_SHARE * size_m[known] * rate_hz / np.maximum(speed_m_s[known], 1e-3)
+    tightest = int(frames.argmin())
+    if frames[tightest] >= min(wanted, knobs.maximum_every):
+        return wanted, ""
+    speed, size = speed_m_s[known][tightest], size_m[known][tightest]
+    # Whole frames, so that it holds.
+    return max(float(np.floor(frames[tightest])), 1.0), f"; a target of {size:.1f} m goes at {speed:.1f} m/s"
+
+
+def sampled(frame: int, now: int, wanted: float, why: str, knobs: SteeringKnobs) -> tuple[int, tuple[Adjustment, ...]]:
+    """Of how many frames one is looked at from here on, and the record of its change, if any; steady as `adjusted`."""
+    new = int(np.clip(round(min(wanted, 1e6)), 1, knobs.maximum_every))
+    if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75):
+        return now, ()
+    return new, (Adjustment(frame, "sampling.every", now, new, why),)
 
 
 @dataclass(frozen=True)

@@ -602,7 +602,13 @@ class SteeringKnobs(Group):
     slow_m_s: float = knob(1.0, "m/s", 0, 30, meaning="and near it, where its own motion must not spoil its place")
     near_m: float = knob(6.0, "m", 0, 1000, meaning="what counts as near")
     station_m: float = knob(12.0, "m", 2, 1000, meaning="how far from a crowd ground vehicles stand about it")
+    look_m: float = knob(
+        14.0, "m", 1, 1000, meaning="up to this distance a ground vehicle's camera recognizes people: 64 px of body"
+    )
     picture_s: float = knob(1.0, "s", 0.01, 3600, meaning="time between two pictures of one ground vehicle")
+    maximum_altitude_m: float = knob(
+        0.0, "m", 0, 10_000, meaning="the aerial vehicle climbs no higher to see more; 0: twice its altitude at first"
+    )
 
 
 class Settings(Group):

@@ -1,0 +1,103 @@
+"""From what was found in a frame to what the instruments are asked to do next."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchvision_dddas.control import every_wanted, interval_from_flow, interval_from_telemetry, sampled
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.steering.follow import Follow
+from torchvision_dddas.steering.footprint import Stand, stand_of
+from torchvision_dddas.steering.outlook import Memory, Outlook
+from torchvision_dddas.steering.record import Record
+from torchvision_dddas.steering.team import Team
+from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flight, Grounded, Marks, Order, Registration
+
+# After something was lost every frame is looked at for so long.
+_ALERT_S = 2.0
+# A target is lost once so many frames in a row do not show it.
+_MISSED = 2
+# A registration in which a smaller share of points agrees is weak.
+_WEAK = 0.5
+
+
+class Steering:
+    """What was asked of the instruments so far. Feed it located frames in order."""
+
+    def __init__(self, settings: Settings, camera: Camera, rate_hz: float, vehicles: Sequence[str]) -> None:
+        """camera: of the aerial vehicle; vehicles: the names of the ground vehicles, as the landmarks have them."""
+        self.settings, self.camera, self.rate_hz = settings, camera, rate_hz
+        self._memory, self._record = Memory(camera), Record()
+        self._follow, self._team = Follow(settings), Team(settings, vehicles)
+        self._stand: Stand | None = None
+        self._every, self._before, self._alert_s, self._alert = 1, 0, -np.inf, ""
+
+    def step(
+        self,
+        grounded: Grounded,
+        confirmed: Confirmed | None,
+        now_s: float,
+        marks: Marks,
+        flight: Flight | None,
+        step: Registration | None = None,
+    ) -> tuple[Command, tuple[Adjustment, ...]]:
+        """What the instruments are asked to do after a frame was located, and what of it is new, with its causes.
+
+        confirmed: row = that of grounded.positions. now_s: of the newest frame read; the located one is older. marks,
+        flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
+        while silent. step: how the background moved up to the located frame. Places in the command are local metres.
+        """
+        knobs = self.settings.steering
+        if not knobs.on:
+            return Command(), ()
+        self._record.begin(grounded.frame)
+        now_s = max(now_s, grounded.time_s)
+        outlook = self._memory.step(grounded, confirmed, now_s)
+        self._stand = stand_of(flight, grounded.fix, self._stand, self.camera)
+        team_m = self._team.hear(marks, now_s, self._record)
+        if knobs.sampling:
+            self._sample(grounded, outlook, now_s, flight, step)
+        if knobs.follow:
+            self._follow.step(outlook, team_m, self._stand, now_s, self._record)
+        orders: tuple[Order, ...] = ()
+        if knobs.look:
+            orders = self._team.orders(outlook, self._stand, self._follow.look_at, now_s, self._record)
+        look_at = self._follow.look_at
+        command = Command(self._every, self._fly_to(look_at), look_at, self._follow.altitude_m, orders)
+        return command, self._record.made()
+
+    def _fly_to(self, look_at: np.ndarray | None) -> np.ndarray | None:
+        """The ground below the aerial vehicle when it looks there as it is carried now."""
+        if look_at is None or self._stand is None:
+            return None
+        return self._stand.pose(look_at, self._follow.altitude_m or self._stand.altitude_m).place_m[:2]
+
+    def _sample(
+        self, grounded: Grounded, outlook: Outlook, now_s: float, flight: Flight | None, step: Registration | None
+    ) -> None:
+        """Of how many frames one is wanted."""
+        frame, knobs, interval = grounded.frame, self.settings.steering, self.settings.interval
+        between, self._before = max(frame - self._before, 1), frame
+        lost = np.flatnonzero(outlook.wanted & (outlook.missed == _MISSED))
+        if len(lost):
+            self._alert_s, self._alert = now_s + _ALERT_S, f"target {outlook.target[lost[0]]} was lost"
+        elif step is not None and (not step.reliable or step.inliers < _WEAK * step.tracked):
+            self._alert_s = now_s + _ALERT_S
+            self._alert = f"weak registration: {step.inliers} of {step.tracked} points agree"
+        wanted, why = 1.0, self._alert
+        if now_s >= self._alert_s:
+            if flight is not None and np.isfinite([flight.altitude_m, flight.speed_m_s]).all():
+                wanted = interval_from_telemetry(flight.altitude_m, flight.speed_m_s, self.rate_hz, interval)
+                why = f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+            elif step is not None and step.reliable:
+                wanted = interval_from_flow([step.flow_px / between], self.camera.size_px[0], interval)
+                why = f"background flow {step.flow_px / between:.2f} px a frame"
+            else:
+                return
+            seen = outlook.missed == 0
+            wanted, limit = every_wanted(
+                wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], knobs
+            )
+            why += limit
+        self._every, made = sampled(frame, self._every, wanted, why, knobs)
+        self._record.add(made)
