@@ -76,6 +76,12 @@ def shade(body: Body, time_s: float, view: View, layer: np.ndarray) -> None:
         cv2.fillConvexPoly(layer, np.round(hull * 2**_FRACTION).astype(np.int32), 255, cv2.LINE_AA, _FRACTION)
 
 
+def car_faces(body: Body, time_s: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, bool]]:
+    """(corners (N, 3), outward normal, colour, whether the sun shades it) of a car, in the order to draw them."""
+    solid = [(*face, True) for face in _car_faces(body, time_s)]
+    return [*solid, *((*face, False) for face in _car_trim(body, time_s))]
+
+
 def _axes(body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors ahead and to the left of a body, on the ground."""
     speed = float(np.linalg.norm(body.velocity_m_s))

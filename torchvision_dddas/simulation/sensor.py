@@ -1,0 +1,55 @@
+"""From light to a file: the lens blurs, exposure drifts, the sensor adds noise, the compression its blocks."""
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.simulation.scenario import CameraKnobs
+
+_SPARE_PX = 192  # a tile of noise is so much larger than the picture, so that its start can vary
+
+
+class Sensor:
+    """The sensor of a camera. stream tells cameras of one seed apart.
+
+    What happens to a picture depends on the seed, the stream and the picture's number alone.
+    """
+
+    def __init__(self, knobs: CameraKnobs, size_px: tuple[int, int], seed: int, stream: int = 0) -> None:
+        self.knobs = knobs
+        self._key = [seed, 71, stream]
+        rng = np.random.default_rng(self._key)
+        self._phase = rng.uniform(0, 2 * np.pi, 3)
+        shape = (size_px[1] + _SPARE_PX, size_px[0] + _SPARE_PX, 3)
+        self._noisy = knobs.shot_noise > 0 or knobs.read_noise > 0
+        self._tile = rng.standard_normal(shape, np.float32) if self._noisy else None
+
+    def gain(self, time_s: float) -> float:
+        """The exposure beside its middle: slow, of a few periods, within 1 - drift to 1 + drift."""
+        waves = np.sin(2 * np.pi * time_s / np.array([11.0, 4.3, 27.0]) + self._phase)
+        return 1 + self.knobs.drift * float(waves @ (0.5, 0.2, 0.3))
+
+    def expose(self, picture: np.ndarray, number: int, time_s: float) -> np.ndarray:
+        """The file's picture, (H, W, 3) uint8, of what the lens looks at, the same; number: of the picture."""
+        knobs = self.knobs
+        if knobs.sharpness_px > 0:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), knobs.sharpness_px))
+        levels = np.asarray(np.arange(256) * self.gain(time_s), np.float32)
+        if self._tile is None:
+            picture = np.asarray(cv2.LUT(picture, np.clip(np.round(levels), 0, 255).astype(np.uint8)))
+        else:
+            sigma = np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2).astype(np.float32)
+            rng = np.random.default_rng([*self._key, number])
+            y, x = rng.integers(0, _SPARE_PX, 2)
+            grain = self._tile[y : y + picture.shape[0], x : x + picture.shape[1]]
+            # Turned over and the sign changed, so that no two pictures show the same pattern moved aside.
+            flip = int(rng.integers(0, 4))
+            if flip < 3:
+                grain = cv2.flip(grain, flip - 1)
+            if rng.integers(0, 2):
+                sigma = -sigma
+            noise = cv2.multiply(cv2.LUT(picture, sigma), grain)
+            picture = np.asarray(cv2.add(cv2.LUT(picture, levels), noise, dtype=cv2.CV_8U))
+        if knobs.quality < 100:
+            _, file = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, knobs.quality])
+            picture = np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))
+        return picture

@@ -1,0 +1,86 @@
+"""A rolling shutter over relief: each row of a picture has the camera's pose at the time at which it is read."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from torchvision_dddas.simulation.moment import Moment
+from torchvision_dddas.types import Camera
+
+_LOWEST = 0.004  # rays sink at least so much for each metre along the axis: those above the horizon never land
+_FURTHEST_M = 20_000.0
+_LANDINGS = 8
+_CLOSE_M = 0.002
+
+
+class Shutter:
+    """A camera without distortion whose last row is read readout_s after its first."""
+
+    def __init__(self, camera: Camera, readout_s: float) -> None:
+        self.camera = camera
+        self.readout_s = readout_s
+
+    def lag_s(self, v: np.ndarray) -> np.ndarray:
+        """When a row is read, after the middle one."""
+        last = self.camera.size_px[1] - 1
+        return (np.clip(v, 0, last) / last - 0.5) * self.readout_s
+
+    def rays(self, moment: Moment, image_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the rays through pixels (N, 2) start and whither they go, (N, 3) each, a metre along the axis long."""
+        camera, pose = self.camera, moment.pose
+        focal = np.array(camera.focal_px) * pose.focal
+        flat = (image_px - np.array(camera.centre_px)) / focal
+        lag = self.lag_s(image_px[:, 1])[:, None]
+        way = turned(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
+        return pose.place_m + lag * moment.velocity_m_s, way
+
+    def project(
+        self, moment: Moment, points_m: np.ndarray, velocity_m_s: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (N, 2) of points (N, 3) that move so, and how far along the axis they are (N,)."""
+        camera, pose = self.camera, moment.pose
+        focal, centre = np.array(camera.focal_px) * pose.focal, np.array(camera.centre_px)
+        lag = np.zeros((len(points_m), 1))
+        # The row tells the time and the time the row; the shutter is far faster than what moves.
+        for _ in range(3 if self.readout_s > 0 else 1):
+            away = points_m + lag * (velocity_m_s - moment.velocity_m_s) - pose.place_m
+            seen = turned(away, moment.turn_rad_s, -lag) @ pose.axes
+            depth = seen[:, 2]
+            image_px = seen[:, :2] / np.where(np.abs(depth) < 1e-6, 1e-6, depth)[:, None] * focal + centre
+            lag = self.lag_s(image_px[:, 1])[:, None]
+        return image_px, depth
+
+
+def turned(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
+    if not np.any(lag_s):
+        return vectors
+    once = lag_s * np.cross(turn_rad_s, vectors)
+    return vectors + once + lag_s / 2 * np.cross(turn_rad_s, once)
+
+
+def landing(
+    start_m: np.ndarray, way: np.ndarray, up_m: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far along their way (N,) rays (N, 3) meet the ground, and the height (N,) there; up_m: of places (N, 2).
+
+    Rays that go above the horizon land far off.
+    """
+    sink = np.maximum(-way[:, 2], _LOWEST)
+    up = up_m(start_m[:, :2])
+    far = np.clip((start_m[:, 2] - up) / sink, 0.0, _FURTHEST_M)
+    before: tuple[np.ndarray, np.ndarray] | None = None
+    for _ in range(_LANDINGS):
+        up = up_m(start_m[:, :2] + far[:, None] * way[:, :2])
+        over = start_m[:, 2] - far * sink - up
+        if np.abs(over).max() < _CLOSE_M:
+            break
+        step = over / sink
+        if before is not None:
+            # The secant converges where the ground rises along the ray, which plain stepping does slowly.
+            change = over - before[1]
+            slope = np.where(np.abs(change) > 1e-9, (far - before[0]) / np.where(change == 0, 1, change), -1 / sink)
+            step = np.where((slope < 0) & (slope > -4 / sink), -over * slope, step)
+        before = far, over
+        far = np.clip(far + step, 0.0, _FURTHEST_M)
+    return far, up
