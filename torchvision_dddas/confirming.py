@@ -103,12 +103,13 @@ def _frames(
                 f"target {min(map(str, twice))} is twice in frame {number}; a target is there once a frame"
             )
         beliefs.add(targets, seen)
-        yield _confirmed(number, rows, targets, beliefs, seen)
+        yield confirmed_by(number, rows, targets, beliefs, seen)
 
 
-def _confirmed(
+def confirmed_by(
     number: int, rows: slice, targets: Sequence[Hashable], beliefs: Beliefs, seen: Sequence[tuple[str, Look]]
 ) -> Confirmed:
+    """What is believed of the targets of a frame. rows: their places in their table; seen: who looked in this frame."""
     count = len(targets)
     nothing = Look(*(np.zeros(count, kind) for kind in (bool, np.int64)), *(np.full(count, np.nan) for _ in range(3)))
     all_looks = [nothing, *(one for _, one in seen)]

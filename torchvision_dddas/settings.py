@@ -697,13 +697,15 @@ def range_of(field: FieldInfo) -> str:
 # Changing and loading them.
 
 
-def load(config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-    """The defaults, changed by a TOML file and then by `group.knob=value` overrides.
+def load(
+    config: str | Path | None = None, overrides: Sequence[str] = (), base: Mapping[str, object] | None = None
+) -> Settings:
+    """The defaults, changed by base, then by a TOML file and then by `group.knob=value` overrides.
 
-    config: the name of a shipped configuration (`source`, `fast`) or a TOML file.
+    config: the name of a shipped configuration (`source`, `fast`) or a TOML file. base: `{"group.knob": value}`.
     Raises InputError with one line: no such file, bad TOML, unknown knob (with the nearest names), value out of range.
     """
-    settings = Settings()
+    settings = with_knobs(Settings(), base or {})
     if config is not None:
         path = _config_file(config)
         settings = with_knobs(settings, _flat(read_toml(path), str(path)), origin=str(path))

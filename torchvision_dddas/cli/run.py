@@ -1,6 +1,6 @@
 """`dddas run`: the whole path, from a clip to places on the ground."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,24 +18,26 @@ from torchvision_dddas.cli.aerial import (
     locator_for,
 )
 from torchvision_dddas.cli.clips import clip_facts, last_lines
+from torchvision_dddas.cli.mission import SIMULATED, fly
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.geolocating import Locator, Watch, Watched
+    from torchvision_dddas.geolocating import Locator, Watch
     from torchvision_dddas.settings import Settings
     from torchvision_dddas.sinks.journal import Record
     from torchvision_dddas.sources import Source
-    from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
-    from torchvision_dddas.vision import Vision
 
 
 @explained
 def run(
     clip: Annotated[
-        str, typer.Argument(metavar="CLIP", help="A video file, a folder or glob of images, camera:0 or rtsp://...")
+        str,
+        typer.Argument(
+            metavar="CLIP", help="A video file, a folder or glob of images, camera:0, rtsp://... or sim:SCENARIO"
+        ),
     ],
     landmarks: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A CSV of landmarks: where they were. [default: none located]")
@@ -57,6 +59,10 @@ def run(
         typer.Option(metavar="NAMES", help="overlay,cot,map,report, all or none; tables are always written."),
     ] = None,
     rate: Rate = None,
+    scene: Annotated[
+        list[str] | None, typer.Option("--scene", metavar="KNOB=VALUE", help="Change a knob of a scenario (sim:NAME).")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the scenario's chances, in place of its own.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what moves in a clip from the air, give it lasting identities, and locate it by landmarks of known place.
@@ -70,6 +76,13 @@ def run(
 
     if interval < 1:
         raise InputError(f"--interval is {interval}; wanted 1 or more frames")
+    if clip.startswith(SIMULATED):
+        files = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--dem": dem}
+        files |= {"--colours": colours, "--camera": camera, "--background": background}
+        fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, files, quiet)
+        return
+    if scene or seed is not None:
+        raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
     others = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
     if landmarks is None and (useless := [name for name, given in others.items() if given is not None]):
         raise InputError(f"{useless[0]} is of no use without --landmarks FILE: nothing would be located")
@@ -106,6 +119,7 @@ def run_into(
     with kind(folder, save) as output:
         from torchvision_dddas.sources import open_source
         from torchvision_dddas.sources.telemetry import read_telemetry
+        from torchvision_dddas.surveying import survey
         from torchvision_dddas.vision import load
 
         source = open_source(clip, rate_hz=rate_hz)
@@ -143,7 +157,7 @@ def run_into(
         try:
             count = None if source.count is None else -(-source.count // interval)
             with progress(source.name, count, quiet) as tick:
-                for surveyed in surveyed_clip(source, vision, settings, flight, watch, interval):
+                for surveyed in survey(source, vision, settings, flight, watch, interval):
                     write(surveyed)
                     tick()
         finally:
@@ -177,67 +191,6 @@ def _sized(settings: "Settings", locator: "Locator") -> "tuple[Settings, list[st
         return settings, []
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
     return with_knobs(settings, {"gates.focal_px": focal}), [note]
-
-
-def surveyed_clip(
-    source: "Source",
-    vision: "Vision",
-    settings: "Settings",
-    telemetry: "Telemetry | None",
-    watch: "Watch | None",
-    interval: int,
-) -> "Iterator[Surveyed]":
-    """Everything of each frame that is followed, in order.
-
-    Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
-    target is located by the picture in which it was seen.
-    """
-    from torchvision_dddas.following import follow_scenes
-    from torchvision_dddas.run import run as scenes_of
-    from torchvision_dddas.types import Surveyed
-
-    waiting: dict[int, Watched] = {}
-
-    def scenes() -> "Iterator[Scene]":
-        for scene in scenes_of(source, vision, settings, telemetry):
-            if watch is None:
-                yield scene
-                continue
-            watched = watch.step(scene)
-            waiting[scene.frame.number] = watched
-            yield watched.scene
-
-    for followed in follow_scenes(scenes(), settings, interval, source.size):
-        if watch is None:
-            yield Surveyed(followed)
-            continue
-        past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
-        yield _located(followed, past, watch.locator)
-
-
-def _located(followed: "Followed", past: "Sequence[Watched]", locator: "Locator") -> "Surveyed":
-    """A followed frame on the ground. past: what was seen since the one before, it at the end."""
-    from dataclasses import replace
-
-    from torchvision_dddas.geolocating import Targets
-    from torchvision_dddas.targets import geodesy
-    from torchvision_dddas.types import Surveyed
-
-    here, tracks = past[-1], followed.tracks
-    # A box that bridges a gap was not seen: it has an identity, and no place.
-    seen = tracks.row >= 0
-    targets = Targets(
-        tracks.box_px[seen], tracks.identity[seen], seen[seen], tracks.score[seen].clip(0, 1), bodies=True
-    )
-    earlier = tuple(a for watched in past[:-1] for a in watched.look.adjustments)
-    seconds = dict(followed.seconds)
-    for watched in past:
-        for stage, spent in watched.look.seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + spent
-    grounded = locator.ground(replace(here.look, seconds={}), targets, (*followed.adjustments, *earlier), seconds)
-    origin = locator.site.origin_deg
-    degrees = None if origin is None else geodesy.lonlat(grounded.marks.east_north_m, origin)
-    return Surveyed(followed, grounded, here.sighted_by, degrees)
 
 
 def summary(journal: "Record", folder: Path, located: bool, save: Sequence[str]) -> list[str]:

@@ -32,7 +32,7 @@ class SimulatorSource:
     """A scenario as a Source, its frames drawn when they are asked for.
 
     Beside what every source offers: scenario; camera, the aerial one; colours of the landmarks; elevation, of the
-    ground; steer; and what is there of the run until now: landmarks, telemetry, pictures, truths.
+    ground about origin_deg; steer; and what is there of the run until now: landmarks, telemetry, pictures, truths.
     Every new iteration starts the run anew. Frames that a command leaves out are not drawn; those that the camera
     drops are missing numbers.
     """
@@ -46,6 +46,7 @@ class SimulatorSource:
         self.camera: Camera = simulator.camera
         self.colours: Colours = simulator.colours
         self.elevation: Elevation = simulator.world.relief
+        self.origin_deg = scenario.world.origin_deg
         self.names: tuple[str, ...] = simulator.names
         self.count: int | None = simulator.frames
         self.rate_hz = scenario.clip.rate_hz

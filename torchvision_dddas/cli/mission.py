@@ -1,0 +1,122 @@
+"""`dddas run sim:SCENARIO`: the whole path in a closed loop with simulated vehicles, and what it was worth."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from torchvision_dddas.cli.clips import clip_facts
+from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.mission import Mission
+    from torchvision_dddas.sinks.journal import Record
+    from torchvision_dddas.sources.simulator import SimulatorSource
+
+SIMULATED = "sim:"
+"""What names of scenarios begin with."""
+
+CONFIG = "patrol"
+"""The shipped configuration that a simulated run takes unless another is named."""
+
+
+def fly(
+    scenario: str,
+    folder: Path,
+    config: str | None,
+    overrides: Sequence[str],
+    scene: Sequence[str],
+    seed: int | None,
+    backend: str,
+    save: str | None,
+    files: Mapping[str, Any],
+    quiet: bool,
+) -> None:
+    """Run a scenario and write everything under a folder. files: options that a scenario has no use for.
+
+    overrides: of the settings; scene: of the scenario. Raises InputError for bad input.
+    """
+    from torchvision_dddas.cli.run import summary
+    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.sinks.survey_output import SAVED
+
+    if useless := [name for name, given in files.items() if given is not None]:
+        raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
+    names = saved(save, SAVED)
+    journal = fly_into(folder, scenario, config, overrides, scene, seed, backend, names, quiet)
+    if not quiet:
+        for line in summary(journal, folder, True, names):
+            typer.echo(line)
+
+
+def fly_into(
+    folder: Path,
+    scenario: str,
+    config: str | None = None,
+    overrides: Sequence[str] = (),
+    scene: Sequence[str] = (),
+    seed: int | None = None,
+    backend: str = "auto",
+    save: Sequence[str] = (),
+    quiet: bool = False,
+) -> "Record":
+    """As `fly`, but returns the record of the run, and says nothing at its end."""
+    from torchvision_dddas.sinks.survey_output import SurveyOutput
+
+    with SurveyOutput(folder, save) as output:
+        from torchvision_dddas.mission import Begun, mission_of
+        from torchvision_dddas.settings import load
+        from torchvision_dddas.simulation.scenario import settings_of
+        from torchvision_dddas.sources.simulator import open_scenario
+        from torchvision_dddas.surveying import survey
+        from torchvision_dddas.vision import load as load_vision
+
+        simulated: SimulatorSource = open_scenario(scenario, scene, seed)
+        settings = load(config or CONFIG, overrides, settings_of(simulated.scenario))
+        source: Any = Begun(simulated)
+        mission = mission_of(source, settings, backend)
+        vision = load_vision(backend, mission.settings)
+        journal = _begin(output, mission, simulated, vision.name)
+        try:
+            with progress(simulated.name, simulated.count, quiet) as tick:
+                done = 0
+                for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
+                    output.survey(surveyed)
+                    for _ in range(surveyed.followed.number - done):
+                        tick()
+                    done = surveyed.followed.number
+        finally:
+            journal.problems += [str(problem) for problem in simulated.problems]
+    return journal
+
+
+def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: str) -> "Record":
+    """Say what the run is."""
+    from functools import partial
+
+    from torchvision_dddas.targets import geodesy
+
+    locator, site = mission.watch.locator, mission.watch.locator.site
+    facts: dict[str, Any] = {
+        "input": f"{SIMULATED}{source.name}",
+        "clip": clip_facts(source),
+        "scenario": source.scenario.model_dump(),
+        "backend": backend,
+        "origin_deg": site.origin_deg,
+        "settings": mission.settings.model_dump(),
+    }
+    journal = output.begin(
+        facts,
+        names=site.landmarks.names,
+        origin_deg=site.origin_deg,
+        start_utc_s=float("nan"),
+        rate_hz=source.rate_hz,
+        background=None,
+        camera=locator.camera,
+        degrees=None if site.origin_deg is None else partial(geodesy.lonlat, origin_deg=site.origin_deg),
+    )
+    output.also(journal, source.rate_hz, source.size, site.landmarks.names, site.origin_deg is not None)
+    kept: Record = journal
+    return kept

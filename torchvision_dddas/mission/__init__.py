@@ -1,0 +1,7 @@
+"""A run whose source can be steered: what is reported meanwhile, what ground vehicles see, and where all go next."""
+
+from torchvision_dddas.mission.closer import CloserLook
+from torchvision_dddas.mission.instrument import Begun, Instrument
+from torchvision_dddas.mission.mission import Mission, mission_of
+
+__all__ = ["Begun", "CloserLook", "Instrument", "Mission", "mission_of"]

@@ -1,0 +1,72 @@
+"""A closer look: people whom ground vehicles recognize tell which of the aerial camera's targets are human."""
+
+import time
+
+import numpy as np
+
+from torchvision_dddas.confirming import confirmed_by
+from torchvision_dddas.recognizing import people_in
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.targets.collaboration import Beliefs, Look, look, view_of
+from torchvision_dddas.targets.ranging import sight
+from torchvision_dddas.types import Confirmed, Grounded, GroundPicture, Poses
+from torchvision_dddas.vision import Recognizer
+
+
+class CloserLook:
+    """What is believed of each target, as pictures from the ground come in."""
+
+    def __init__(self, settings: Settings, recognizer: Recognizer) -> None:
+        self._settings, self._recognizer = settings, recognizer
+        self._beliefs = Beliefs(settings.confirm)
+        self._waiting: list[GroundPicture] = []
+        self.pictures = 0
+        self.spent_s = 0.0
+
+    def take(self, pictures: list[GroundPicture]) -> None:
+        """Pictures of the frames to come, as targets are located some frames later."""
+        self._waiting += pictures
+
+    def confirm(self, grounded: Grounded, extent_m: np.ndarray) -> Confirmed:
+        """What is known of the targets of a frame, by the pictures taken at it and all before.
+
+        extent_m: (P,) radius of each located target: its people stand about its middle.
+        """
+        here = [picture for picture in self._waiting if picture.frame <= grounded.frame]
+        self._waiting = [picture for picture in self._waiting if picture.frame > grounded.frame]
+        start = time.perf_counter()
+        positions = grounded.positions
+        looks = [(p.vehicle, self._look(p, grounded, extent_m)) for p in here if p.frame == grounded.frame]
+        targets = positions.target.tolist()
+        self._beliefs.add(targets, looks)
+        self.pictures += len(looks)
+        self.spent_s = time.perf_counter() - start
+        return confirmed_by(grounded.frame, slice(0, len(targets)), targets, self._beliefs, looks)
+
+    def _look(self, picture: GroundPicture, grounded: Grounded, extent_m: np.ndarray) -> Look:
+        settings, camera, positions = self._settings, picture.camera, grounded.positions
+        (people,) = people_in([picture.image], self._recognizer, settings.people)
+        place = np.array([camera.place], float)
+        if positions.origin_deg is not None:
+            place = geodesy.east_north(place, positions.origin_deg)
+        rows = np.zeros(len(people), np.int64)
+        poses = Poses(
+            np.array([camera.place], float)[rows],
+            np.full(len(people), camera.heading_rad),
+            np.full(len(people), camera.pitch_rad),
+        )
+        seen = sight(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
+        known = seen.by != "bearing"
+        view = view_of(camera, place[0], camera.heading_rad, settings.people, settings.ground)
+        # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
+        spread = positions.covariance_m2 + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
+        return look(
+            positions.east_north_m,
+            spread,
+            seen.east_north_m[known],
+            seen.covariance_m2[known],
+            people.score[known],
+            [view],
+            settings.confirm,
+        )

@@ -1,0 +1,148 @@
+"""The loop about the whole path: reports come in, what is found goes out as commands."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from torchvision_dddas.geolocating import Locator, Site, Watch, site_of
+from torchvision_dddas.mission.closer import CloserLook
+from torchvision_dddas.mission.instrument import Instrument
+from torchvision_dddas.recognizing import recognizer_of
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.steering import Steering
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.targets.elevation import up
+from torchvision_dddas.types import Command, Elevation, Landmarks, Order, Registration, Scene, Surveyed, Telemetry
+from torchvision_dddas.vision import load_colours, load_solver
+
+MEMORY_S = 15.0
+"""Reports this old no longer tell where anything is: the rest of a long run would only cost time."""
+
+
+def mission_of(source: Instrument, settings: Settings, backend: str) -> "Mission":
+    """Everything about a source that can be steered, whose first frame has been read: it has reports by then.
+
+    Raises InputError where these do not do.
+    """
+    if settings.gates.focal_px == Settings().gates.focal_px:
+        # So that sizes in metres hold, as for a clip whose camera is known.
+        settings = with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0])})
+    site = site_of(source.landmarks(), source.telemetry())
+    site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site))
+    locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
+    colours = source.colours
+    watch = Watch(locator, colours, load_colours(backend)) if len(colours) else Watch(locator, None, None)
+    closer = CloserLook(settings, recognizer_of(settings.people, backend)) if len(colours) else None
+    steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
+    return Mission(source, watch, settings, closer, steering)
+
+
+class Mission:
+    """The state of a run that steers. watch: takes the scenes; settings: with what the source itself says."""
+
+    def __init__(
+        self,
+        source: Instrument,
+        watch: Watch,
+        settings: Settings,
+        closer: CloserLook | None,
+        steering: Steering | None,
+    ) -> None:
+        self.source, self.watch, self.settings = source, watch, settings
+        self._closer, self._steering = closer, steering
+        self._origin = watch.locator.site.origin_deg
+
+    def refresh(self, scene: Scene) -> None:
+        """Before a scene is laid on the ground: take what was reported meanwhile."""
+        first = scene.frame.number - MEMORY_S * self.source.rate_hz
+        self.watch.locator.learn(self._site(_recent(self.source.landmarks(), first), self.source.telemetry()))
+        if self._closer is not None:
+            self._closer.take(self.source.pictures())
+
+    def after(self, surveyed: Surveyed, step: Registration | None) -> Surveyed:
+        """Judge the targets of a frame by what the ground vehicles saw, and say where all go next.
+
+        step: how the background moved up to the frame.
+        """
+        grounded = surveyed.grounded
+        if grounded is None:
+            return surveyed
+        seconds = dict(grounded.seconds)
+        confirmed = None
+        if self._closer is not None:
+            confirmed = self._closer.confirm(grounded, self._extent_m(surveyed))
+            seconds["people"] = self._closer.spent_s
+        command = None
+        adjustments = grounded.adjustments
+        if self._steering is not None:
+            start = time.perf_counter()
+            now = self.source.last
+            now_s = (now - 1) / self.source.rate_hz
+            locator = self.watch.locator
+            local, moved = self._steering.step(
+                grounded, confirmed, now_s, locator.marks(now), locator.flight(now_s), step
+            )
+            command = self._in_degrees(local)
+            self.source.steer(command)
+            adjustments = (*adjustments, *moved)
+            seconds["steer"] = time.perf_counter() - start
+        grounded = replace(grounded, adjustments=adjustments, seconds=seconds)
+        return replace(surveyed, grounded=grounded, confirmed=confirmed, command=command)
+
+    def _site(self, landmarks: Landmarks, telemetry: Telemetry) -> Site:
+        """The reports in the metres of the site."""
+        site = self.watch.locator.site
+        if self._origin is not None:
+            landmarks = replace(landmarks, place=geodesy.east_north(landmarks.place, self._origin), geographic=False)
+            telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, self._origin), geographic=False)
+        return replace(site, landmarks=landmarks, telemetry=telemetry)
+
+    def _extent_m(self, surveyed: Surveyed) -> np.ndarray:
+        """(P,) radius of each located target on the ground; 0 where unknown."""
+        grounded = surveyed.grounded
+        assert grounded is not None
+        box = grounded.box_px[grounded.row]
+        corners = np.concatenate([box[:, :2] - 0.5, box[:, :2] + box[:, 2:] - 0.5])
+        low, high = np.split(self.watch.locator.places(grounded.fix, corners), 2)
+        return np.nan_to_num(np.linalg.norm(high - low, axis=1) / 2 / np.sqrt(2))
+
+    def _in_degrees(self, command: Command) -> Command:
+        """A command with the places that the vehicles understand."""
+        if self._origin is None:
+            return command
+        origin = self._origin
+
+        def there(place: np.ndarray | None) -> np.ndarray | None:
+            return None if place is None else geodesy.lonlat(np.asarray(place, float)[None], origin)[0]
+
+        orders = tuple(
+            Order(o.vehicle, geodesy.lonlat(o.goal[None], origin)[0], o.speed_m_s, there(o.look_at), o.picture)
+            for o in command.orders
+        )
+        return replace(command, fly_to=there(command.fly_to), look_at=there(command.look_at), orders=orders)
+
+
+def _moved(elevation: Elevation, origin_deg: tuple[float, float], site: Site) -> Elevation:
+    """Heights about one origin as heights about the site's: metres from there, above the ground there."""
+    if site.origin_deg is None:
+        return elevation
+    shift = geodesy.east_north(np.array([origin_deg]), site.origin_deg)[0]
+    here = replace(elevation, corner_m=(elevation.corner_m[0] + shift[0], elevation.corner_m[1] + shift[1]))
+    base = float(up(here, np.zeros((1, 2)))[0])
+    return replace(here, up_m=here.up_m - base, base_m=here.base_m + base)
+
+
+def _recent(landmarks: Landmarks, first: float) -> Landmarks:
+    """The reports from a frame on."""
+    rows = landmarks.frame >= first
+    return replace(
+        landmarks,
+        frame=landmarks.frame[rows],
+        landmark=landmarks.landmark[rows],
+        image_px=landmarks.image_px[rows],
+        place=landmarks.place[rows],
+        sigma_m=landmarks.sigma_m[rows],
+        planned=landmarks.planned[rows],
+        line=landmarks.line[rows],
+    )

@@ -1,0 +1,78 @@
+"""The whole path, frame by frame: what moves, who is who, where on the ground; and where an instrument goes next."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torchvision_dddas.following import follow_scenes
+from torchvision_dddas.geolocating import Locator, Targets, Watch, Watched, gathered
+from torchvision_dddas.run import run as scenes_of
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.source import Source
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
+from torchvision_dddas.vision import Vision
+
+if TYPE_CHECKING:
+    from torchvision_dddas.mission import Mission
+
+
+def survey(
+    source: Source,
+    vision: Vision,
+    settings: Settings,
+    telemetry: Telemetry | None = None,
+    watch: Watch | None = None,
+    interval: int = 1,
+    mission: "Mission | None" = None,
+) -> Iterator[Surveyed]:
+    """Everything of each frame that is followed, in order.
+
+    Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
+    target is located by the picture in which it was seen.
+    """
+    waiting: dict[int, Watched] = {}
+
+    def scenes() -> Iterator[Scene]:
+        for scene in scenes_of(source, vision, settings, telemetry):
+            if watch is None:
+                yield scene
+                continue
+            if mission is not None:
+                mission.refresh(scene)
+            watched = gathered(watch.step(scene), watch.locator, source.rate_hz)
+            waiting[scene.frame.number] = watched
+            yield watched.scene
+
+    for followed in follow_scenes(scenes(), settings, interval, source.size):
+        if watch is None:
+            yield Surveyed(followed)
+            continue
+        past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
+        surveyed = _located(followed, past, watch.locator)
+        yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
+
+
+def _located(followed: Followed, past: Sequence[Watched], locator: Locator) -> Surveyed:
+    """A followed frame on the ground. past: what was seen since the one before, it at the end."""
+    here, tracks = past[-1], followed.tracks
+    # A box that bridges a gap was not seen: it has an identity, and no place.
+    seen = tracks.row >= 0
+    middle = followed.detections.middle_px[tracks.row[seen]] if locator.settings.crowds.join_m else None
+    targets = Targets(
+        tracks.box_px[seen],
+        tracks.identity[seen],
+        seen[seen],
+        tracks.score[seen].clip(0, 1),
+        bodies=True,
+        middle_px=middle,
+    )
+    earlier = tuple(a for watched in past[:-1] for a in watched.look.adjustments)
+    seconds = dict(followed.seconds)
+    for watched in past:
+        for stage, spent in watched.look.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent
+    grounded = locator.ground(replace(here.look, seconds={}), targets, (*followed.adjustments, *earlier), seconds)
+    origin = locator.site.origin_deg
+    degrees = None if origin is None else geodesy.lonlat(grounded.marks.east_north_m, origin)
+    return Surveyed(followed, grounded, here.sighted_by, degrees)
