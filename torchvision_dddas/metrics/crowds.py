@@ -277,7 +277,7 @@ class CrowdScorer:
         self._found_rows += [(truth.frame, int(i), box) for i, box in zip(told.identity, told.box_px, strict=True)]
 
     def _judge_kinds(self, truth: Shown, told: Told, lies: np.ndarray) -> None:
-        human: np.ndarray = lies[:, truth.kind == "person"].any(axis=1)
+        human = np.asarray(lies[:, truth.kind == "person"].any(axis=1))
         for row, kind in enumerate(told.kind):
             which = int(told.identity[row])
             self._holds[which] += 1 if human[row] else -1
