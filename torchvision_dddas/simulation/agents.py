@@ -1,0 +1,249 @@
+"""All that moves in a simulated world, step by step, and what the vehicles say of it."""
+
+from typing import Protocol
+
+import numpy as np
+
+from torchvision_dddas.simulation.aircraft import Aircraft, Telemetry, rotation
+from torchvision_dddas.simulation.cars import Cars
+from torchvision_dddas.simulation.crowds import Crowds
+from torchvision_dddas.simulation.faults import Faults, Wrong
+from torchvision_dddas.simulation.moment import Moment, Report
+from torchvision_dddas.simulation.obstacles import Obstacles, Things
+from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.scenario import Scenario
+from torchvision_dddas.simulation.team import Team, plates
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
+
+_TICK_S = 0.1
+_PLANNED_S = 5
+_STRAYS_M = 0.1
+"""How well a vehicle keeps to what it plans, a second ahead; standard deviation along each axis."""
+_UGV_BGR = (70.0, 74.0, 72.0)
+_GUST_S = 1.5
+
+
+class Ground(Protocol):
+    """What the agents need to know of a world: its size, heights (N,) of places (N, 2), and what stands there."""
+
+    @property
+    def side_m(self) -> float: ...  # noqa: D102
+    @property
+    def things(self) -> Things: ...  # noqa: D102
+    def up_m(self, east_north: np.ndarray, /) -> np.ndarray: ...  # noqa: D102
+
+
+class Agents:
+    """People, cars, ground vehicles and the UAV of a scenario.
+
+    Each step of a frame is made of equal steps of at most 0.1 s, whether or not anyone looks at the frame: what happens
+    does not depend on that.
+    """
+
+    def __init__(self, scenario: Scenario, world: Ground) -> None:
+        self._scenario, self._world, seed = scenario, world, scenario.seed
+        obstacles = Obstacles(world.things, world.side_m)
+        many, cars, ugvs = len(scenario.crowd), len(scenario.car), scenario.team.ugvs
+        self._car_target = many + 1 + np.arange(cars)
+        self._ugv_target = many + cars + 1 + np.arange(ugvs)
+        self._crowds = Crowds(scenario.crowd, scenario.happening, world.side_m, obstacles, seed, many + cars + ugvs + 1)
+        self._cars = Cars(scenario.car, world.side_m, obstacles, seed)
+        self._team = Team(scenario.team, scenario.uav, world.side_m, obstacles, seed)
+        self._plates = plates(ugvs)[1]
+        self._aircraft = Aircraft(scenario.uav, world.side_m / 2, world.up_m, seed)
+        self._telemetry = Telemetry(scenario.uav, seed)
+        self._telemetry_errors = self._telemetry.errors(0.0)
+        gps = scenario.gps
+        rng = np.random.default_rng([seed, 40])
+        self._gps = Receivers(ugvs, gps.error95_m, gps.white_share, gps.correlation_s, gps.common_m, rng)
+        self._jump = rng.uniform(0, 2 * np.pi, ugvs)
+        self._faults = Faults(scenario.fault)
+        self._gust = np.random.default_rng([seed, 53]).uniform(0, 2 * np.pi, len(scenario.fault))
+        self._rate = scenario.clip.rate_hz
+        self._ticks = max(1, int(np.ceil(1 / self._rate / _TICK_S - 1e-9)))
+        self._number, self._reported = 1, 0
+        self._reports: list[Report] = []
+        self._events: list[str] = self._faults.events(-np.inf, 0.0)
+        self._report(self._team.place, self._team.place, 0.0, 0.0)
+        self._plan(0.0)
+        self._last: Moment | None = None
+
+    @property
+    def time_s(self) -> float:
+        """Of the frame at hand."""
+        return (self._number - 1) / self._rate
+
+    def moment(self) -> Moment:
+        """The world at the frame at hand, with all that was said since the moment before."""
+        if self._last is None:
+            self._last = self._moment()
+        return self._last
+
+    def step(self, every: int = 1) -> None:
+        """On by so many frames."""
+        if every < 1:
+            raise ValueError(f"a step of {every} frames; wanted 1 or more")
+        if self._last is not None:
+            self._reports, self._events, self._last = [], [], None
+        for _ in range(every):
+            self._frame()
+
+    def steer(self, command: Command) -> None:
+        """What the instruments do from now on; what a command does not name goes on as before."""
+        self._aircraft.steer(self._local(command.fly_to), self._local(command.look_at), command.altitude_m)
+        for order in command.orders:
+            if order.vehicle in self._team.names:
+                goal = self._local(order.goal)
+                assert goal is not None
+                self._team.order(
+                    self._team.names.index(order.vehicle), goal, order.speed_m_s, self._local(order.look_at)
+                )
+
+    def _local(self, place_deg: np.ndarray | None) -> np.ndarray | None:
+        """(2,) local metres of longitude and latitude."""
+        if place_deg is None:
+            return None
+        return geodesy.east_north(np.asarray(place_deg, float)[None], self._scenario.world.origin_deg)[0]
+
+    def _lonlat(self, place_m: np.ndarray) -> np.ndarray:
+        return geodesy.lonlat(place_m, self._scenario.world.origin_deg)
+
+    def _frame(self) -> None:
+        start, seconds = self.time_s, 1 / self._rate / self._ticks
+        for tick in range(self._ticks):
+            begin = start + tick * seconds
+            self._tick(begin, seconds)
+        self._number += 1
+        self._telemetry_errors = self._telemetry.errors(1 / self._rate)
+        self._events += self._faults.events(start, self.time_s)
+
+    def _tick(self, begin: float, seconds: float) -> None:
+        end, wrong = begin + seconds, self._faults.at(begin)
+        team, before = self._team, self._team.place
+        vehicles = np.concatenate([self._cars.place, before])
+        self._events += self._crowds.step(end, seconds, vehicles)
+        people = self._crowds.place
+        self._cars.step(end, seconds, np.concatenate([people, before]))
+        team.step(end, seconds, sorted(wrong.lost), people)
+        self._aircraft.step(end, seconds, *self._blow(begin))
+        self._report(before, team.place, begin, end)
+        if np.floor(end + 1e-6) > np.floor(begin + 1e-6):
+            self._plan(end)
+
+    def _blow(self, time_s: float) -> tuple[np.ndarray | None, float]:
+        """The push (3,) of the gusts, m/s2, and how much rougher the air is."""
+        gusts = self._faults.gusts(time_s)
+        push = np.zeros(3)
+        for row, since, size in gusts:
+            if since < _GUST_S:
+                # A spring at rest is by then as fast as the gust.
+                push[:2] += np.e * size / _GUST_S * np.array([np.sin(self._gust[row]), np.cos(self._gust[row])])
+        return (push, 1 + max(size for *_, size in gusts) / 5) if gusts else (None, 1.0)
+
+    def _report(self, before: np.ndarray, after: np.ndarray, begin: float, end: float) -> None:
+        """What the receivers say between two times, at which the vehicles are at places (K, 2)."""
+        rate = self._scenario.gps.rate_hz
+        while self._reported / rate <= end + 1e-9:
+            time = self._reported / rate
+            if self._reported:
+                self._gps.advance(1 / rate)
+            share = np.clip((time - begin) / (end - begin), 0, 1) if end > begin else 1.0
+            place = before + share * (after - before) + self._gps.error_m
+            wrong = self._faults.at(time)
+            said = self._lonlat(place + self._jumped(wrong))
+            for k in range(len(self._team)):
+                if k not in wrong.lost and k not in wrong.silent:
+                    self._reports.append(Report(k, time * self._rate + 1, said[k], self._gps.sigma_m))
+            self._reported += 1
+
+    def _jumped(self, wrong: Wrong) -> np.ndarray:
+        """(K, 2) by how much the receivers are off."""
+        off = np.zeros((len(self._team), 2))
+        for k, size in wrong.jumped.items():
+            if k < len(off):
+                off[k] = size * np.array([np.sin(self._jump[k]), np.cos(self._jump[k])])
+        return off
+
+    def _plan(self, time_s: float) -> None:
+        """What they mean to pass in the coming seconds, this one included; told anew each second."""
+        if not self._scenario.team.planned or not len(self._team):
+            return
+        wrong = self._faults.at(time_s)
+        times = np.round(time_s) + np.arange(_PLANNED_S + 1)
+        places = self._team.waypoints(time_s, 1 / self._rate / self._ticks, times, sorted(wrong.lost))
+        # A vehicle knows where it is no better than its receiver does, and plans from there.
+        places = places + self._gps.lasting_m + self._jumped(wrong)
+        for ahead, (time, place) in enumerate(zip(times, places, strict=True)):
+            sigma = float(np.hypot(self._gps.sigma_m, _STRAYS_M * ahead))
+            said = self._lonlat(place)
+            for k in range(len(self._team)):
+                if k not in wrong.lost:
+                    self._reports.append(Report(k, time * self._rate + 1, said[k], sigma, planned=True))
+
+    def _moment(self) -> Moment:
+        time, team = self.time_s, self._team
+        wrong = self._faults.at(time)
+        pose, velocity, turn = self._aircraft.pose()
+        said = self._lonlat(team.place + self._gps.error_m + self._jumped(wrong))
+        silent = [k for k in range(len(team)) if k in wrong.lost or k in wrong.silent]
+        said[silent] = np.nan
+        return Moment(
+            self._number,
+            time,
+            self._bodies(wrong),
+            pose,
+            velocity,
+            turn,
+            None if wrong.mute else self._flight(pose, velocity),
+            tuple(self._reports),
+            team.heading.copy(),
+            said,
+            (team.heading + team.heading_error) % (2 * np.pi),
+            wrong.picture,
+            tuple(self._events),
+        )
+
+    def _flight(self, pose: CameraPose, velocity: np.ndarray) -> Flight:
+        """What the UAV says of itself."""
+        wrong, place = self._telemetry_errors, pose.place_m
+        ground = float(self._world.up_m(place[None, :2])[0])
+        high = (place[2] - ground) * (1 + wrong[3])
+        said = CameraPose(place, rotation(wrong[:3]) @ pose.axes)
+        heading, pitch, roll = said.angles_rad
+        longitude, latitude = self._lonlat((place[:2] + wrong[4:])[None])[0].tolist()
+        hfov = float(np.radians(self._scenario.camera.hfov_deg))
+        return Flight(
+            float(high),
+            float(np.hypot(velocity[0], velocity[1])),
+            (longitude, latitude),
+            float(self._scenario.world.above_sea_m + ground + high),
+            heading,
+            pitch,
+            roll,
+            hfov,
+        )
+
+    def _bodies(self, wrong: Wrong) -> Bodies:
+        crowds, cars, team = self._crowds, self._cars, self._team
+        people, machines, ugvs = len(crowds), len(cars), len(team)
+        total = people + machines + ugvs
+        place = np.concatenate([crowds.place, cars.place, team.place])
+        plate = np.full((total, 3), np.nan)
+        plate[people + machines :] = self._plates
+        hidden = np.zeros(total, bool)
+        hidden[[people + machines + k for k in wrong.covered if k < ugvs]] = True
+        none = np.zeros(machines + ugvs)
+        return Bodies(
+            np.arange(1, total + 1),
+            np.repeat(np.array(["person", "car", "ugv"]), [people, machines, ugvs]),
+            np.concatenate([crowds.target, self._car_target, self._ugv_target]).astype(np.int64),
+            np.c_[place, self._world.up_m(place)],
+            np.concatenate([crowds.velocity, cars.velocity, team.velocity]),
+            np.concatenate([crowds.facing, cars.course, team.course]),
+            np.concatenate([crowds.height, none]),
+            np.concatenate([crowds.phase, none]),
+            np.concatenate([crowds.colour, cars.colour, np.tile(_UGV_BGR, (ugvs, 1))]),
+            plate,
+            hidden,
+        )

@@ -1,0 +1,208 @@
+"""The UAV: where it flies, how its camera hangs, how gusts move both, and what it says of itself."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.scenario import AircraftKnobs
+from torchvision_dddas.simulation.ways import Way
+from torchvision_dddas.types import CameraPose
+
+ACCELERATION_M_S2 = 3.0
+_AIM_RAD_S, _TURN_RAD_S = np.radians(35.0), np.radians(15.0)
+"""How fast the gimbal moves the middle of the picture, and turns the picture. With the flight below 60 deg/s."""
+_SLANTED = 0.35
+"""Where the camera looks further from below it than this share of its height, the picture's upper edge turns away."""
+_GUST_S, _SHAKE_S = 1.5, 0.5
+"""Time constants of the place and of the angles."""
+_HELD = 0.3
+"""Share of a gust's speed with which a vehicle moves that holds its place."""
+
+
+class Swaying:
+    """Values that sway about 0 smoothly: a critically damped spring that is pushed at random (Matern 3/2).
+
+    Its rate is its true derivative. Standard deviation sigma, (n,), time constant in seconds; started as it goes on.
+    """
+
+    def __init__(self, sigma: np.ndarray, constant_s: float, rng: np.random.Generator) -> None:
+        self._sigma, self._rate, self._rng = np.asarray(sigma, float), 1 / constant_s, rng
+        drawn = rng.standard_normal((2, len(self._sigma)))
+        self.value, self.rate = self._sigma * drawn[0], self._sigma * self._rate * drawn[1]
+
+    def step(self, seconds: float, push: np.ndarray | float = 0.0, rougher: float = 1.0) -> None:
+        """On by so long, exactly; push: a constant acceleration meanwhile; rougher: factor of the random pushes."""
+        k, t = self._rate, seconds
+        decay = np.exp(-k * t)
+        step = decay * np.array([[1 + k * t, t], [-(k**2) * t, 1 - k * t]])
+        rest = np.asarray(push) / k**2  # where it would come to rest under that push
+        moved = step @ np.stack([self.value - rest, self.rate])
+        stationary = np.diag([1.0, k**2])
+        factor = np.linalg.cholesky(stationary - step @ stationary @ step.T + 1e-15 * np.eye(2))
+        noise = factor @ self._rng.standard_normal((2, len(self._sigma))) * self._sigma * rougher
+        self.value, self.rate = moved[0] + noise[0] + rest, moved[1] + noise[1]
+
+
+class _Pursuer:
+    """A point that goes after another with bounded speed and acceleration."""
+
+    def __init__(self, place: np.ndarray, velocity: np.ndarray) -> None:
+        self.place, self.velocity = place.astype(float), velocity.astype(float)
+
+    def step(self, goal: np.ndarray, going: np.ndarray, fastest: float, hardest: float, seconds: float) -> None:
+        """Towards a goal that moves with a velocity `going`; the acceleration is constant over the step."""
+        gap = goal - self.place
+        distance = float(np.linalg.norm(gap))
+        # No faster than it can brake, and gently at the end.
+        closing = min(np.sqrt(hardest * distance), distance / 0.8)
+        wanted = going + gap / max(distance, 1e-9) * closing
+        wanted *= min(1.0, fastest / max(float(np.linalg.norm(wanted)), 1e-9))
+        push = (wanted - self.velocity) / max(0.3, seconds)
+        push *= min(1.0, hardest / max(float(np.linalg.norm(push)), 1e-9))
+        self.place = self.place + seconds * self.velocity + seconds**2 / 2 * push
+        self.velocity = self.velocity + seconds * push
+
+
+class Aircraft:
+    """Flies along its way, or whither it is steered; pose and rates are those of its camera.
+
+    Unsteered it looks at a point that moves along the way, always from the same side and under the same angle.
+    """
+
+    def __init__(
+        self, knobs: AircraftKnobs, half_m: float, up_m: Callable[[np.ndarray], np.ndarray], seed: int
+    ) -> None:
+        self._knobs, self._half, self._up = knobs, half_m, up_m
+        self._way = Way(np.array([knobs.start_m, *knobs.way_m], float), knobs.speed_m_s)
+        self._altitude = knobs.altitude_m
+        self._fly_to: np.ndarray | None = None
+        self._look_at: np.ndarray | None = None
+        self._heading, self._turning = float(np.radians(knobs.heading_deg)), 0.0
+        point, going = self._way.at(0.0)
+        back = self._back_m()
+        for _ in range(8):  # as far back as the ground's heights ask for
+            behind = point - back * self._ahead()
+            rise = knobs.altitude_m + self._ground(behind) - self._ground(point)
+            back = max(rise, 1.0) * self._cotangent()
+        self._relief_m = back - self._back_m()
+        place = np.append(point - back * self._ahead(), 0.0)
+        place[2] = knobs.altitude_m + self._ground(place[:2])
+        aim, still = np.append(point, self._ground(point)), np.append(going, 0.0)
+        self._craft, self._aim = _Pursuer(place, still), _Pursuer(aim, still)
+        gust = knobs.wind_m_s * _HELD * _GUST_S * np.array([1.0, 1.0, 0.5])
+        self._blown = Swaying(gust, _GUST_S, np.random.default_rng([seed, 50]))
+        self._shaken = Swaying(np.full(3, np.radians(knobs.shake_deg)), _SHAKE_S, np.random.default_rng([seed, 51]))
+
+    def _cotangent(self) -> float:
+        return float(1 / np.tan(np.radians(self._knobs.pitch_deg))) if self._knobs.pitch_deg < 90 else 0.0
+
+    def _back_m(self) -> float:
+        """How far behind what it looks at it flies, over level ground."""
+        return self._altitude * self._cotangent()
+
+    def _ahead(self) -> np.ndarray:
+        return np.array([np.sin(self._heading), np.cos(self._heading)])
+
+    def _ground(self, place_m: np.ndarray) -> float:
+        return float(self._up(place_m[None, :2])[0])
+
+    def steer(self, fly_to: np.ndarray | None, look_at: np.ndarray | None, altitude_m: float | None) -> None:
+        """What is None stays as it is. Places in local metres, (2,), taken into the world."""
+        if fly_to is not None:
+            self._fly_to = np.clip(np.asarray(fly_to, float), -self._half, self._half)
+        if look_at is not None:
+            self._look_at = np.clip(np.asarray(look_at, float), -self._half, self._half)
+        if altitude_m is not None:
+            self._altitude = float(np.clip(altitude_m, 2.0, 2000.0))
+
+    def step(self, time_s: float, seconds: float, push: np.ndarray | None = None, rougher: float = 1.0) -> None:
+        """On by so long, to time_s. push: acceleration by a gust, (3,) m/s2; rougher: how much more all shakes."""
+        point, going = self._way.at(time_s)
+        back = (self._back_m() + self._relief_m * (self._cotangent() > 0)) * self._ahead()
+        if self._fly_to is not None:
+            goal, going = self._fly_to, np.zeros(2)
+            point = goal + back
+        else:
+            goal = point - back
+        aim, aim_going = (point, going) if self._look_at is None else (self._look_at, np.zeros(2))
+        craft, target = self._craft, self._aim
+        goal_up = self._altitude + self._ground(craft.place)
+        fastest = max(self._knobs.maximum_m_s, self._knobs.speed_m_s if self._fly_to is None else 0.0)
+        craft.step(np.append(goal, goal_up), np.append(going, 0.0), fastest, ACCELERATION_M_S2, seconds)
+        aim_up = self._ground(target.place)
+        if self._look_at is None:
+            # Hangs as before: the middle of the picture goes with the vehicle.
+            target.step(np.append(aim, aim_up), np.append(aim_going, 0.0), fastest, ACCELERATION_M_S2, seconds)
+        else:
+            height = max(craft.place[2] - target.place[2], 1.0)
+            swift = _AIM_RAD_S * height
+            target.step(np.append(aim, aim_up), np.append(aim_going, 0.0), swift, 3 * swift, seconds)
+        self._turn(seconds)
+        self._blown.step(seconds, 0.0 if push is None else push, rougher)
+        self._shaken.step(seconds, 0.0, rougher)
+
+    def _turn(self, seconds: float) -> None:
+        """The picture's upper edge turns to where the camera looks, if that is aslant and was asked for."""
+        to = self._aim.place - self._craft.place
+        slanted = np.hypot(to[0], to[1]) > _SLANTED * abs(to[2])
+        error = 0.0
+        if self._look_at is not None and slanted:
+            error = float((np.arctan2(to[0], to[1]) - self._heading + np.pi) % (2 * np.pi) - np.pi)
+        wanted = float(np.clip(1.5 * error, -_TURN_RAD_S, _TURN_RAD_S))
+        push = float(np.clip((wanted - self._turning) / max(0.3, seconds), -1.0, 1.0))
+        self._heading += seconds * self._turning + seconds**2 / 2 * push
+        self._turning += seconds * push
+
+    def _pose(self, ahead_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Place and axes, moved on by the rates for a moment."""
+        craft = self._craft.place + ahead_s * self._craft.velocity
+        aim = self._aim.place + ahead_s * self._aim.velocity
+        heading = self._heading + ahead_s * self._turning
+        forward = (aim - craft) / np.linalg.norm(aim - craft)
+        right = np.cross(forward, [np.sin(heading), np.cos(heading), 0.0])
+        right /= np.linalg.norm(right)
+        hung = np.stack([right, np.cross(forward, right), forward], axis=1)
+        shaken = rotation(self._shaken.value + ahead_s * self._shaken.rate)
+        return craft + self._blown.value + ahead_s * self._blown.rate, hung @ shaken
+
+    def pose(self) -> tuple[CameraPose, np.ndarray, np.ndarray]:
+        """The pose, velocity (3,) m/s and turn (3,) rad/s about east, north, up."""
+        place, hung = self._pose(0.0)
+        tiny = 1e-5
+        change = (self._pose(tiny)[1] - self._pose(-tiny)[1]) / (2 * tiny) @ hung.T
+        turn = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
+        return CameraPose(place, hung), self._craft.velocity + self._blown.rate, turn
+
+
+class Telemetry:
+    """What the UAV says of itself: lasting errors of the knobs' standard deviations, and a tenth of it anew.
+
+    Angles near straight down are what they are: a heading that swings with a tiny tilt, and a roll that undoes it.
+    """
+
+    NEW = 0.1
+
+    def __init__(self, knobs: AircraftKnobs, seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 52])
+        tilt, heading = np.radians(knobs.angle_error_deg), np.radians(knobs.heading_error_deg)
+        self._sigma = np.array([tilt, tilt, heading, knobs.altitude_error])
+        self._lasting = self._sigma * self._rng.standard_normal(4)
+        self.receiver = Receivers(1, knobs.place_error95_m, 0.02, 60.0, 0.0, self._rng)
+
+    def errors(self, seconds: float) -> np.ndarray:
+        """(6,) rotation about east, north and up, rad; share of the altitude; metres east, north; so much later."""
+        self.receiver.advance(seconds)
+        new = self.NEW * self._sigma * self._rng.standard_normal(4)
+        wrong = self._lasting + new
+        return np.array([wrong[0], wrong[1], -wrong[2], wrong[3], *self.receiver.error_m[0]])
+
+
+def rotation(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) that turns by the length of a vector (3,), in radians, about it (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

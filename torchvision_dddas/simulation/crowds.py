@@ -1,0 +1,387 @@
+"""People in crowds: how they hold together, keep apart, walk, join, split and scatter.
+
+A crowd has a middle that goes its way; everyone in it has a place about that middle, goes with it, strays a little, and
+gives way to others. Behaviours and speeds follow appendix A, section V.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from torchvision_dddas.simulation.neighbours import pairs
+from torchvision_dddas.simulation.obstacles import Obstacles
+from torchvision_dddas.simulation.scenario import CrowdPlan, Happening
+
+UNIT_S = 2.0
+"""The source's time unit, which it does not give in seconds: with two, 1.11 to 3.34 m a unit is a walker's speed."""
+SLOWEST_M, FASTEST_M = 1.11, 3.34
+"""Metres a unit, along east and along north each, of a crowd that goes at random."""
+BODY_M = 0.5
+"""Middles of two people are no nearer."""
+_MARGIN_M = 10.0
+_PERSONAL_M = 0.8
+_PATIENCE_S = 120.0
+_RUN_M_S = (2.5, 4.0)
+_STAND, _HEADING, _WAY, _RANDOM, _MEET = range(5)
+_SHIRTS = np.array(
+    [
+        [225, 225, 225], [200, 205, 210], [60, 60, 62], [40, 38, 38], [95, 80, 70], [120, 95, 75], [70, 75, 110],
+        [90, 110, 130], [140, 150, 160], [75, 95, 85], [110, 120, 105], [165, 150, 140], [60, 70, 120], [150, 130, 100],
+    ],
+    float,
+)  # fmt: skip
+
+
+@dataclass
+class _Groups:
+    """One row a crowd. way: (G, W, 2), the first `places` of them count; at, step: whither it goes among them."""
+
+    number: np.ndarray
+    middle: np.ndarray
+    velocity: np.ndarray
+    radius: np.ndarray
+    behaviour: np.ndarray
+    speed: np.ndarray
+    course: np.ndarray
+    from_s: np.ndarray
+    way: np.ndarray
+    places: np.ndarray
+    at: np.ndarray
+    step: np.ndarray
+    unit: np.ndarray
+    meeting: np.ndarray
+
+    def add(self, row: int, count: int) -> np.ndarray:
+        """The rows of new crowds that are like one there is."""
+        before = len(self.number)
+        for one in fields(self):
+            values = getattr(self, one.name)
+            setattr(self, one.name, np.concatenate([values, np.repeat(values[row : row + 1], count, axis=0)]))
+        return np.arange(before, before + count)
+
+
+@dataclass
+class _Meeting:
+    """Crowds that walk to one place, at the latest until a time, and how the first goes on then."""
+
+    rows: list[int]
+    place: np.ndarray
+    until_s: float
+    behaviour: int
+    speed_m_s: float
+    course_rad: float
+
+
+class Crowds:
+    """All people of a world, as plain arrays: place, velocity (N, 2), facing (N,), phase (N,) and what they look like.
+
+    group: (N,) the row of each one's crowd; target: (N,) its number. numbers: the next crowd gets the next one.
+    """
+
+    def __init__(
+        self,
+        plans: tuple[CrowdPlan, ...],
+        happenings: tuple[Happening, ...],
+        side_m: float,
+        obstacles: Obstacles,
+        seed: int,
+        next_number: int,
+    ) -> None:
+        self._half, self._obstacles, self._next = side_m / 2, obstacles, next_number
+        self._margin = min(_MARGIN_M, side_m / 8)
+        self._rng = np.random.default_rng([seed, 10])
+        self._happenings = sorted(happenings, key=lambda one: one.time_s)
+        self._done = 0
+        self._meetings: list[_Meeting] = []
+        self._groups = _groups_of(plans, self._half - self._margin)
+        people = np.array([plan.people for plan in plans], int)
+        self.group = np.repeat(np.arange(len(plans)), people)
+        count = len(self.group)
+        self._slot = np.concatenate(
+            [np.zeros((0, 2)), *(_slots(n, plan.radius_m, self._rng) for n, plan in zip(people, plans, strict=True))]
+        )
+        edge = self._half - 1.0
+        self.place = self._free((self._groups.middle[self.group] + self._slot).clip(-edge, edge))
+        self._slot = self.place - self._groups.middle[self.group]
+        self.velocity = np.zeros((count, 2))
+        self.facing = self._groups.course[self.group] + self._rng.normal(0, 0.4, count)
+        standing = self._groups.behaviour[self.group] == _STAND
+        self.facing = np.where(standing, self._rng.uniform(-np.pi, np.pi, count), self.facing) % (2 * np.pi)
+        self.phase = self._rng.uniform(0, 1, count)
+        self.height = self._rng.normal(1.72, 0.08, count).clip(1.5, 1.95)
+        shade = self._rng.uniform(0.85, 1.15, (count, 1))
+        self.colour = (_SHIRTS[self._rng.integers(0, len(_SHIRTS), count)] * shade).clip(0, 255)
+        self._stray = self._rng.normal(0, 1, (count, 2))
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    @property
+    def target(self) -> np.ndarray:
+        """(N,) int64, the number of each one's crowd."""
+        return self._groups.number[self.group]
+
+    def _free(self, place: np.ndarray) -> np.ndarray:
+        """Places outside of all that stands, and no two in one place."""
+        for _ in range(30):
+            place = self._obstacles.outside(_apart(place, pairs(place, BODY_M), 0.55))
+        return place
+
+    def step(self, time_s: float, seconds: float, vehicles: np.ndarray) -> list[str]:
+        """On by so long, to time_s, past vehicles (V, 2); what happened, in words."""
+        said = self._happen(time_s)
+        if not len(self):
+            return said
+        self._lead(time_s, seconds)
+        groups, mine = self._groups, self.group
+        started = (time_s >= groups.from_s) & (groups.behaviour != _STAND)
+        goal = groups.middle[mine] + self._slot
+        wanted = groups.velocity[mine] + (goal - self.place) / 1.5
+        # Those behind go faster, but nobody much.
+        most = np.where(started, 1.5 * groups.speed + 0.4, 0.4)[mine]
+        speed = np.linalg.norm(wanted, axis=1)
+        wanted = wanted * np.minimum(1.0, most / np.maximum(speed, 1e-9))[:, None]
+        kept = np.exp(-seconds / 3.0)
+        self._stray = kept * self._stray + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._stray.shape)
+        wanted = wanted + np.where(started, 0.12, 0.03)[mine, None] * self._stray
+        near = pairs(self.place, _PERSONAL_M)
+        wanted = self._obstacles.steer(self.place, wanted, 0.5)
+        wanted = wanted + self._give_way(near) + self._past(vehicles)
+        velocity = wanted + (self.velocity - wanted) * np.exp(-seconds / 0.35)
+        place = _apart(self.place + seconds * velocity, near, BODY_M)
+        place = self._obstacles.outside(place).clip(-self._half + 1, self._half - 1)
+        self.velocity = (place - self.place) / seconds
+        self.place = place
+        self._walk(seconds)
+        return said
+
+    def _walk(self, seconds: float) -> None:
+        """Legs move with the way gone, faces turn to where it goes."""
+        speed = np.linalg.norm(self.velocity, axis=1)
+        stride = 0.8 * self.height * np.sqrt(np.clip(speed / 1.4, 0.25, 4.0))
+        self.phase = (self.phase + speed * seconds / stride) % 1.0
+        ahead = np.arctan2(self.velocity[:, 0], self.velocity[:, 1])
+        error = (ahead - self.facing + np.pi) % (2 * np.pi) - np.pi
+        turned = error * (1 - np.exp(-seconds / 0.3)) * np.clip((speed - 0.1) / 0.4, 0, 1)
+        self.facing = (self.facing + turned) % (2 * np.pi)
+
+    def _give_way(self, near: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """(N, 2) velocities away from those who come too near."""
+        first, second = near
+        away = self.place[first] - self.place[second]
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        push = away * (0.8 * (1 - distance / _PERSONAL_M) / distance)[:, None]
+        return _summed(push, first, len(self)) - _summed(push, second, len(self))
+
+    def _past(self, vehicles: np.ndarray) -> np.ndarray:
+        """(N, 2) velocities away from vehicles that are near."""
+        found = np.zeros_like(self.place)
+        for vehicle in vehicles:
+            away = self.place - vehicle
+            distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+            found += away * (1.5 * np.clip(1 - distance / 2.5, 0, 1) / distance)[:, None]
+        return found
+
+    def _lead(self, time_s: float, seconds: float) -> None:
+        """The middles of the crowds go on."""
+        groups = self._groups
+        self._draw(time_s)
+        rows = np.arange(len(groups.number))
+        goal = np.where((groups.behaviour == _MEET)[:, None], groups.meeting, groups.way[rows, groups.at])
+        to = goal - groups.middle
+        distance = np.linalg.norm(to, axis=1)
+        aimed = (groups.behaviour == _WAY) | (groups.behaviour == _MEET)
+        course = np.where(aimed, np.arctan2(to[:, 0], to[:, 1]), groups.course)
+        going = (groups.behaviour != _STAND) & (time_s >= groups.from_s)
+        speed = np.where(going, groups.speed, 0.0)
+        speed = np.where(aimed, np.minimum(speed, distance / max(seconds, 0.1)), speed)
+        # It waits for those who fall behind.
+        late = np.linalg.norm(groups.middle[self.group] + self._slot - self.place, axis=1)
+        count = np.maximum(np.bincount(self.group, minlength=len(rows)), 1)
+        late = np.bincount(self.group, late, minlength=len(rows)) / count
+        speed = speed * np.clip(1 - (late - 1.5) / 3, 0, 1)
+        heading = np.stack([np.sin(course), np.cos(course)], axis=1)
+        groups.course = course
+        limit = np.maximum(self._half - self._margin - groups.radius, 1.0)[:, None]
+        # Back from the edge, as a ball from a cushion.
+        out = (np.abs(groups.middle) > limit) & (np.sign(heading) == np.sign(groups.middle)) & ~aimed[:, None]
+        heading = np.where(out, -heading, heading)
+        groups.course = np.arctan2(heading[:, 0], heading[:, 1])
+        groups.velocity = self._obstacles.steer(groups.middle, heading * speed[:, None], 1.0)
+        groups.middle = groups.middle + seconds * groups.velocity
+        reached = (groups.behaviour == _WAY) & (distance < np.maximum(0.5, groups.speed * seconds)) & going
+        ahead = groups.at + groups.step
+        turn = reached & ((ahead < 0) | (ahead >= groups.places))
+        groups.step = np.where(turn, -groups.step, groups.step)
+        groups.at = np.where(reached, (groups.at + groups.step).clip(0, groups.places - 1), groups.at)
+
+    def _draw(self, time_s: float) -> None:
+        """New velocities, each time unit, for crowds that go at random."""
+        groups = self._groups
+        unit = np.floor((time_s - 1e-9) / UNIT_S).astype(int)
+        due = (groups.behaviour == _RANDOM) & (groups.unit != unit)
+        if due.any():
+            many = int(due.sum())
+            steps = self._rng.uniform(SLOWEST_M, FASTEST_M, (many, 2)) * self._rng.choice([-1.0, 1.0], (many, 2))
+            groups.speed[due] = np.linalg.norm(steps, axis=1) / UNIT_S
+            groups.course[due] = np.arctan2(steps[:, 0], steps[:, 1])
+            groups.unit[due] = unit
+
+    def _happen(self, time_s: float) -> list[str]:
+        said = []
+        while self._done < len(self._happenings) and self._happenings[self._done].time_s <= time_s + 1e-9:
+            happening = self._happenings[self._done]
+            self._done += 1
+            rows = [one - 1 for one in happening.crowds]
+            if happening.what == "join":
+                said += self._walk_together(rows, time_s)
+            else:
+                for row in rows:
+                    said += self._split(row, happening.turn_deg) if happening.what == "split" else self._scatter(row)
+        return said + self._meet(time_s)
+
+    def _walk_together(self, rows: list[int], time_s: float) -> list[str]:
+        groups = self._groups
+        rows = [row for row in rows if (self.group == row).any()]
+        if len(rows) < 2:
+            return []
+        place = groups.middle[rows].mean(axis=0)
+        first = rows[0]
+        then = int(groups.behaviour[first]), float(groups.speed[first]), float(groups.course[first])
+        self._meetings.append(_Meeting(rows, place, time_s + _PATIENCE_S, *then))
+        groups.meeting[rows] = place
+        groups.behaviour[rows] = _MEET
+        groups.speed[rows] = np.maximum(groups.speed[rows], 1.0)
+        groups.from_s[rows] = np.minimum(groups.from_s[rows], time_s)
+        return [f"crowds {_listed(groups.number[rows])} walk to one another"]
+
+    def _meet(self, time_s: float) -> list[str]:
+        """Crowds that have come together are one."""
+        groups, said = self._groups, []
+        for meeting in list(self._meetings):
+            rows, first = meeting.rows, meeting.rows[0]
+            reach = np.sqrt((groups.radius[rows] ** 2).sum())
+            away = np.linalg.norm(groups.middle[rows] - meeting.place, axis=1)
+            if (away > np.maximum(0.5 * reach, 1.0)).any() and time_s < meeting.until_s:
+                continue
+            self._meetings.remove(meeting)
+            numbers = groups.number[rows].copy()
+            mine = np.isin(self.group, rows)
+            self.group[mine] = first
+            self._gather(first)
+            groups.behaviour[first], groups.speed[first] = meeting.behaviour, meeting.speed_m_s
+            groups.course[first], groups.unit[first] = meeting.course_rad, -1
+            said.append(f"crowds {_listed(numbers)} are one, crowd {numbers[0]}")
+        return said
+
+    def _gather(self, row: int) -> None:
+        """A crowd's middle and places anew, by where its people are; those far out come nearer."""
+        mine = np.flatnonzero(self.group == row)
+        middle = self.place[mine].mean(axis=0)
+        away = self.place[mine] - middle
+        radius = max(0.4 * np.sqrt(len(mine)), float(np.median(np.linalg.norm(away, axis=1))) * np.sqrt(2))
+        self._groups.middle[row], self._groups.radius[row] = middle, radius
+        far = np.linalg.norm(away, axis=1)
+        self._slot[mine] = away * np.minimum(1.0, radius / np.maximum(far, 1e-9))[:, None]
+
+    def _split(self, row: int, turn_deg: float) -> list[str]:
+        groups = self._groups
+        mine = np.flatnonzero(self.group == row)
+        if len(mine) < 2:
+            return []
+        course, turn = groups.course[row], np.radians(turn_deg)
+        aside = (self.place[mine] - self.place[mine].mean(axis=0)) @ [np.cos(course), -np.sin(course)]
+        # The right half turns to the right.
+        leaving = mine[np.argsort(aside, kind="stable")[len(mine) - len(mine) // 2 :]]
+        new = groups.add(row, 1)
+        self.group[leaving] = new
+        groups.number[new] = self._next
+        self._next += 1
+        groups.course[new] = course + turn
+        if groups.behaviour[row] in (_STAND, _WAY, _MEET):
+            groups.behaviour[new] = _HEADING
+        groups.speed[new] = np.where(groups.speed[new] > 0, groups.speed[new], 1.4)
+        groups.from_s[new] = 0.0
+        for one in (row, int(new[0])):
+            self._gather(one)
+        old, number = groups.number[row], groups.number[new[0]]
+        return [f"crowd {old} splits: {len(leaving)} of {len(mine)} are now crowd {number}"]
+
+    def _scatter(self, row: int) -> list[str]:
+        groups = self._groups
+        mine = np.flatnonzero(self.group == row)
+        if not len(mine):
+            return []
+        new, number = groups.add(row, len(mine)), groups.number[row]
+        away = self.place[mine] - self.place[mine].mean(axis=0)
+        self.group[mine], self._slot[mine] = new, 0.0
+        groups.number[new] = self._next + np.arange(len(mine))
+        self._next += len(mine)
+        groups.middle[new], groups.radius[new], groups.from_s[new] = self.place[mine], 0.0, 0.0
+        groups.behaviour[new] = _HEADING
+        groups.course[new] = np.arctan2(away[:, 0], away[:, 1]) + self._rng.normal(0, 0.4, len(mine))
+        groups.speed[new] = self._rng.uniform(*_RUN_M_S, len(mine))
+        return [f"the {len(mine)} of crowd {number} scatter"]
+
+
+def _groups_of(plans: tuple[CrowdPlan, ...], limit_m: float) -> _Groups:
+    """The crowds as planned, numbered from 1."""
+    many, longest = len(plans), max([len(plan.way_m) for plan in plans], default=0) or 1
+    way = np.zeros((many, longest, 2))
+    for row, plan in enumerate(plans):
+        way[row, : len(plan.way_m)] = np.array(plan.way_m, float).reshape(-1, 2)
+    kinds = {"stand": _STAND, "random": _RANDOM}
+
+    def each(values: list[float]) -> np.ndarray:
+        return np.array(values, float)
+
+    return _Groups(
+        number=np.arange(1, many + 1),
+        middle=np.array([plan.start_m for plan in plans], float).reshape(-1, 2),
+        velocity=np.zeros((many, 2)),
+        radius=each([_radius(plan.people, plan.radius_m) for plan in plans]),
+        behaviour=np.array([kinds.get(p.behaviour, _WAY if p.way_m else _HEADING) for p in plans], int),
+        speed=each([plan.speed_m_s for plan in plans]),
+        course=np.radians(each([plan.heading_deg for plan in plans])),
+        from_s=each([plan.from_s for plan in plans]),
+        way=way.clip(-limit_m, limit_m),
+        places=np.array([max(len(plan.way_m), 1) for plan in plans], int),
+        at=np.zeros(many, int),
+        step=np.ones(many, int),
+        unit=np.full(many, -1),
+        meeting=np.zeros((many, 2)),
+    )
+
+
+def _radius(people: int, radius_m: float) -> float:
+    """Of a disc in which so many have room; one alone is its own middle."""
+    return max(radius_m, 0.36 * float(np.sqrt(people))) if people > 1 else 0.0
+
+
+def _slots(people: int, radius_m: float, rng: np.random.Generator) -> np.ndarray:
+    """(N, 2) places in a disc, apart from one another (a sunflower's), no two crowds alike."""
+    reach = _radius(people, radius_m)
+    away = reach * np.sqrt((np.arange(people) + 0.5) / max(people, 1))
+    turn = np.arange(people) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    slots = np.stack([away * np.cos(turn), away * np.sin(turn)], axis=1)
+    return slots + rng.uniform(-0.5, 0.5, slots.shape) * reach / np.sqrt(max(people, 1))
+
+
+def _apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: float) -> np.ndarray:
+    """(N, 2) places, those of pairs that are too near moved half the way apart each."""
+    first, second = near
+    for _ in range(2):
+        away = place[first] - place[second]
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        push = away * (0.5 * np.clip(least_m - distance, 0, None) / distance)[:, None]
+        place = place + _summed(push, first, len(place)) - _summed(push, second, len(place))
+    return place
+
+
+def _summed(values: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:
+    """(count, 2) sums of values (P, 2) by row."""
+    return np.stack([np.bincount(row, values[:, axis], minlength=count) for axis in (0, 1)], axis=1)
+
+
+def _listed(numbers: np.ndarray) -> str:
+    return " and ".join(str(int(number)) for number in numbers)

@@ -1,0 +1,116 @@
+"""What stands in the way: how those who move go round it."""
+
+from typing import Protocol
+
+import numpy as np
+
+_CELL_M = 4.0
+_REACH_M = 8.0
+_NEAREST = 6
+"""So many things, those whose edges are nearest, are looked at from a cell."""
+
+
+class Things(Protocol):
+    """What stands in a world, one row a thing. kind: str; east_north_m: (K, 2); radius_m: (K,)."""
+
+    @property
+    def kind(self) -> np.ndarray | tuple[str, ...]: ...  # noqa: D102
+    @property
+    def east_north_m(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def radius_m(self) -> np.ndarray: ...  # noqa: D102
+
+
+class Obstacles:
+    """Round things on the ground, found by the cell that one is in. Nobody walks through trees and buildings.
+
+    Bushes are gone round where there is room, and trodden down where there is none.
+    """
+
+    def __init__(self, things: Things, side_m: float) -> None:
+        self.place = np.asarray(things.east_north_m, float).reshape(-1, 2)
+        self.radius = np.asarray(things.radius_m, float).reshape(-1)
+        self.hard = np.array([str(kind) != "bush" for kind in things.kind], bool)
+        self._half, self._across = side_m / 2, max(1, int(np.ceil(side_m / _CELL_M)))
+        self._table = self._near_cells()
+        # Row -1 of the table stands for nothing: infinitely far.
+        self._places = np.concatenate([self.place, [[1e9, 1e9]]])
+        self._radii = np.append(self.radius, 0.0)
+        self._hards = np.append(self.hard, False)
+
+    def _near_cells(self) -> np.ndarray:
+        """(cells, _NEAREST) int64, the things near each cell, -1 for none."""
+        table = np.full((self._across**2, _NEAREST), -1, np.int64)
+        if not len(self.place):
+            return table
+        cells, things, away = [], [], []
+        low = np.floor((self.place - (self.radius + _REACH_M)[:, None] + self._half) / _CELL_M).astype(int)
+        high = np.floor((self.place + (self.radius + _REACH_M)[:, None] + self._half) / _CELL_M).astype(int)
+        for k, (first, last) in enumerate(zip(low.clip(0), high.clip(max=self._across - 1), strict=True)):
+            column, row = np.meshgrid(np.arange(first[0], last[0] + 1), np.arange(first[1], last[1] + 1))
+            middle = (np.stack([column, row], -1) + 0.5) * _CELL_M - self._half
+            distance = np.linalg.norm(middle - self.place[k], axis=-1) - self.radius[k]
+            cells.append((row * self._across + column).ravel())
+            away.append(distance.ravel())
+            things.append(np.full(distance.size, k))
+        cell, thing, distance = np.concatenate(cells), np.concatenate(things), np.concatenate(away)
+        order = np.lexsort((distance, cell))
+        cell, thing = cell[order], thing[order]
+        rank = np.arange(len(cell)) - np.searchsorted(cell, cell)
+        kept = rank < _NEAREST
+        table[cell[kept], rank[kept]] = thing[kept]
+        return table
+
+    def _near(self, place: np.ndarray) -> np.ndarray:
+        """(N, _NEAREST) the things near places, -1 for none."""
+        index = np.floor((place + self._half) / _CELL_M).astype(int).clip(0, self._across - 1)
+        return self._table[index[:, 1] * self._across + index[:, 0]]
+
+    def steer(self, place: np.ndarray, velocity: np.ndarray, clear_m: float) -> np.ndarray:
+        """(N, 2) velocities, as fast as those wanted, that pass what is ahead at clear_m from its edge."""
+        near = self._near(place) if len(self.place) else np.zeros((len(place), 0), np.int64)
+        if not (near >= 0).any():
+            return velocity
+        return round_discs(place, velocity, self._places[near], self._radii[near] + clear_m)
+
+    def outside(self, place: np.ndarray, clear_m: float = 0.3) -> np.ndarray:
+        """(N, 2) the places, moved out of trees and buildings."""
+        if not len(self.place):
+            return place
+        near = self._near(place)
+        away = place[:, None] - self._places[near]
+        distance = np.linalg.norm(away, axis=2)
+        inside = np.where(self._hards[near], self._radii[near] + clear_m - distance, 0.0).clip(0)
+        deepest = inside.argmax(axis=1)
+        rows = np.arange(len(place))
+        direction = away[rows, deepest] / np.maximum(distance[rows, deepest], 1e-6)[:, None]
+        return place + inside[rows, deepest, None] * direction
+
+
+def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """(N, 2) velocities that pass the first of (N, M) discs that lie ahead along its tangent.
+
+    place, velocity: (N, 2). centre: (N, M, 2); radius: (N, M), clearance included.
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    ahead = velocity / np.maximum(speed, 1e-9)[:, None]
+    to = centre - place[:, None]
+    along = (to * ahead[:, None]).sum(axis=2)
+    # Positive: the disc's middle is to the left.
+    left = ahead[:, None, 0] * to[..., 1] - ahead[:, None, 1] * to[..., 0]
+    reach = np.maximum(3.0, 2.0 * speed)[:, None] + radius
+    hit = (along > 0) & (along < reach) & (np.abs(left) < radius) & (speed[:, None] > 1e-6)
+    if not hit.any():
+        return velocity
+    row = np.flatnonzero(hit.any(axis=1))
+    first = np.where(hit[row], along[row], np.inf).argmin(axis=1)
+    to, left, radius = to[row, first], left[row, first], radius[row, first]
+    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
+    # Inside the clearance: along the edge, and a little outward.
+    turn = np.where(distance > radius, np.arcsin(np.minimum(radius / distance, 1.0)), np.pi / 2 + 0.3)
+    turn = np.where(left > 0, -turn, turn)
+    cos, sin = np.cos(turn), np.sin(turn)
+    way = np.stack([cos * to[:, 0] - sin * to[:, 1], sin * to[:, 0] + cos * to[:, 1]], axis=1) / distance[:, None]
+    turned = velocity.copy()
+    turned[row] = speed[row, None] * way
+    return turned

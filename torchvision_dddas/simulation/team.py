@@ -1,0 +1,175 @@
+"""The ground vehicles: how they drive and look, and the colours that they wear."""
+
+from collections.abc import Sequence
+from copy import deepcopy
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.simulation.obstacles import Obstacles, round_discs
+from torchvision_dddas.simulation.scenario import AircraftKnobs, TeamKnobs
+from torchvision_dddas.simulation.ways import Way
+from torchvision_dddas.types import Colours
+
+ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
+_ROOM_M = 1.6
+"""How far from another's middle they pass it."""
+_HEADING_SIGMA_RAD = float(np.radians(2.0))
+_FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
+"""gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring."""
+_HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
+"""In OpenCV's units; those furthest from sand and scrub come first."""
+
+
+def plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
+    """Names, the plates' colours (K, 3) BGR, and the ranges in which a picture shows them; 12 at most.
+
+    The ranges do not overlap: hues are 15 apart, in steps of two degrees, and 7 to either side are theirs.
+    """
+    hue = np.array(_HUES[:count], int)
+    hsv = np.stack([hue, np.full(count, 235), np.full(count, 225)], axis=1).astype(np.uint8)
+    bgr = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0].astype(float) if count else np.zeros((0, 3))
+    low = np.stack([(hue - 7) % 180, np.full(count, 90), np.full(count, 50)], axis=1)
+    high = np.stack([hue + 7, np.full(count, 255), np.full(count, 255)], axis=1)
+    names = tuple(f"ugv{k + 1}" for k in range(count))
+    return names, bgr, Colours(names, low.astype(np.int64), high.astype(np.int64))
+
+
+class Team:
+    """All ground vehicles as plain arrays: place (K, 2), course, heading (of the camera), speed (K,)."""
+
+    def __init__(self, knobs: TeamKnobs, flight: AircraftKnobs, side_m: float, obstacles: Obstacles, seed: int) -> None:
+        count = knobs.ugvs
+        self._knobs, self._half, self._obstacles, self._seed = knobs, side_m / 2, obstacles, seed
+        rng = np.random.default_rng([seed, 30])
+        self.names = plates(count)[0]
+        turn = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 1)
+        self._spoke = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+        self._middle = np.array(knobs.middle_m, float)
+        self._way = Way(np.array([flight.start_m, *flight.way_m], float), flight.speed_m_s)
+        self.place = self._inside(obstacles.outside(self._middle + knobs.ring_m * self._spoke, 1.5))
+        self._start = self.place.copy()
+        self.course = rng.uniform(0, 2 * np.pi, count)
+        self.speed = np.zeros(count)
+        self.heading = self.course.copy()
+        self.heading_error = _HEADING_SIGMA_RAD * rng.standard_normal(count)
+        self._passed = np.zeros(count, int)
+        self._ordered = np.full((count, 2), np.nan)
+        self._ordered_speed = np.zeros(count)
+        self._look_at = np.full((count, 2), np.nan)
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """(K, 2)."""
+        return self.speed[:, None] * _ahead(self.course)
+
+    def order(self, row: int, goal_m: np.ndarray, speed_m_s: float, look_at_m: np.ndarray | None) -> None:
+        """Go to a place, in local metres, and look at another."""
+        if np.isfinite(goal_m).all():
+            self._ordered[row] = self._inside(np.asarray(goal_m, float)[None])[0]
+            self._ordered_speed[row] = max(speed_m_s, 0.0)
+        self._look_at[row] = np.nan if look_at_m is None else look_at_m
+
+    def step(self, time_s: float, seconds: float, lost: Sequence[int], people: np.ndarray) -> None:
+        """On by so long, to time_s; the lost stand still. people: (M, 2), before whom they stop."""
+        goal, most = self._goals(time_s)
+        to = goal - self.place
+        distance = np.linalg.norm(to, axis=1)
+        arrived = distance < 0.3
+        # As fast as it can still brake.
+        wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
+        direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
+        direction = self._obstacles.steer(self.place, direction, 1.2)
+        direction = self._round_one_another(direction, distance)
+        error = _wrapped(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
+        turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
+        wanted = np.where(arrived, 0.0, wanted * np.clip(np.cos(error), 0, 1))
+        wanted = np.minimum(wanted, self._clear(people))
+        stopped = np.isin(np.arange(len(self)), list(lost))
+        wanted, turn = np.where(stopped, 0.0, wanted), np.where(stopped, 0.0, turn)
+        hardest = ACCELERATION_M_S2 * seconds
+        self.speed = np.maximum(self.speed + np.clip(wanted - self.speed, -2 * hardest, hardest), 0.0)
+        # A vehicle that is lost stands at once: its place is what the team knew last.
+        self.speed = np.where(stopped, 0.0, self.speed)
+        place = self.place + (seconds * self.speed)[:, None] * _ahead(self.course + turn * seconds / 2)
+        self.place = np.where(stopped[:, None], self.place, self._inside(self._obstacles.outside(place, 0.6)))
+        self.course = (self.course + turn * seconds) % (2 * np.pi)
+        self._pan(seconds, stopped)
+
+    def waypoints(self, time_s: float, seconds: float, times_s: np.ndarray, lost: Sequence[int]) -> np.ndarray:
+        """(T, K, 2) where they mean to be at coming times, as far as they know: people may stop them."""
+        ahead, now, found = deepcopy(self), time_s, []
+        for time in times_s:
+            while now < time - 1e-6:
+                step = min(seconds, float(time) - now)
+                now += step
+                ahead.step(now, step, lost, np.zeros((0, 2)))
+            found.append(ahead.place.copy())
+        return np.array(found).reshape(len(times_s), len(self), 2)
+
+    def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 2) whither, (K,) how fast."""
+        knobs, patrol = self._knobs, self._knobs.patrol
+        speed = np.full(len(self), knobs.patrol_m_s)
+        if patrol == "random":
+            goal = np.array([self._random(k, int(n)) for k, n in enumerate(self._passed)]).reshape(-1, 2)
+            there = np.linalg.norm(goal - self.place, axis=1) < 1.0
+            self._passed = self._passed + there
+        elif patrol == "gather":
+            goal = self._middle + min(_GATHERED_M, knobs.ring_m) * self._spoke
+            far = np.linalg.norm(goal - self.place, axis=1) > _NEAR_M
+            speed = np.where(far, _FAST * speed, speed)
+        elif patrol == "along":
+            middle, going = self._way.at(time_s)
+            goal = middle + self._start - self._way.at(0.0)[0]
+            speed = np.full(len(self), 1.5 * float(np.linalg.norm(going)) + 0.2)
+        else:
+            goal = self._start.copy()
+        sent = np.isfinite(self._ordered[:, 0])
+        goal = np.where(sent[:, None], self._ordered, goal)
+        return self._inside(goal), np.where(sent, self._ordered_speed, speed)
+
+    def _random(self, k: int, n: int) -> np.ndarray:
+        """(2,) the n-th place of a vehicle within the ring."""
+        rng = np.random.default_rng([self._seed, 31, k, n])
+        reach, turn = self._knobs.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+        return self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
+
+    def _round_one_another(self, direction: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        if len(self) < 2:
+            return direction
+        others = np.array([np.delete(np.arange(len(self)), k) for k in range(len(self))])
+        return round_discs(self.place, direction, self.place[others], np.full(others.shape, _ROOM_M))
+
+    def _clear(self, people: np.ndarray) -> np.ndarray:
+        """(K,) how fast they may go for who is ahead of them."""
+        if not len(people) or not len(self):
+            return np.full(len(self), np.inf)
+        ahead = _ahead(self.course)
+        to = people[None] - self.place[:, None]
+        along = (to * ahead[:, None]).sum(axis=2)
+        aside = np.abs(ahead[:, None, 1] * to[..., 0] - ahead[:, None, 0] * to[..., 1])
+        room = np.where((along > 0) & (aside < 1.0), along, np.inf).min(axis=1)
+        return np.sqrt(2 * ACCELERATION_M_S2 * np.maximum(room - 1.8, 0))
+
+    def _pan(self, seconds: float, stopped: np.ndarray) -> None:
+        to = self._look_at - self.place
+        wanted = np.where(np.isfinite(to[:, 0]), np.arctan2(to[:, 0], to[:, 1]), self.course)
+        error = _wrapped(wanted - self.heading)
+        turned = np.clip(error, -PAN_RAD_S * seconds, PAN_RAD_S * seconds)
+        self.heading = (self.heading + np.where(stopped, 0.0, turned)) % (2 * np.pi)
+
+    def _inside(self, place: np.ndarray) -> np.ndarray:
+        edge = self._half - min(3.0, self._half / 4)
+        return place.clip(-edge, edge)
+
+
+def _ahead(course: np.ndarray) -> np.ndarray:
+    return np.stack([np.sin(course), np.cos(course)], axis=1)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
