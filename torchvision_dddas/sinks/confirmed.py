@@ -10,8 +10,11 @@ from typing import Any
 
 from torchvision_dddas.sinks.journal import NAME, Record
 from torchvision_dddas.sinks.output import RunFolder
+from torchvision_dddas.sinks.positions import COLUMNS as POSITION_COLUMNS
+from torchvision_dddas.sinks.positions import DEGREES
 from torchvision_dddas.sinks.tables import TextFiles
-from torchvision_dddas.types import Confirmed
+from torchvision_dddas.sinks.whole import remove
+from torchvision_dddas.types import Confirmed, Positions, Surveyed
 
 COLUMNS = ("kind", "probability", "seen_by", "people", "nearest_m", "nearest_sigmas", "best_score")
 """What is added to the blobs' own columns; a column of theirs with such a name is replaced."""
@@ -61,6 +64,51 @@ class ConfirmedTable:
     def discard(self) -> None:
         """Remove what was begun."""
         self._files.discard()
+
+
+class ConfirmedPlaces:
+    """confirmed.csv of targets located from the air, written as the frames go by; none where nobody looked at any."""
+
+    def __init__(self, folder: Path, geographic: bool) -> None:
+        """geographic: whether longitudes and latitudes are known."""
+        header = [*POSITION_COLUMNS, *(DEGREES if geographic else ()), *COLUMNS]
+        self.path, self._geographic = folder / "confirmed.csv", geographic
+        self._files = TextFiles({self.path: ",".join(header) + "\n"})
+        self._written = False
+
+    def write(self, surveyed: Surveyed) -> None:
+        """Add the targets of a frame."""
+        confirmed, grounded = surveyed.confirmed, surveyed.grounded
+        if confirmed is None or grounded is None:
+            return
+        self._written = True
+        given = position_text(grounded.positions, self._geographic)
+        self._files.write(csv_lines(confirmed, given))
+
+    def close(self, complete: bool) -> None:
+        """Put the table in its place, or remove that of an earlier run. Raises OSError as ConfirmedTable does."""
+        if self._written:
+            self._files.close()
+        else:
+            remove(self.path)
+
+    def discard(self) -> None:
+        """Remove what was begun."""
+        self._files.discard()
+
+
+def position_text(positions: Positions, geographic: bool) -> list[list[str]]:
+    """The cells of POSITION_COLUMNS and DEGREES of each row."""
+    rows = []
+    for k in range(len(positions)):
+        (east, north), covariance = positions.east_north_m[k].tolist(), positions.covariance_m2[k]
+        spread = [f"{v:.6g}" if math.isfinite(v) else "" for v in covariance[[0, 0, 1], [0, 1, 1]].tolist()]
+        cells = [f"{positions.frame[k]}", f"{positions.target[k]}", f"{east:.4f}", f"{north:.4f}", *spread]
+        if geographic:
+            degrees = positions.lonlat_deg
+            cells += ["", ""] if degrees is None else [f"{v:.9f}" for v in degrees[k].tolist()]
+        rows.append(cells)
+    return rows
 
 
 class ConfirmJournal(Record):

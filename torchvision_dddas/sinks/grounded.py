@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from torchvision_dddas.sinks.grounded_tables import GroundedTables
 from torchvision_dddas.sinks.journal import NAME, Record
 from torchvision_dddas.sinks.kml import kml
 from torchvision_dddas.sinks.map_picture import CameraPath, map_picture, view_of
+from torchvision_dddas.sinks.map_signs import Signs
 from torchvision_dddas.sinks.output import RunFolder
 from torchvision_dddas.sinks.report import Story, Table, report, span
 from torchvision_dddas.sinks.timeline import USED, Timeline
@@ -27,6 +28,7 @@ SAVED = ("cot", "map", "report")
 """What --save may name. The tables, tracks.geojson, tracks.kml and run.json are always written."""
 
 GEOJSON, KML, COT, MAP, REPORT = "tracks.geojson", "tracks.kml", "tracks.cot.xml", "map.png", "report.html"
+_LARGE = 400_000  # bytes
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 Degrees = Callable[[np.ndarray], np.ndarray]
@@ -117,6 +119,15 @@ class GroundedJournal(Record):
         self._before = frame
 
 
+class More(Protocol):
+    """What is known of a run beside what was located."""
+
+    signs: Signs
+
+    def told(self, story: Story) -> Story:
+        """The story of a report, with that."""
+
+
 class Maps:
     """The files that need all frames, written at the end. Memory grows with the places that they show.
 
@@ -143,6 +154,7 @@ class Maps:
         self._way: list[tuple[float, float]] = []
         self._last: Fix | None = None
         self.written: set[str] = set()
+        self.more: More | None = None
 
     def write(self, grounded: Grounded) -> None:
         """Keep what the maps will show of a frame."""
@@ -177,7 +189,9 @@ class Maps:
             if "map" in self._save:
                 self._put(MAP, picture)
             if "report" in self._save:
-                story = _story(self._kept, targets, complete, picture)
+                story = _story(self._kept, targets, complete, _smaller(picture))
+                if self.more is not None:
+                    story = self.more.told(story)
                 self._put(REPORT, report(story, self._timeline).encode())
 
     def discard(self) -> None:
@@ -193,7 +207,8 @@ class Maps:
         seen = view_of(self._last, self._camera) if self._last is not None and self._camera is not None else None
         way = np.array(self._way).reshape(-1, 2)
         camera = CameraPath(way, np.zeros((0, 2)) if seen is None else seen)
-        picture = map_picture(targets, marks, self._kept.names, camera, self._photo, self._name)
+        signs = None if self.more is None else self.more.signs
+        picture = map_picture(targets, marks, self._kept.names, camera, self._photo, self._name, signs)
         return cv2.imencode(".png", picture)[1].tobytes()
 
 
@@ -241,6 +256,15 @@ class GroundedOutput(RunFolder[Grounded]):
         super().close(complete)
         for name in {GEOJSON, KML, COT, MAP, REPORT} - self._maps.written:
             remove(self.folder / name)
+
+
+def _smaller(map_png: bytes) -> bytes:
+    """A map as JPEG where it is large, as over a photo: a report must stay light."""
+    if len(map_png) < _LARGE:
+        return map_png
+    picture = cv2.imdecode(np.frombuffer(map_png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
 def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png: bytes) -> Story:

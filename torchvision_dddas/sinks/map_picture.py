@@ -25,6 +25,7 @@ from torchvision_dddas.sinks.map_frame import (
     text_width,
     write,
 )
+from torchvision_dddas.sinks.map_signs import Signs, draw_look, draw_signs, draw_verdict
 from torchvision_dddas.sinks.map_symbols import MARK, Labels, dashes, draw_camera, draw_dot, draw_landmark, line
 from torchvision_dddas.sinks.track_overlay import colour_of
 from torchvision_dddas.types import Camera, Fix, Ortho
@@ -49,6 +50,7 @@ def map_picture(
     camera: CameraPath | None = None,
     photo: Ortho | None = None,
     title: str = "",
+    signs: Signs | None = None,
 ) -> np.ndarray:
     """(H, 1400, 3) uint8 BGR, north up, over a photo of the ground or a plain grid.
 
@@ -71,6 +73,10 @@ def map_picture(
             line(plot, frame.pixels(tracks.east_north_m[piece]), _dark(target), 2, halo=True)
     for target, rows in tracks.of.items():
         _draw_last(plot, frame, tracks, rows.stop - 1, _dark(target))
+    if signs is not None:
+        draw_signs(plot, frame, signs)
+        for _, _, place in signs.verdicts:
+            labels.keep_free(place)
     for shown in (tracks, landmarks):
         for rows in shown.of.values():
             labels.keep_free(shown.east_north_m[rows.stop - 1])
@@ -83,7 +89,7 @@ def map_picture(
     if len(camera.east_north_m):
         draw_camera(plot, frame.pixels(camera.east_north_m[-1]))
     write(picture, title, (LEFT + 26, TOP - 14), 0.62)
-    _legend(picture, frame, tracks, camera, len(landmarks) > 0)
+    _legend(picture, frame, tracks, camera, len(landmarks) > 0, signs or Signs())
     return cv2.resize(picture, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA)
 
 
@@ -182,7 +188,9 @@ def _draw_last(plot: np.ndarray, frame: MapFrame, tracks: GroundTracks, row: int
     draw_dot(plot, frame.pixels(centre), colour)
 
 
-def _legend(picture: np.ndarray, frame: MapFrame, tracks: GroundTracks, camera: CameraPath, marked: bool) -> None:
+def _legend(
+    picture: np.ndarray, frame: MapFrame, tracks: GroundTracks, camera: CameraPath, marked: bool, signs: Signs
+) -> None:
     y = TOP + frame.height + 62
     x = LEFT + 8.0
     ring = np.array([x, y]) + np.array([13, 7]) * np.array([(np.cos(t), np.sin(t)) for t in np.linspace(0, 6.2832, 40)])
@@ -190,6 +198,9 @@ def _legend(picture: np.ndarray, frame: MapFrame, tracks: GroundTracks, camera: 
     entries += [("landmark", "mark")] if marked else []
     entries += [("camera", "camera")] if len(camera.east_north_m) else []
     entries += [("what it saw last", "view")] if len(camera.view_m) else []
+    kinds = {kind for _, kind, _ in signs.verdicts}
+    entries += [(f"told {kind.replace('_', ' ')}", kind) for kind in ("human", "not_human") if kind in kinds]
+    entries += [("seen from here", "look")] if signs.looks else []
     for text, kind in entries:
         at = np.array([x, y]) * FINE
         if kind == "ring":
@@ -199,10 +210,14 @@ def _legend(picture: np.ndarray, frame: MapFrame, tracks: GroundTracks, camera: 
             draw_landmark(picture, at)
         elif kind == "camera":
             draw_camera(picture, at)
+        elif kind == "look":
+            draw_look(picture, at - (9.0 * FINE, 0.0), at)
+        elif kind in kinds:
+            draw_verdict(picture, at, kind)
         else:
             dashes(picture, at + FINE * np.array([[-14.0, 0], [14, 0]]), VIEW, 2)
         write(picture, text, (x + 20, y + 5), 0.5)
-        x += 20 + text_width(text, 0.5) + 40
+        x += 20 + text_width(text, 0.5) + 34
     places = frame.pixels(tracks.east_north_m) / FINE
     outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
     text = f"{len(tracks.of)} targets, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")

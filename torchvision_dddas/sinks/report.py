@@ -9,7 +9,8 @@ from html import escape
 from typing import Any
 
 from torchvision_dddas.sinks.journal import finite
-from torchvision_dddas.sinks.timeline import Timeline, plots
+from torchvision_dddas.sinks.keyframes import KeyFrame
+from torchvision_dddas.sinks.timeline import OverTime, Panel, plots
 
 MOST_ROWS = 200
 """A table shows so many rows; run.json has them all."""
@@ -33,6 +34,8 @@ img,svg{width:100%;height:auto;display:block}
 svg text{font-size:12px;fill:#555}svg .title{font-size:13px;font-weight:600;fill:#222}
 svg .grid{stroke:#eee}svg .tick{stroke:#888;fill:none}svg .gap{fill:#c0392b;opacity:.15}
 svg .curve{fill:none;stroke-width:1.6;stroke-linejoin:round}
+.frames{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));gap:16px}
+figure{margin:0}figcaption{font-size:13px;color:#444;margin-top:4px;overflow-wrap:anywhere}
 .note{color:#666}ul{padding-left:20px}pre{background:#f6f6f6;padding:12px;overflow:auto;font-size:13px}
 """
 
@@ -42,6 +45,7 @@ class Story:
     """What a report tells. All words are escaped when it is written.
 
     figures: names and values. facts: what was run; `settings` among them is folded away. notes: in words.
+    map_png: or as JPEG. first: tables that stand before the map. panels: plots above those of the timeline.
     """
 
     title: str
@@ -51,10 +55,13 @@ class Story:
     tables: Sequence[Table]
     notes: Sequence[str] = field(default_factory=tuple)
     map_png: bytes | None = None
+    first: Sequence[Table] = ()
+    pictures: Sequence[KeyFrame] = ()
+    panels: Sequence[Panel] = ()
 
 
-def report(story: Story, timeline: Timeline) -> str:
-    """The HTML: figures, map, plots over time, tables, and what was run."""
+def report(story: Story, timeline: OverTime) -> str:
+    """The HTML: figures, map, key frames, plots over time, tables, and what was run."""
     parts = [
         f"<h1>{escape(story.title)}</h1>",
         f'<p class="state">{escape(story.state)}</p>',
@@ -64,13 +71,14 @@ def report(story: Story, timeline: Timeline) -> str:
     ]
     if story.notes:
         parts += ["<h2>Notes</h2>", "<ul>", *(f"<li>{escape(note)}</li>" for note in story.notes), "</ul>"]
+    parts += _tables(story.first)
     if story.map_png is not None:
-        picture = base64.b64encode(story.map_png).decode()
-        parts += ["<h2>Map</h2>", f'<img alt="map of the tracks" src="data:image/png;base64,{picture}">']
-    if drawn := plots(timeline):
+        parts += ["<h2>Map</h2>", f'<img alt="map of the tracks" src="{_inline(story.map_png)}">']
+    if story.pictures:
+        parts += ["<h2>Key frames</h2>", '<div class="frames">', *(_figure(one) for one in story.pictures), "</div>"]
+    if drawn := plots(timeline, story.panels):
         parts += ["<h2>Over time</h2>", drawn, '<p class="note">Shaded: frames in which nothing could be located.</p>']
-    for title, names, rows, empty in story.tables:
-        parts += [f"<h2>{escape(title)}</h2>", table(names, rows) if rows else f'<p class="note">{escape(empty)}</p>']
+    parts += _tables(story.tables)
     facts = {name: value for name, value in story.facts.items() if name != "settings"}
     parts += ["<h2>What was run</h2>", table(("what", "value"), [(name, _words(v)) for name, v in facts.items()])]
     if "settings" in story.facts:
@@ -82,6 +90,26 @@ def report(story: Story, timeline: Timeline) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(story.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
+
+
+def _tables(tables: Sequence[Table]) -> list[str]:
+    parts = []
+    for title, names, rows, empty in tables:
+        parts += [f"<h2>{escape(title)}</h2>", table(names, rows) if rows else f'<p class="note">{escape(empty)}</p>']
+    return parts
+
+
+def _figure(picture: KeyFrame) -> str:
+    when = f"frame {picture.number}" + (f", {picture.time_s:.1f} s" if math.isfinite(picture.time_s) else "")
+    words = f": {escape(picture.words)}" if picture.words else ""
+    shown = f'<img alt="{when}" src="{_inline(picture.jpeg)}">'
+    return f"<figure>{shown}<figcaption><b>{when}</b>{words}</figcaption></figure>"
+
+
+def _inline(picture: bytes) -> str:
+    """A picture as a URL that holds it: JPEG by its first two bytes, else PNG."""
+    kind = "jpeg" if picture[:2] == b"\xff\xd8" else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

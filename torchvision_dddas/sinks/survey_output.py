@@ -1,18 +1,22 @@
 """The folder of a run of the whole path: what was found, who is who, where on the ground, and the record of it all."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from torchvision_dddas.sinks.confirmed import ConfirmedPlaces
 from torchvision_dddas.sinks.grounded import SAVED as MAPS
-from torchvision_dddas.sinks.grounded import GroundedOutput
+from torchvision_dddas.sinks.grounded import GroundedJournal, GroundedOutput
 from torchvision_dddas.sinks.journal import Record
 from torchvision_dddas.sinks.mark_table import MarkTable
 from torchvision_dddas.sinks.output import RunFolder, Sink, uninterrupted
 from torchvision_dddas.sinks.overlay import Overlay
-from torchvision_dddas.sinks.survey_overlay import SurveyPictures
+from torchvision_dddas.sinks.run_log import NAME as LOG
+from torchvision_dddas.sinks.run_log import WORLD
+from torchvision_dddas.sinks.run_story import REPORT, RunStory
+from torchvision_dddas.sinks.survey_overlay import Once, SurveyPictures
 from torchvision_dddas.sinks.tables import Tables
 from torchvision_dddas.sinks.track_output import TrackJournal
 from torchvision_dddas.sinks.track_tables import TrackTables
@@ -22,8 +26,8 @@ from torchvision_dddas.types import Followed, Scene, Surveyed
 SAVED = ("overlay", *MAPS)
 """What --save may name. The tables and run.json are always written."""
 
-FOUND = ("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", *RunFolder.files)
-ALL = (*FOUND, "landmarks.csv", *(name for name in GroundedOutput.files if name not in FOUND))
+FOUND = ("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", LOG, REPORT, *RunFolder.files)
+ALL = (*FOUND, "landmarks.csv", "confirmed.csv", *(name for name in GroundedOutput.files if name not in FOUND))
 """What a run leaves where nothing is located, and where targets are."""
 
 Part = TypeVar("Part")
@@ -37,14 +41,32 @@ class FoundOutput(RunFolder[Surveyed]):
 
     def begin(self, facts: dict[str, Any], rate_hz: float, size: tuple[int, int]) -> TrackJournal:
         """Say what the run is, for run.json; how fast the overlay plays and its (width, height)."""
-        self.journal = kept = TrackJournal(self.folder, facts)
-        self._sinks = [_Of(kept, _followed), *_found(self.folder, self._save, rate_hz, size, ())]
+        self.journal = self._kept = kept = TrackJournal(self.folder, facts)
+        self._facts = facts
+        self._story, more = _found(self.folder, self._save, rate_hz, size, (), kept, facts)
+        self._sinks = [_Of(kept, _followed), *more]
         return kept
+
+    def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
+        """As in SurveyOutput."""
+        self._story.event(frame, text, time_s, kind)
+
+    def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
+        """As in SurveyOutput."""
+        self._story.scored(measures, words)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place, as in RunFolder; what an earlier run here located goes."""
+        made = set(FOUND)
+        if "report" in self._save and self._kept.frames:
+            kept = self._kept
+            counted = [("frames", kept.frames), ("detections", kept.targets), ("identities", kept.identities)]
+            with uninterrupted(), self._refusals():
+                self._story.report(self._facts, [(name, f"{count}") for name, count in counted], complete)
+        else:
+            made -= {REPORT}
         super().close(complete)
-        for name in set(ALL) - set(FOUND):
+        for name in set(ALL) - made:
             remove(self.folder / name)
 
 
@@ -60,11 +82,27 @@ class SurveyOutput(GroundedOutput):
 
     def also(self, kept: Record, rate_hz: float, size: tuple[int, int], names: Sequence[str], geographic: bool) -> None:
         """After begin: what to write beside. kept: its record; geographic: whether longitudes are known."""
+        facts = kept.facts if isinstance(kept, GroundedJournal) else {}
+        self._story, found = _found(self.folder, self._save, rate_hz, size, names, kept, facts)
+        self._maps.more = self._story
         self._more = [
             _Identities(kept),
             MarkTable(self.folder, names, geographic),
-            *_found(self.folder, self._save, rate_hz, size, names),
+            ConfirmedPlaces(self.folder, geographic),
+            *found,
         ]
+
+    def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
+        """Say, after `also`, what the frames do not tell themselves, for the log and the report.
+
+        Best before the frame is surveyed: then a key frame shows it. time_s: None where the frame tells when.
+        kind: one of those of run_log, as WORLD or PROBLEM.
+        """
+        self._story.event(frame, text, time_s, kind)
+
+    def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
+        """Say, after the last frame, how good the run was against the truth: values by name, and what each is."""
+        self._story.scored(measures, words)
 
     def survey(self, item: Surveyed) -> None:
         """Write a frame to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
@@ -92,13 +130,22 @@ class SurveyOutput(GroundedOutput):
 
 
 def _found(
-    folder: Path, save: Sequence[str], rate_hz: float, size: tuple[int, int], names: Sequence[str]
-) -> list[Sink[Surveyed]]:
-    """Tables of what was found and who is who, and the overlay."""
+    folder: Path,
+    save: Sequence[str],
+    rate_hz: float,
+    size: tuple[int, int],
+    names: Sequence[str],
+    kept: Record,
+    facts: Mapping[str, Any],
+) -> tuple[RunStory, list[Sink[Surveyed]]]:
+    """Tables of what was found and who is who, the overlay, and the log."""
     sinks: list[Sink[Surveyed]] = [_Of(Tables(folder), _scene), _Of(TrackTables(folder), _followed)]
+    pictures = Once(SurveyPictures(size, names))
     if "overlay" in save:
-        sinks.append(Overlay(folder, rate_hz, SurveyPictures(size, names)))
-    return sinks
+        sinks.append(Overlay(folder, rate_hz, pictures))
+    shown = pictures if "report" in save else None
+    story = RunStory(folder, Path(str(facts.get("input", ""))).name, kept, names, shown)
+    return story, [*sinks, story]
 
 
 class _Of(Generic[Part]):

@@ -1,6 +1,6 @@
 """The clip with its tracks drawn in: a colour and a number an identity, and the way that it came."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -32,12 +32,22 @@ class TrackPictures:
         self.size = size
         self._trails = Trails(LENGTH)
 
-    def __call__(self, followed: Followed, more: Sequence[tuple[str, Colour]] = ()) -> np.ndarray:
+    def skip(self, followed: Followed) -> None:
+        """Take note of a frame that is not drawn."""
+        self._trails.add(followed)
+
+    def __call__(
+        self,
+        followed: Followed,
+        more: Sequence[tuple[str, Colour]] = (),
+        kinds: Mapping[int, str] | None = None,
+    ) -> np.ndarray:
         """The frame with boxes, numbers and trails, (H, W, 3) uint8 BGR; black where it could not be read.
 
-        more: further lines of the caption, each with its colour.
+        more: further lines of the caption, each with its colour. kinds: what stands behind the number of an identity.
         """
         self._trails.add(followed)
+        kinds = kinds or {}
         picture = _picture(followed, self.size)
         thick = line_width(picture)
         tracks, given = followed.tracks, followed.detections
@@ -48,7 +58,7 @@ class TrackPictures:
             way = whole(np.array([place[1:] for place in self._trails.places[identity]]))
             cv2.polylines(picture, [way], False, colour, thick, cv2.LINE_AA)
             rectangle(picture, box, colour, thick + 1 if row >= 0 else 1)
-            label(picture, box, str(identity), colour)
+            label(picture, box, f"{identity} {kinds[identity]}" if identity in kinds else str(identity), colour)
         lines = [(f"frame {followed.number}  identities {len(tracks)}  detections {len(given)}", TEXT)]
         if followed.cause:
             lines.append((followed.cause, WARNING))
