@@ -1,6 +1,7 @@
 """`dddas run sim:SCENARIO`: the whole path in a closed loop with simulated vehicles, and what it was worth."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
+    from torchvision_dddas.metrics.crowds import CrowdScore
     from torchvision_dddas.mission import Mission
     from torchvision_dddas.sinks.journal import Record
     from torchvision_dddas.sources.simulator import SimulatorSource
@@ -45,9 +47,10 @@ def fly(
     if useless := [name for name, given in files.items() if given is not None]:
         raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
     names = saved(save, SAVED)
-    journal = fly_into(folder, scenario, config, overrides, scene, seed, backend, names, quiet)
+    journal, score = fly_into(folder, scenario, config, overrides, scene, seed, backend, names, quiet)
     if not quiet:
-        for line in summary(journal, folder, True, names):
+        first, *others = summary(journal, folder, True, names)
+        for line in (first, *score.lines(), *others):
             typer.echo(line)
 
 
@@ -61,16 +64,18 @@ def fly_into(
     backend: str = "auto",
     save: Sequence[str] = (),
     quiet: bool = False,
-) -> "Record":
-    """As `fly`, but returns the record of the run, and says nothing at its end."""
+) -> "tuple[Record, CrowdScore]":
+    """As `fly`, but returns the record of the run and its score, and says nothing at its end."""
     from torchvision_dddas.sinks.survey_output import SurveyOutput
 
     with SurveyOutput(folder, save) as output:
+        from torchvision_dddas.metrics.crowds import CrowdScorer
         from torchvision_dddas.mission import Begun, mission_of
         from torchvision_dddas.settings import load
         from torchvision_dddas.simulation.scenario import settings_of
         from torchvision_dddas.sources.simulator import open_scenario
         from torchvision_dddas.surveying import survey
+        from torchvision_dddas.targets import geodesy
         from torchvision_dddas.vision import load as load_vision
 
         simulated: SimulatorSource = open_scenario(scenario, scene, seed)
@@ -79,23 +84,27 @@ def fly_into(
         mission = mission_of(source, settings, backend)
         vision = load_vision(backend, mission.settings)
         journal = _begin(output, mission, simulated, vision.name)
+        scorer = CrowdScorer(partial(geodesy.east_north, origin_deg=simulated.origin_deg))
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
                 done = 0
                 for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
+                    for truth in simulated.truths():
+                        scorer.feed(truth)
+                    scorer.feed(surveyed)
                     output.survey(surveyed)
                     for _ in range(surveyed.followed.number - done):
                         tick()
                     done = surveyed.followed.number
         finally:
             journal.problems += [str(problem) for problem in simulated.problems]
-    return journal
+        score = scorer.score()
+        journal.counts["against_truth"] = score.by_name()
+    return journal, score
 
 
 def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: str) -> "Record":
     """Say what the run is."""
-    from functools import partial
-
     from torchvision_dddas.targets import geodesy
 
     locator, site = mission.watch.locator, mission.watch.locator.site
