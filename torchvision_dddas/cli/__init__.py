@@ -18,6 +18,7 @@ from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.people import people
 from torchvision_dddas.cli.run import run
 from torchvision_dddas.cli.settings import settings
+from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.track import track
 
 app = typer.Typer(
@@ -27,7 +28,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, detect, people, track, confirm, calibrate, colours, evaluate, demo, settings):
+for command in (run, detect, people, track, confirm, calibrate, colours, evaluate, simulate, demo, settings):
     app.command()(command)
 app.add_typer(locate, name="locate")
 

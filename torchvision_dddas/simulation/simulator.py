@@ -1,13 +1,17 @@
 """A scenario that runs: world, agents and cameras in one, frame by frame, steered on the way."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.simulation.aerial import AerialCamera
+from torchvision_dddas.simulation.agents import Agents
+from torchvision_dddas.simulation.groundview import GroundCamera
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, check
-from torchvision_dddas.simulation.standin import AerialCamera, Agents, GroundCamera, World, build, plates
+from torchvision_dddas.simulation.team import plates
+from torchvision_dddas.simulation.world import World, build
 from torchvision_dddas.types import Camera, Command, Elevation, Frame, GroundPicture, Ortho, Truth
 
 
@@ -42,7 +46,7 @@ class Simulator:
         """
         check(scenario)
         self.scenario = scenario
-        self.world: World = build(scenario.world, scenario.seed, elevation, photo)
+        self.world: World = build(scenario.world, scenario.seed, elevation, photo, (starts_m(scenario), CLEAR_M))
         self._aerial = AerialCamera(self.world, scenario)
         self._ground = GroundCamera(self.world, scenario)
         self.camera: Camera = self._aerial.camera
@@ -97,4 +101,20 @@ class Simulator:
         moment, row = self._now, self.names.index(vehicle)
         if moment is None or not np.isfinite(moment.said_lonlat_deg[row]).all():
             return None
-        return replace(self._ground.take(moment, row), vehicle=vehicle)
+        return self._ground.take(moment, row)
+
+
+CLEAR_M = 4.0
+"""Nothing stands nearer to where something that moves begins."""
+
+
+def starts_m(scenario: Scenario) -> np.ndarray:
+    """(N, 2) places about which what moves begins: crowds and what is about their middles, cars, the ring of UGVs."""
+    about = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]).reshape(-1, 2)
+    places = [np.array([car.start_m]) for car in scenario.car]
+    places += [np.array(crowd.start_m) + about * min(crowd.radius_m, 2 * CLEAR_M) for crowd in scenario.crowd]
+    team = scenario.team
+    turn = 2 * np.pi * np.arange(64) / 64
+    if team.ugvs:
+        places.append(np.array(team.middle_m) + team.ring_m * np.stack([np.sin(turn), np.cos(turn)], axis=1))
+    return np.concatenate(places) if places else np.zeros((0, 2))

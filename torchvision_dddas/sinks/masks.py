@@ -21,15 +21,18 @@ class Masks:
 
     def write(self, scene: Scene) -> None:
         """Write the mask of a frame. Raises OSError if the disk refuses."""
+        self.add(scene.frame.number, scene.mask)
+
+    def add(self, number: int, mask: np.ndarray) -> None:
+        """The same for the mask (H, W) of any frame."""
         self._folder.mkdir(exist_ok=True)
-        mask = scene.mask
         kind = np.uint8 if mask.size == 0 or mask.max() <= 255 else np.uint16
         # Level 1: masks are nearly empty, and higher levels cost time for a few bytes.
         ok, png = cv2.imencode(".png", mask.astype(kind, copy=False), [cv2.IMWRITE_PNG_COMPRESSION, 1])
         if not ok:
-            raise OSError(f"mask of frame {scene.frame.number} could not be encoded")
-        write_whole(self._folder / f"{scene.frame.number:06d}.png", png.tobytes())
-        self._last = scene.frame.number
+            raise OSError(f"mask of frame {number} could not be encoded")
+        write_whole(self._folder / f"{number:06d}.png", png.tobytes())
+        self._last = number
 
     def close(self, complete: bool) -> None:
         """Remove the masks of an earlier, longer clip, so that the folder speaks of one clip only."""

@@ -69,9 +69,11 @@ def caption(picture: np.ndarray, lines: Sequence[tuple[str, tuple[int, int, int]
 class Overlay(Generic[Item]):
     """overlay.mp4: H.264, which browsers play, where PyAV is installed (extra `video`); else OpenCV's mp4v."""
 
-    def __init__(self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray]) -> None:
+    def __init__(
+        self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray], name: str = "overlay.mp4"
+    ) -> None:
         """draw: makes the picture of a scene or followed frame, a new one each time, (H, W, 3) uint8 BGR."""
-        self._path = folder / "overlay.mp4"
+        self._path = folder / name
         self._part = temporary(self._path)
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
         self._writer: Writer | None = None
