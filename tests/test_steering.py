@@ -1,5 +1,7 @@
 """What is found steers the instruments: synthetic located frames in, commands and their causes out."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -7,8 +9,10 @@ from torchvision_dddas.settings import Settings, SteeringKnobs
 from torchvision_dddas.steering import Steering
 from torchvision_dddas.targets.projection import axes_of, project
 from torchvision_dddas.types import (
+    Adjustment,
     Camera,
     CameraPose,
+    Command,
     Confirmed,
     Fix,
     Flight,
@@ -86,3 +90,86 @@ def test_nothing_known_changes_nothing():
             (),
         )
         assert made == ()
+
+
+@dataclass
+class World:
+    """A toy: targets walk, the aerial vehicle and the ground vehicles go where they are asked, frames settle late."""
+
+    steering: Steering
+    targets: np.ndarray
+    velocity: np.ndarray
+    team: np.ndarray
+    kinds: tuple[str, ...] = ()
+    delay_s: float = 1.0
+    altitude_m: float = 50.0
+    pitch_deg: float = 90.0
+    hidden: Callable[[float], bool] = lambda now_s: False
+    now_s: float = 0.0
+    looked: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    commands: list[Command] = field(default_factory=list)
+    made: list[Adjustment] = field(default_factory=list)
+    poses: list[CameraPose] = field(default_factory=list)
+    frames: list[Grounded] = field(default_factory=list)
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
+    said: np.ndarray | None = None  # (V,) bool: which vehicles report
+    silent: bool = False
+
+    def run(self, seconds: float, check: Callable[["World"], None] | None = None) -> "World":
+        for _ in range(round(seconds * RATE_HZ)):
+            self._frame()
+            if check is not None:
+                check(self)
+        return self
+
+    def inside(self, places: np.ndarray) -> np.ndarray:
+        """Whether the picture shows them now."""
+        pixels = project(np.c_[places, np.zeros(len(places))], self.poses[-1], CAMERA)
+        return ((pixels > 0) & (pixels < np.array(CAMERA.size_px) - 1)).all(axis=1)
+
+    def _frame(self) -> None:
+        pose = pose_at(self.looked, self.altitude_m, self.pitch_deg)
+        self.poses.append(pose)
+        number = len(self.poses)
+        shown = self.inside(self.targets) & (not self.hidden(self.now_s))
+        noise = self.rng.normal(0, 0.3, self.targets.shape)
+        ids = np.arange(1, len(self.targets) + 1)
+        self.frames.append(located(number, (self.targets + noise)[shown], self.velocity[shown], ids[shown], pose))
+        late = number - 1 - round(self.delay_s * RATE_HZ)
+        if late >= 0:
+            settled = self.frames[late]
+            kinds = [self.kinds[k - 1] for k in settled.positions.target] if self.kinds else None
+            reported = np.ones(len(self.team), bool) if self.said is None else self.said
+            places = self.team + self.rng.normal(0, 0.5, self.team.shape)
+            marks = team_at(places)
+            marks = replace(marks, landmark=marks.landmark[reported], east_north_m=places[reported])
+            flight = None if self.silent else flown(pose)
+            confirmed = judged(settled.frame, *kinds) if kinds else None
+            command, made = self.steering.step(settled, confirmed, self.now_s, marks, flight)
+            self.commands.append(command)
+            self.made.extend(made)
+            self._obey(command)
+        self.targets = self.targets + self.velocity / RATE_HZ
+        self.now_s += 1 / RATE_HZ
+
+    def _obey(self, command: Command) -> None:
+        if command.look_at is not None:
+            self.looked = self.looked + towards(self.looked, command.look_at, 10.0)
+        if command.altitude_m is not None:
+            self.altitude_m += float(np.clip(command.altitude_m - self.altitude_m, -0.2, 0.2))
+        for order in command.orders:
+            k = int(order.vehicle.removeprefix("ugv")) - 1
+            self.team[k] += towards(self.team[k], order.goal, order.speed_m_s)
+
+
+def towards(place: np.ndarray, goal: np.ndarray, speed_m_s: float) -> np.ndarray:
+    """The step of one frame."""
+    way = goal - place
+    return way * min(1.0, speed_m_s / RATE_HZ / max(float(np.linalg.norm(way)), 1e-9))
+
+
+def world(targets, velocity=None, team=SQUARE, settings=None, **more) -> World:
+    targets = np.array(targets, float).reshape(-1, 2)
+    velocity = np.zeros_like(targets) if velocity is None else np.array(velocity, float).reshape(-1, 2)
+    steering = Steering(settings or Settings(), CAMERA, RATE_HZ, names(len(team)))
+    return World(steering, targets, velocity, np.array(team, float), **more)

@@ -29,3 +29,8 @@ class Record:
     def made(self) -> tuple[Adjustment, ...]:
         """The adjustments of the present frame, in order."""
         return tuple(self._made)
+
+
+def counted(n: int, what: str) -> str:
+    """1 target, 2 targets."""
+    return f"{n} {what}" + ("" if n == 1 else "s")

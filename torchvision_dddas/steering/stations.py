@@ -12,8 +12,10 @@ from torchvision_dddas.steering.outlook import Outlook
 KEEP_OFF_M = 4.0
 # A station is this far within the aerial picture, as a share of its half.
 _WITHIN = 0.2
-# Turns of the ring that are tried; it is turned, or vehicles change places, where this share of the ways is saved.
+# Turns of the ring that are tried; it is turned, or vehicles change places, where the ways become so much shorter, ...
 _TURNS, _BETTER = 12, 0.75
+# ... and are longer than this share of the ring's radius.
+_NEAR = 0.5
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,13 @@ class Ring:
 def assigned(team_m: np.ndarray, ring: Ring, now: np.ndarray | None) -> tuple[Ring, np.ndarray]:
     """The ring, turned, and which of its places (V,) each of the vehicles at (V, 2) takes, by the shortest ways.
 
-    now: the places in force; they stay as they are unless others save a quarter of the ways.
+    now: the places in force; they stay as they are unless others save a quarter of ways that are long.
     """
-    count = len(team_m)
+    count, held = len(team_m), np.inf
+    if now is not None and len(now) == count:
+        held = float(_ways(team_m, ring)[np.arange(count), now].sum())
+        if held < _NEAR * count * ring.radius_m:
+            return ring, now
     best: tuple[float, Ring, np.ndarray] = (np.inf, ring, np.arange(count))
     for turn in np.arange(_TURNS) * 2 * np.pi / count / _TURNS:
         turned = Ring(ring.middle_m, ring.radius_m, ring.turn_rad + turn)
@@ -43,25 +49,20 @@ def assigned(team_m: np.ndarray, ring: Ring, now: np.ndarray | None) -> tuple[Ri
         rows, places = linear_sum_assignment(ways)
         if (total := float(ways[rows, places].sum())) < best[0] - 1e-9:
             best = total, turned, places
-    if now is not None and len(now) == count:
-        held = float(_ways(team_m, ring)[np.arange(count), now].sum())
-        # Where all are near their places there is nothing to gain.
-        if best[0] > _BETTER * held or held < 0.5 * count * ring.radius_m:
-            return ring, now
-    return best[1], best[2]
+    return (ring, now) if now is not None and best[0] > _BETTER * held else best[1:]
 
 
 def _ways(team_m: np.ndarray, ring: Ring) -> np.ndarray:
     return np.linalg.norm(team_m[:, None] - ring.places(len(team_m))[None], axis=2)
 
 
-def drawn_in(places_m: np.ndarray, middle_m: np.ndarray, stand: Stand | None, look_at_m: np.ndarray) -> np.ndarray:
-    """The places (V, 2), those outside the aerial picture drawn towards the middle until they are well within."""
+def drawn_in(places_m: np.ndarray, middle_m: np.ndarray, stand: Stand | None) -> np.ndarray:
+    """The places (V, 2), those outside an aerial picture of the middle drawn towards it until they are well within."""
     if stand is None:
         return places_m
     drawn = places_m.copy()
     for share in np.linspace(1.0, 0.3, 8):
-        outside = stand.inside(drawn, look_at_m, stand.altitude_m) < _WITHIN
+        outside = stand.inside(drawn, middle_m, stand.altitude_m) < _WITHIN
         if not outside.any():
             break
         drawn[outside] = middle_m + share * (places_m[outside] - middle_m)

@@ -1,18 +1,21 @@
 """From what was found in a frame to what the instruments are asked to do next."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from torchvision_dddas.control import every_wanted, interval_from_flow, interval_from_telemetry, sampled
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.steering.follow import Follow
-from torchvision_dddas.steering.footprint import Stand, stand_of
+from torchvision_dddas.steering.footprint import Stand, inside, looked_at, stand_of
 from torchvision_dddas.steering.outlook import Memory, Outlook
 from torchvision_dddas.steering.record import Record
 from torchvision_dddas.steering.team import Team
-from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flight, Grounded, Marks, Order, Registration
+from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flight, Grounded, Marks, Registration
 
+# Vehicles are given new goals so often at most: what is found is a second old, and they do not turn faster.
+_PERIOD_S = 0.2
 # After something was lost every frame is looked at for so long.
 _ALERT_S = 2.0
 # A target is lost once so many frames in a row do not show it.
@@ -30,6 +33,7 @@ class Steering:
         self._memory, self._record = Memory(camera), Record()
         self._follow, self._team = Follow(settings), Team(settings, vehicles)
         self._stand: Stand | None = None
+        self._command, self._steered_s = Command(), -np.inf
         self._every, self._before, self._alert_s, self._alert = 1, 0, -np.inf, ""
 
     def step(
@@ -54,23 +58,34 @@ class Steering:
         now_s = max(now_s, grounded.time_s)
         outlook = self._memory.step(grounded, confirmed, now_s)
         self._stand = stand_of(flight, grounded.fix, self._stand, self.camera)
-        team_m = self._team.hear(marks, now_s, self._record)
         if knobs.sampling:
             self._sample(grounded, outlook, now_s, flight, step)
+        if now_s - self._steered_s < _PERIOD_S - 1e-6:
+            orders = tuple(replace(order, picture=False) for order in self._command.orders)
+            self._command = replace(self._command, every=self._every, orders=orders)
+            return self._command, self._record.made()
+        self._steered_s = now_s
+        team_m = self._team.hear(marks, now_s, self._record)
         if knobs.follow:
-            self._follow.step(outlook, team_m, self._stand, now_s, self._record)
-        orders: tuple[Order, ...] = ()
+            at = looked_at(flight, grounded.fix, self._stand) if self._stand is not None else None
+            self._follow.step(outlook, team_m, self._stand, at, now_s, self._record)
+        orders = ()
         if knobs.look:
-            orders = self._team.orders(outlook, self._stand, self._follow.look_at, now_s, self._record)
+            orders = self._team.orders(outlook, self._follow.rows(outlook), self._aloft(), now_s, self._record)
         look_at = self._follow.look_at
-        command = Command(self._every, self._fly_to(look_at), look_at, self._follow.altitude_m, orders)
-        return command, self._record.made()
+        self._command = Command(self._every, self._fly_to(look_at), look_at, self._follow.altitude_m, orders)
+        return self._command, self._record.made()
+
+    def _aloft(self) -> Stand | None:
+        """How the aerial camera is carried at the altitude at which it was asked to be."""
+        if self._stand is None or self._follow.altitude_m is None:
+            return self._stand
+        return replace(self._stand, altitude_m=self._follow.altitude_m)
 
     def _fly_to(self, look_at: np.ndarray | None) -> np.ndarray | None:
-        """The ground below the aerial vehicle when it looks there as it is carried now."""
-        if look_at is None or self._stand is None:
-            return None
-        return self._stand.pose(look_at, self._follow.altitude_m or self._stand.altitude_m).place_m[:2]
+        """The ground below the aerial vehicle when it looks there as it is carried."""
+        stand = self._aloft()
+        return None if look_at is None or stand is None else stand.pose(look_at, stand.altitude_m).place_m[:2]
 
     def _sample(
         self, grounded: Grounded, outlook: Outlook, now_s: float, flight: Flight | None, step: Registration | None
@@ -79,6 +94,8 @@ class Steering:
         frame, knobs, interval = grounded.frame, self.settings.steering, self.settings.interval
         between, self._before = max(frame - self._before, 1), frame
         lost = np.flatnonzero(outlook.wanted & (outlook.missed == _MISSED))
+        if grounded.fix.pose is not None and len(lost):  # what has left the picture is not lost
+            lost = lost[inside(outlook.east_north_m[lost], grounded.fix.pose, self.camera) > 0]
         if len(lost):
             self._alert_s, self._alert = now_s + _ALERT_S, f"target {outlook.target[lost[0]]} was lost"
         elif step is not None and (not step.reliable or step.inliers < _WEAK * step.tracked):

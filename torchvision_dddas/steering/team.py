@@ -9,7 +9,7 @@ from torchvision_dddas.settings import Settings
 from torchvision_dddas.steering import stations
 from torchvision_dddas.steering.footprint import Stand
 from torchvision_dddas.steering.outlook import Outlook
-from torchvision_dddas.steering.record import Record
+from torchvision_dddas.steering.record import Record, counted
 from torchvision_dddas.types import Marks, Order
 
 # A vehicle that reports no place is counted on for so long: planned waypoints bridge dropouts.
@@ -20,6 +20,10 @@ _FAR = 1.5
 _SURE, _UNSURE, _SELDOM = 0.95, 0.9, 5
 # A vehicle sent to a target stays so long at most, and that target is let be for a while.
 _TRIED_S, _LET_BE_S = 15.0, 30.0
+# A vehicle looks at a target for so long at least.
+_LOOK_S = 2.0
+# The ring is no wider than so many times station_m, however far apart targets are: vehicles are sent to those afar.
+_WIDEST = 1.5
 # Stations are where the crowd will be so much later.
 _LEAD_S = 1.0
 NEEDED = 4
@@ -33,6 +37,7 @@ class _Vehicle:
     heard_s: float
     near: bool = False
     watches: int = -1
+    watched_s: float = -np.inf
     sure: bool = False
     pictured_s: float = -np.inf
     sent_to: int = -1
@@ -71,19 +76,16 @@ class Team:
         """The vehicles that are counted on."""
         return sorted(self._known)
 
-    def orders(
-        self, outlook: Outlook, stand: Stand | None, look_at_m: np.ndarray | None, now_s: float, record: Record
-    ) -> tuple[Order, ...]:
-        """What each is asked to do; none while there is nothing to go to."""
-        rows, present = np.flatnonzero(outlook.wanted), self.present
+    def orders(self, outlook: Outlook, stand: Stand | None, now_s: float, record: Record) -> tuple[Order, ...]:
+        """What each is asked to do; none while there is nothing to go to. rows: the targets that are followed."""
+        present = self.present
         if not len(rows) or not present:
             self._ring = None
             return ()
         middle = self._middle(outlook, rows, stand)
-        self._send(outlook, middle, now_s, record)
+        self._send(outlook, now_s, record)
         team_m = np.array([self._known[v].place_m for v in present])
-        look_at = middle if look_at_m is None else look_at_m
-        goals = self._stations(outlook, middle, rows, team_m, stand, look_at, record)
+        goals = self._stations(outlook, middle, rows, team_m, stand, record)
         goals = stations.kept_off(goals, outlook, team_m)
         passing = stations.around(goals, team_m, outlook)
         drift = outlook.velocity_m_s[rows].mean(axis=0)
@@ -104,13 +106,12 @@ class Team:
         rows: np.ndarray,
         team_m: np.ndarray,
         stand: Stand | None,
-        look_at: np.ndarray,
         record: Record,
     ) -> np.ndarray:
         """(V, 2) the goals of those on the ring and of those sent to look."""
         present, knobs = self.present, self.knobs
         reach = np.linalg.norm(outlook.east_north_m[rows] - middle, axis=1) + outlook.radius_m[rows]
-        radius = max(knobs.station_m, float(reach.max()) + stations.KEEP_OFF_M)
+        radius = float(np.clip(reach.max() + stations.KEEP_OFF_M, knobs.station_m, _WIDEST * knobs.station_m))
         on = [k for k, v in enumerate(present) if self._known[v].sent_to < 0]
         names = tuple(present[k] for k in on)
         goals = team_m.copy()
@@ -120,14 +121,15 @@ class Team:
             self._ring, self._place_of = stations.assigned(team_m[on], stations.Ring(middle, radius, turn), held)
             self._on_ring = names
             goals[on] = self._ring.places(len(on))[self._place_of]
-            why = f"{len(on)} vehicles about {len(rows)} targets at ({middle[0]:.0f}, {middle[1]:.0f}) m"
+            about = f"{counted(len(rows), 'target')} at ({middle[0]:.0f}, {middle[1]:.0f}) m"
+            why = f"{counted(len(on), 'vehicle')} about {about}"
             record.set("team.ring_m", round(radius, 1), why, least=2.0)
         for k, v in enumerate(present):
             if self._known[v].sent_to >= 0:
                 row = int(np.flatnonzero(outlook.target == self._known[v].sent_to)[0])
                 goals[k] = self._close_to(outlook, row, team_m[k])
         tied = on if len(present) > NEEDED else list(range(len(present)))
-        goals[tied] = stations.drawn_in(goals[tied], middle, stand, look_at)
+        goals[tied] = stations.drawn_in(goals[tied], middle, stand)
         return goals
 
     def _close_to(self, outlook: Outlook, row: int, from_m: np.ndarray) -> np.ndarray:
@@ -137,7 +139,7 @@ class Team:
         away = outlook.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.knobs.look_m)
         return place + apart / max(float(np.linalg.norm(apart)), 1e-6) * away
 
-    def _send(self, outlook: Outlook, middle: np.ndarray, now_s: float, record: Record) -> None:
+    def _send(self, outlook: Outlook, now_s: float, record: Record) -> None:
         """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
         knobs, wanted = self.knobs, dict(zip(outlook.target.tolist(), range(len(outlook)), strict=True))
         needs = stations.need(outlook)
@@ -148,7 +150,7 @@ class Team:
             if row is None:
                 why = f"target {vehicle.sent_to} is lost"
             elif not outlook.unseen[row] and needs[row] < 1 - _UNSURE:
-                why = f"target {vehicle.sent_to} is human with {outlook.probability[row]:.2f}"
+                why = f"target {vehicle.sent_to}: {_known(outlook, row)}"
             elif now_s - vehicle.sent_s > _TRIED_S:
                 why = f"target {vehicle.sent_to} told nothing for {_TRIED_S:.0f} s"
                 self._let_be[vehicle.sent_to] = now_s
@@ -157,13 +159,16 @@ class Team:
                 record.set(f"{self.names[v]}.sent_to", 0, why)
         free = max(len(self._known) - NEEDED, 1) - sum(vehicle.sent_to >= 0 for vehicle in self._known.values())
         gone_to = {vehicle.sent_to for vehicle in self._known.values()}
-        afar = np.linalg.norm(outlook.east_north_m - middle, axis=1) - outlook.radius_m
+        if self._ring is None:
+            return
+        ring_m = self._ring.places(max(len(self._on_ring), 1))
+        afar = np.linalg.norm(outlook.east_north_m[:, None] - ring_m, axis=2).min(axis=1) - outlook.radius_m
         for row in np.argsort(-needs, kind="stable"):
             target = int(outlook.target[row])
             let_be = now_s - self._let_be.get(target, -np.inf) < _LET_BE_S
             if free <= 0 or needs[row] < 1 - _UNSURE:
                 break
-            seen_from_ring = abs(afar[row] - knobs.station_m) < knobs.look_m - 2 or afar[row] < knobs.look_m
+            seen_from_ring = afar[row] < knobs.look_m
             too_fast = outlook.speed_m_s[row] > knobs.fast_m_s
             if target in gone_to or let_be or too_fast or seen_from_ring or outlook.lost_s[row] > 1:
                 continue
@@ -173,8 +178,8 @@ class Team:
                 continue  # somebody sees it already
             v = idle[int(np.argmin(away))]
             self._known[v].sent_to, self._known[v].sent_s = target, now_s
-            why = "nobody has seen it" if outlook.unseen[row] else f"it is human with {outlook.probability[row]:.2f}"
-            record.set(f"{self.names[v]}.sent_to", target, f"{afar[row]:.0f} m from the others' middle, and {why}")
+            why = f"{afar[row]:.0f} m from the nearest station: {_known(outlook, row)}"
+            record.set(f"{self.names[v]}.sent_to", target, why)
             free -= 1
 
     def _order(
@@ -199,15 +204,18 @@ class Team:
             least=0.5,
         )
         row = stations.most_needed(outlook, vehicle.place_m, knobs.look_m, vehicle.watches)
+        here = np.flatnonzero(outlook.target == vehicle.watches)
+        if len(here) and now_s - vehicle.watched_s < _LOOK_S:
+            row = int(here[0])
         if vehicle.sent_to >= 0:
             row = int(np.flatnonzero(outlook.target == vehicle.sent_to)[0])
         at = outlook.east_north_m[row]
         target = int(outlook.target[row])
         if target != vehicle.watches:
-            why = "nobody has seen it" if outlook.unseen[row] else f"human with {outlook.probability[row]:.2f}"
+            why = _known(outlook, row)
             apart = float(np.linalg.norm(at - vehicle.place_m))
             record.set(f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {why}")
-            vehicle.watches, vehicle.sure = target, False
+            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, False
         return Order(
             name,
             goal,
@@ -222,10 +230,14 @@ class Team:
         surely = max(probability, 1 - probability)
         vehicle.sure = not outlook.unseen[row] and surely > (_UNSURE if vehicle.sure else _SURE)
         period = self.knobs.picture_s * (_SELDOM if vehicle.sure else 1)
-        why = f"target {outlook.target[row]} is human with {probability:.2f}"
+        why = f"target {outlook.target[row]}: {_known(outlook, row)}"
         record.set(f"{name}.picture_s", period, why, old=self.knobs.picture_s)
         apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
         if apart > self.knobs.look_m or now_s - vehicle.pictured_s < period - 1e-6:
             return False
         vehicle.pictured_s = now_s
         return True
+
+
+def _known(outlook: Outlook, row: int) -> str:
+    return "nobody has seen it" if outlook.unseen[row] else f"human with {outlook.probability[row]:.2f}"
