@@ -1,15 +1,16 @@
-"""What stands on the ground: bushes, trees and buildings, where they are and how high and coloured they look from above."""
+"""What stands on the ground: bushes, trees, buildings; where they are, how high they are, how they look from above."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-_BUSH, _TREE, _ROOFS = (
-    np.array([[70, 104, 98], [62, 92, 92], [86, 112, 112], [58, 96, 84]], float),
-    np.array([[56, 92, 82], [48, 82, 76], [70, 108, 100]], float),
-    np.array([[176, 182, 186], [92, 104, 150], [128, 138, 146], [120, 150, 178]], float),
-)
+# Colours as a photo shows them in full sun, BGR: creosote, saltbush, burroweed, dry; mesquite, palo verde, juniper.
+_TINTS = {
+    "bush": np.array([[78, 112, 108], [108, 126, 124], [80, 116, 120], [100, 122, 134]], float),
+    "tree": np.array([[72, 110, 106], [84, 126, 120], [62, 94, 88]], float),
+    "building": np.array([[196, 200, 204], [92, 104, 150], [140, 150, 158], [124, 156, 184]], float),
+}
 _TRIES = 20
 
 
@@ -43,9 +44,9 @@ def scatter(
 ) -> Things:
     """So many bushes, trees and buildings on free places.
 
-    wished, built: (h, w) pictures of the world, row 0 the north edge: how well plants and buildings stand there, 0 to 1.
-    clear: places (N, 2) and how near to them nothing stands. Nothing overlaps a building. What finds no place is left
-    out.
+    wished, built: (h, w) pictures of the world, row 0 the north edge: how well plants and buildings stand there, from
+    0 to 1. clear: places (N, 2) and how near to them nothing stands. Nothing overlaps a building. What finds no place
+    is left out.
     """
     kind = np.repeat(["building", "tree", "bush"], counts[::-1])
     total = len(kind)
@@ -74,8 +75,7 @@ def scatter(
                 continue
             places[k], stands[k] = place, True
             break
-    tints = {"bush": _BUSH, "tree": _TREE, "building": _ROOFS}
-    colour = np.array([tints[name][rng.integers(len(tints[name]))] for name in kind]).reshape(-1, 3)
+    colour = np.array([_TINTS[name][rng.integers(len(_TINTS[name]))] for name in kind]).reshape(-1, 3)
     colour = np.clip(colour * rng.uniform(0.85, 1.15, (total, 1)), 0, 255)
     return Things(*(field[stands] for field in (kind, places, radius, height, colour, half, heading)))
 
@@ -86,109 +86,106 @@ class Crowns:
     def __init__(self, things: Things, side_m: float, seed: int) -> None:
         self.things, self.side_m, self.seed = things, side_m, seed
         rng = np.random.default_rng([seed, 21])
-        self._moulds = [_mould(rng) for _ in range(12)]
+        self._moulds = [_mould(rng) for _ in range(16)]
         self._which = rng.integers(0, (len(self._moulds), 8), (len(things), 2))
 
     def surface(self, cells: int) -> np.ndarray:
         """(cells, cells) float32 metres above the ground, row 0 the north edge."""
         heights = np.zeros((cells, cells), np.float32)
-        texel = self.side_m / cells
         for k in range(len(self.things)):
-            shape, (row, column) = self._shape(k, texel)
-            part, cut = _overlap(heights, shape, row, column)
-            if part.size:
-                np.maximum(part, shape[cut], out=part)
+            shape, row, column = self._shape(k, self.side_m / cells)
+            part, cut = _overlap(heights, shape.shape[0], row, column)
+            np.maximum(part, shape[cut], out=part)
         return heights
 
     def paint(self, image: np.ndarray, first_row: int, texel_m: float, to_sun: np.ndarray) -> None:
-        """Draw the crowns and roofs, in the sun, into rows of a picture (n, W, 3) float32, from first_row on."""
-        things = self.things
+        """Draw the crowns and roofs, in the sun, into rows of a picture (3, n, W) float32, from first_row on."""
+        things, rows = self.things, image.shape[1]
         middle_row = (self.side_m / 2 - things.east_north_m[:, 1]) / texel_m
         reach = things.radius_m / texel_m + 2
-        near = (middle_row + reach > first_row) & (middle_row - reach < first_row + len(image))
+        near = np.flatnonzero((middle_row + reach > first_row) & (middle_row - reach < first_row + rows))
         # The highest last: a crown hides the lower ones under it.
-        for k in np.flatnonzero(near)[np.argsort(things.height_m[near])]:
-            shape, (row, column) = self._shape(int(k), texel_m)
-            part, cut = _overlap(image, shape, row - first_row, column)
-            if not part.size:
-                continue
-            look = self._look(int(k), shape, texel_m, to_sun)[cut]
-            seen = np.clip(shape[cut] / (0.12 * things.height_m[k]), 0, 1)[..., None]
-            part += seen * (look - part)
+        for k in near[np.argsort(things.height_m[near], kind="stable")]:
+            shape, row, column = self._shape(int(k), texel_m)
+            part, cut = _overlap(image, shape.shape[0], row - first_row, column)
+            if part.size:
+                look, seen = self._look(int(k), shape, texel_m, to_sun)
+                part += seen[cut] * (look[:, *cut] - part)
 
-    def _shape(self, k: int, texel_m: float) -> tuple[np.ndarray, tuple[int, int]]:
+    def _shape(self, k: int, texel_m: float) -> tuple[np.ndarray, int, int]:
         """(n, n) float32 heights of one thing, and the row and column of its first pixel."""
         things = self.things
-        reach = int(np.ceil(things.radius_m[k] / texel_m)) + 1
-        place = things.east_north_m[k]
-        column = int(np.floor((place[0] + self.side_m / 2) / texel_m)) - reach
-        row = int(np.floor((self.side_m / 2 - place[1]) / texel_m)) - reach
+        reach = int(np.ceil(things.radius_m[k] / texel_m))
+        row, column = self._corner(k, reach, texel_m)
         size = 2 * reach + 1
+        height = np.float32(things.height_m[k])
         if things.kind[k] == "building":
-            east, north = self._metres(k, row, column, size, texel_m)
-            along, aside = self._own_axes(k, east, north)
-            inside = np.minimum(things.half_m[k, 0] - np.abs(along), things.half_m[k, 1] - np.abs(aside))
-            return (np.clip(inside / texel_m + 0.5, 0, 1) > 0.5).astype(np.float32) * np.float32(things.height_m[k]), (
-                row,
-                column,
-            )
+            along, aside = self._own_metres(k, row, column, size, texel_m)
+            walls = (np.abs(along) < things.half_m[k, 0]) & (np.abs(aside) < things.half_m[k, 1])
+            return walls * height, row, column
         mould, turn = self._which[k]
         shape = np.rot90(self._moulds[mould], turn % 4)
-        shape = shape.T if turn >= 4 else shape
-        shape = cv2.resize(np.ascontiguousarray(shape), (size, size), interpolation=cv2.INTER_AREA)
-        return shape * np.float32(things.height_m[k]), (row, column)
+        shape = np.ascontiguousarray(shape.T if turn >= 4 else shape)
+        smaller = cv2.INTER_AREA if size < len(shape) else cv2.INTER_LINEAR
+        return cv2.resize(shape, (size, size), interpolation=smaller) * height, row, column
 
-    def _look(self, k: int, shape: np.ndarray, texel_m: float, to_sun: np.ndarray) -> np.ndarray:
-        """(n, n, 3) colours of a thing in the sun."""
+    def _look(self, k: int, shape: np.ndarray, texel_m: float, to_sun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Colours of a thing in the sun (3, n, n), and how much of each pixel it hides (n, n)."""
         things, rng = self.things, np.random.default_rng([self.seed, 22, k])
-        colour = things.colour[k].astype(np.float32)
+        colour = things.colour[k].astype(np.float32)[:, None, None]
         spread = rng.standard_normal(shape.shape, np.float32)
         if things.kind[k] == "building":
             reach = shape.shape[0] // 2
-            step = (np.arange(shape.shape[0]) - reach) * texel_m
-            along, _ = self._own_axes(k, *np.meshgrid(step, -step))
-            ribs = 0.05 * np.sign(np.sin(2 * np.pi * along / 0.9))
-            return (1 + ribs + 0.02 * spread).astype(np.float32)[..., None] * colour
-        leaves = 0.16 * spread + 0.14 * cv2.GaussianBlur(spread, (0, 0), 1.2) * 3
-        slope_row, slope_column = np.gradient(shape, texel_m)
-        slope = np.stack([-slope_column, slope_row], axis=-1).clip(-1.5, 1.5) @ to_sun[:2].astype(np.float32)
-        light = (to_sun[2] + slope) / np.sqrt(1 + np.minimum(slope_row**2 + slope_column**2, 4)) / to_sun[2]
-        return colour * ((0.35 + 0.65 * np.clip(light, 0, 1.5)) * (1 + leaves))[..., None].astype(np.float32)
+            along, _ = self._own_metres(k, *self._corner(k, reach, texel_m), shape.shape[0], texel_m)
+            ribs = 0.04 * np.sign(np.sin(2 * np.pi * along / 0.9))
+            stains = cv2.GaussianBlur(spread, (0, 0), 0.8 / texel_m) * np.float32(0.1 / texel_m)
+            return colour * (1 + ribs + 0.025 * spread + stains).astype(np.float32), np.sign(shape)
+        # Twigs half fill a pixel at the rim; clusters of leaves lie higher and are brighter than the gaps between.
+        leaves = 0.1 * spread + 0.12 * cv2.GaussianBlur(spread, (0, 0), 1.2) * 4
+        down, right = np.gradient(shape, texel_m)
+        facing = np.clip(down * to_sun[1] - right * to_sun[0], -0.6, 0.6)
+        deep = shape / cv2.GaussianBlur(shape, (0, 0), max(0.35 / texel_m, 0.5)).clip(1e-3)
+        light = np.clip(1 + 0.45 * facing + leaves, 0.35, 1.45) * np.clip(deep, 0.4, 1.15)
+        seen = np.clip(shape / (0.22 * things.height_m[k]) + 0.5 * leaves, 0, 1)
+        return colour * light.astype(np.float32), np.where(shape > 0, seen, 0).astype(np.float32)
 
-    def _metres(self, k: int, row: int, column: int, size: int, texel_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """East and north of a patch's pixels from the thing's middle."""
+    def _corner(self, k: int, reach: int, texel_m: float) -> tuple[int, int]:
+        """Row and column of the first pixel of a thing's patch."""
+        east, north = self.things.east_north_m[k]
+        row = int(np.floor((self.side_m / 2 - north) / texel_m)) - reach
+        return row, int(np.floor((east + self.side_m / 2) / texel_m)) - reach
+
+    def _own_metres(self, k: int, row: int, column: int, size: int, texel_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Metres along and aside of a thing's heading from its middle, (n, n) each, for the pixels of a patch."""
         east = (column + np.arange(size) + 0.5) * texel_m - self.side_m / 2 - self.things.east_north_m[k, 0]
-        north = self.side_m / 2 - (row + np.arange(size) + 0.5) * texel_m - self.things.east_north_m[k, 1]
-        grid = np.meshgrid(east, north)
-        return grid[0], grid[1]
-
-    def _own_axes(self, k: int, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        north = self.side_m / 2 - (row + np.arange(size)[:, None] + 0.5) * texel_m - self.things.east_north_m[k, 1]
         sine, cosine = np.sin(self.things.heading_rad[k]), np.cos(self.things.heading_rad[k])
         return east * sine + north * cosine, east * cosine - north * sine
 
 
-def _overlap(image: np.ndarray, shape: np.ndarray, row: int, column: int) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The part of a picture that a patch laid at (row, column) covers, and which part of the patch that is."""
-    top, left = max(row, 0), max(column, 0)
-    bottom, right = min(row + shape.shape[0], image.shape[0]), min(column + shape.shape[1], image.shape[1])
-    bottom, right = max(bottom, top), max(right, left)
-    return image[top:bottom, left:right], (slice(top - row, bottom - row), slice(left - column, right - column))
+def _overlap(image: np.ndarray, size: int, row: int, column: int) -> tuple[np.ndarray, tuple[slice, slice]]:
+    """The part of a picture (..., H, W) that a patch laid at (row, column) covers, and which part of it that is."""
+    height, width = image.shape[-2:]
+    top, left = min(max(row, 0), height), min(max(column, 0), width)
+    bottom, right = max(min(row + size, height), top), max(min(column + size, width), left)
+    cut = slice(top - row, bottom - row), slice(left - column, right - column)
+    return image[..., top:bottom, left:right], cut
 
 
 def _mould(rng: np.random.Generator, size: int = 96) -> np.ndarray:
-    """(size, size) float32 in [0, 1]: a rough crown of a few overlapping domes."""
+    """(size, size) float32 in [0, 1]: a crown of overlapping domes, with gaps and a ragged rim."""
     axis = (np.arange(size, dtype=np.float32) + 0.5) / size * 2 - 1
     u, v = np.meshgrid(axis, axis)
-    noise = sum(
-        (0.5**k) * cv2.resize(rng.standard_normal((n, n), np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
-        for k, n in enumerate((5, 10, 20, 40))
-    )
+    noise = np.zeros((size, size), np.float32)
+    for k, cells in enumerate((5, 10, 20, 40)):
+        small = rng.standard_normal((cells, cells), np.float32)
+        noise += np.float32(0.65**k) * cv2.resize(small, (size, size), interpolation=cv2.INTER_CUBIC)
     crown = np.zeros((size, size), np.float32)
-    for _ in range(int(rng.integers(3, 8))):
-        reach = rng.uniform(0.35, 0.75)
-        turn, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.9 - reach)
-        apart = np.hypot(u - off * np.cos(turn), v - off * np.sin(turn)) / reach
-        dome = np.sqrt(np.clip(1 - apart**2, 0, 1)) * (0.55 + 0.6 * reach)
+    for _ in range(int(rng.integers(5, 12))):
+        reach = rng.uniform(0.25, 0.6)
+        turn, off = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.95 - reach)
+        apart = np.hypot(u - off * np.cos(turn), v - off * np.sin(turn)) / reach + 0.12 * noise
+        dome = np.sqrt(np.clip(1 - apart**2, 0, 1)) * np.float32(0.5 + 0.7 * reach)
         crown = np.maximum(crown, dome)
-    rough = crown * (1 + 0.22 * noise) - 0.12 * np.abs(noise)
+    rough = crown * (1 + 0.2 * noise) - 0.05
     return np.clip(rough / rough.max(), 0, 1).astype(np.float32)

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 
 _BLOCK = 64  # rows of noise that share a seed
+_FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
+_SPREAD = 1 / 0.74  # what cubic interpolation between independent numbers takes from their spread
 
 
 def bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
@@ -21,13 +23,10 @@ def bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> 
     return large[first : first + shape[0], first : first + shape[1]] * np.float32(_SPREAD)
 
 
-_SPREAD = 1 / 0.74  # what cubic interpolation between independent numbers takes from their spread
-
-
 def fractal(
     rng: np.random.Generator, shape: tuple[int, int], widest_px: float, narrowest_px: float, fall: float = 0.5
 ) -> np.ndarray:
-    """(H, W) float32 with standard deviation 1: bumps of halving widths, each octave `fall` as high as the wider one."""
+    """(H, W) float32 with standard deviation 1: bumps of halving widths, each octave `fall` times the one before."""
     total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, widest_px
     while width >= narrowest_px or power == 0:
         total += np.float32(height) * bumps(rng, shape, width)
@@ -47,10 +46,16 @@ def band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: i
     return large[skip : skip + rows[1] - rows[0], 2 * width_px : 2 * width_px + columns]
 
 
-def sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: np.ndarray | float) -> np.ndarray:
-    """Rows [first, last) of an endless picture that is 0 but for a share of its pixels, which are in (0, 1]."""
-    drawn = _white(seed, rows[0], rows[1], columns, uniform=True)
-    return np.where(drawn < share, 1 - drawn / np.maximum(share, 1e-9), 0).astype(np.float32)
+def sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
+    """Rows [first, last) of an endless picture that is 0 but for a share of its pixels, which are in (0.3, 1]."""
+    first = rows[0] // _BLOCK
+    drawn = np.zeros((((rows[1] - 1) // _BLOCK + 1 - first) * _BLOCK, columns), np.float32)
+    for block in range(first, first + len(drawn) // _BLOCK):
+        rng = np.random.default_rng([*seed, block + _FIRST])
+        at = rng.integers(0, _BLOCK * columns, rng.poisson(min(share, 1) * _BLOCK * columns))
+        drawn[(block - first) * _BLOCK :][:_BLOCK].reshape(-1)[at] = 1 - 0.7 * rng.random(len(at), np.float32)
+    skip = rows[0] - first * _BLOCK
+    return drawn[skip : skip + rows[1] - rows[0]]
 
 
 def enlarged(coarse: np.ndarray, rows: tuple[int, int], factor: int) -> np.ndarray:
@@ -62,11 +67,10 @@ def enlarged(coarse: np.ndarray, rows: tuple[int, int], factor: int) -> np.ndarr
     return large[skip : skip + rows[1] - rows[0]]
 
 
-def _white(seed: tuple[int, ...], first: int, last: int, columns: int, uniform: bool = False) -> np.ndarray:
+def _white(seed: tuple[int, ...], first: int, last: int, columns: int) -> np.ndarray:
+    """Rows [first, last) of an endless (_, columns) picture of independent normal numbers."""
     parts = []
     for block in range(first // _BLOCK, (last - 1) // _BLOCK + 1):
-        rng = np.random.default_rng([*seed, block + 1_000_000])
-        shape = (_BLOCK, columns)
-        part = rng.random(shape, np.float32) if uniform else rng.standard_normal(shape, np.float32)
+        part = np.random.default_rng([*seed, block + _FIRST]).standard_normal((_BLOCK, columns), np.float32)
         parts.append(part[max(first - block * _BLOCK, 0) : last - block * _BLOCK])
     return np.concatenate(parts)

@@ -1,7 +1,7 @@
-"""Bare ground of a desert in southern Arizona: soils of several tones, dry creek beds, a dirt road, trails, grass, stones.
+"""Bare ground of a desert in southern Arizona: soils, dry creek beds, a dirt road, trails, grass, stones.
 
-Colours are BGR as a photo shows them in full sun. Broad patterns are laid on a grid 8 times coarser than the texture and
-enlarged; what is finer is added band by band, so that a large world needs little memory.
+Colours are BGR as a photo shows them in full sun. Broad patterns are laid on a grid 8 times coarser than the texture
+and enlarged; what is finer is added band by band, so that a large world needs little memory.
 """
 
 from dataclasses import dataclass
@@ -14,34 +14,39 @@ from torchvision_dddas.simulation.noise import band, bumps, enlarged, fractal, s
 COARSE = 8
 """Pixels of the texture to a cell of the broad patterns."""
 
-_TAN, _RED, _PALE, _DARK = (
-    np.array(c, np.float32) for c in ((112, 144, 172), (98, 128, 168), (150, 176, 196), (84, 108, 130))
-)
-_SAND, _GRASS, _ROAD = (np.array(c, np.float32) for c in ((140, 168, 190), (98, 138, 152), (136, 164, 186)))
+
+def _bgr(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+_TAN, _RED, _PALE, _DARK = _bgr(112, 144, 172), _bgr(94, 126, 168), _bgr(150, 176, 196), _bgr(84, 106, 128)
+_SAND, _ROAD = _bgr(146, 172, 194), _bgr(138, 164, 186)
+_STRAW, _GREEN = _bgr(90, 130, 150), _bgr(66, 94, 90)
+
+# Stones, from gravel to boulders, and single tufts: how many a square metre, their radius in metres, and how much
+# brighter than the soil the stones are, how dense the tufts.
+_STONES = ((4.0, 0.05, 30.0), (0.5, 0.1, 40.0), (0.03, 0.22, 28.0))
+_TUFTS = ((2.5, 0.12, 0.9), (0.35, 0.28, 1.0))
 
 
 @dataclass(frozen=True)
 class Lie:
-    """Broad patterns of the ground, each (h, w) float32 on the coarse grid, row 0 the north edge.
+    """Broad patterns of the ground, each (h, w) float32 on the coarse grid of cell_m, row 0 the north edge.
 
-    tone: (h, w, 3) of the soil. grass: how much of it grows, 0 to 1. wash_m, road_m, trail_m: metres from the middle of
-    the nearest creek bed, road, trail; wash_half_m: half the creek's width there.
+    tone: (3, h, w) BGR of the soil. grass: how much of it grows, 0 to 1; green: how much of that is green, not dry.
+    gravel: how rough the soil is, about 1. wash_m, road_m, trail_m: metres from the middle of the nearest creek bed,
+    road, trail, the last two with a sign for the side; wash_half_m: half the creek's width there.
     """
 
+    cell_m: float
     tone: np.ndarray
     grass: np.ndarray
+    green: np.ndarray
+    gravel: np.ndarray
     wash_m: np.ndarray
     wash_half_m: np.ndarray
     road_m: np.ndarray
     trail_m: np.ndarray
-    cell_m: float
-
-    def at(self, field: np.ndarray, east_north_m: np.ndarray) -> np.ndarray:
-        """(N,) of a field at places (N, 2)."""
-        half = field.shape[0] * self.cell_m / 2
-        column = np.clip((east_north_m[:, 0] + half) / self.cell_m, 0, field.shape[1] - 1).astype(int)
-        row = np.clip((half - east_north_m[:, 1]) / self.cell_m, 0, field.shape[0] - 1).astype(int)
-        return field[row, column]
 
 
 def lie(side_m: float, cells: int, seed: int) -> Lie:
@@ -54,11 +59,11 @@ def lie(side_m: float, cells: int, seed: int) -> Lie:
     def patches(widest_m: float, fall: float = 0.6) -> np.ndarray:
         return fractal(rng, shape, max(widest_m / cell, 1), 1, fall)
 
-    red, pale, dark = patches(90), patches(40), patches(25)
-    tone = np.broadcast_to(_TAN, (*shape, 3)).copy()
-    for share, colour in ((red, _RED), (pale - 0.7, _PALE), (dark - 0.9, _DARK)):
-        tone += np.clip(0.5 * share + 0.25, 0, 0.85)[..., None] * (colour - tone)
-    tone *= (1 + 0.05 * patches(12))[..., None]
+    tone = np.empty((3, *shape), np.float32)
+    tone[:] = _TAN[:, None, None]
+    for share, colour in ((patches(90), _RED), (patches(40) - 0.7, _PALE), (patches(25) - 0.9, _DARK)):
+        tone += np.clip(0.5 * share + 0.25, 0, 0.85) * (colour[:, None, None] - tone)
+    tone *= 1 + 0.06 * patches(12) + 0.05 * patches(4)
     ripple = 1.5 * patches(30, 0.5)
 
     def course(swing_m: float, winding_m: float) -> np.ndarray:
@@ -70,66 +75,96 @@ def lie(side_m: float, cells: int, seed: int) -> Lie:
             phase, high = rng.uniform(0, 2 * np.pi), swing_m * length / winding_m
             swing += high * np.sin(2 * np.pi / length * along + phase)
             slope += high * 2 * np.pi / length * np.cos(2 * np.pi / length * along + phase)
-        return (aside - swing) / np.sqrt(1 + slope**2)
+        return np.asarray((aside - swing) / np.sqrt(1 + slope**2))
 
-    wash, half = np.full(shape, 1e3, np.float32), np.zeros(shape, np.float32)
+    wash, half = np.full(shape, 1e3, np.float32), np.ones(shape, np.float32)
     for size in (1.0, 0.5, 0.35, 0.3)[: max(1, min(4, round(side_m / 100)))]:
         distance = np.abs(course(9 * size**0.5, 110 * size**0.5) + ripple)
-        width = size * (3.0 + 1.5 * bumps(rng, shape, 30 / cell)).clip(1.2)
-        nearer = distance / width < wash / np.maximum(half, 1e-6)
+        width = np.clip(size * (3.0 + 1.5 * bumps(rng, shape, max(30 / cell, 1))), 0.4, None)
+        nearer = distance / width < wash / half
         wash, half = np.where(nearer, distance, wash), np.where(nearer, width, half)
     road = course(14, 260)
     trail = np.full(shape, 1e3, np.float32)
     for _ in range(max(1, round(side_m / 100))):
         line = course(5, 60)
         trail = np.where(np.abs(line) < np.abs(trail), line, trail)
-    grass = np.clip(0.45 + 0.35 * patches(35, 0.65), 0, 1)
-    return Lie(*(np.ascontiguousarray(f, np.float32) for f in (tone, grass, wash, half, road, trail)), cell)
+    grass = np.clip(0.45 + 0.3 * patches(35, 0.65) + 0.12 * patches(4), 0, 1)
+    green = np.clip(0.45 + 0.35 * patches(20, 0.7) + 0.4 * np.exp(-np.clip(wash - half, 0, None) / 3), 0, 1)
+    gravel = np.clip(1 + 0.35 * patches(18, 0.7), 0.3, 2)
+    fields = [np.asarray(field, np.float32) for field in (grass, green, gravel, wash, half, road, trail)]
+    return Lie(cell, tone, *fields)
 
 
 def soil(ground: Lie, rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray) -> np.ndarray:
-    """Rows [first, last) of the ground's colours, (n, W, 3) float32 BGR, as on a level plane in the sun."""
+    """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, as on a level plane in the sun."""
     columns = ground.grass.shape[1] * COARSE
+    # What the sun's light strikes beside a pixel matters to it: so many more rows, which are cut off at the end.
+    edge = max(int(np.ceil(0.3 / texel_m)), 1)
+    wide = rows[0] - edge, rows[1] + edge
 
     def broad(field: np.ndarray) -> np.ndarray:
-        return enlarged(field, rows, COARSE)
+        return enlarged(field, wide, COARSE)
 
     def fine(key: int, width_m: float) -> np.ndarray:
-        return band((seed, 12, key), rows, columns, max(round(width_m / texel_m), 1))
+        """Noise with bumps of a width; those within a pixel even out."""
+        noise = band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
+        return noise if width_m >= texel_m else noise * np.float32(width_m / texel_m)
 
-    coarse, middle, small, grain = fine(0, 0.8), fine(1, 0.4), fine(2, 0.2), fine(3, 0.1)
-    image = broad(ground.tone)
-    grass = np.clip(broad(ground.grass) + 0.12 * coarse + 0.1 * middle, 0, 1)
-    wash, half, road, trail = (broad(f) for f in (ground.wash_m, ground.wash_half_m, ground.road_m, ground.trail_m))
-    in_wash = np.clip((half - wash) / 0.8 + 0.25 * coarse + 0.15 * middle, 0, 1)
-    on_road = np.clip((1.9 - np.abs(road)) / 0.5 + 0.3 * middle + 0.3 * coarse, 0, 1)
-    on_trail = np.clip((0.35 - np.abs(trail)) / 0.3 + 0.25 * middle, 0, 0.7)
+    large, middle, small, grain = fine(0, 0.8), fine(1, 0.4), fine(2, 0.2), fine(3, 0.1)
+    grass, wash, half, road = (broad(f) for f in (ground.grass, ground.wash_m, ground.wash_half_m, ground.road_m))
+    # Where the nearest trail changes, its side may too: no trail is there.
+    trail = np.maximum(np.abs(broad(ground.trail_m)), broad(np.abs(ground.trail_m)) - 0.5 * ground.cell_m)
+    ragged = 0.25 * large + 0.2 * middle
+    off_road = np.abs(road)
+    in_wash = np.clip((half - wash) / 0.8 + ragged, 0, 1)
+    on_road = np.clip((1.9 - off_road) / 0.5 + ragged, 0, 1)
+    on_trail = np.clip((0.35 - trail) / 0.3 + ragged, 0, 0.7)
     bare = (1 - in_wash) * (1 - on_road) * (1 - on_trail)
-    grass *= bare
-    rough = 5 * coarse + 5 * middle + 5 * small + 5 * grain
-    image += in_wash[..., None] * (_SAND - image)
-    bank = np.exp(-(((wash - half - 0.5) / 0.7) ** 2)) * (1 - on_road)
-    image *= (1 - 0.18 * bank)[..., None]
-    image += (0.8 * on_road)[..., None] * (_ROAD - image)
-    wheels = np.exp(-(((np.abs(road) - 0.85 - 0.04 * coarse) / 0.25) ** 2))
-    image *= (1 + on_road * (0.09 * wheels - 0.04))[..., None]
-    image += (0.7 * on_trail)[..., None] * (_PALE - image)
-    image += (0.55 * grass)[..., None] * (_GRASS - image)
-    image += (rough * (1 - 0.5 * in_wash - 0.4 * on_road))[..., None]
 
-    # Tufts and stones: sparks spread into blots, lit on the side of the sun and shaded on the other.
-    for key, (each_m2, size_m, strength) in enumerate(
-        ((3.0, 0.12, -70), (0.7, 0.22, -60), (0.5, 0.1, 60), (0.08, 0.2, 55))
-    ):
-        share = np.clip(each_m2 * texel_m**2, 0, 0.2)
-        amount = share * (
-            np.clip(grass * 1.6, 0.08, 1) if strength < 0 else np.clip(1.2 - grass, 0.1, 1) * (1 - 0.7 * on_road)
-        )
-        spread = max(size_m / texel_m, 0.45)
-        margin = int(4 * spread) + 2
-        wide = rows[0] - margin, rows[1] + margin
-        drawn = sparks((seed, 13, key), wide, columns, float(share))
-        drawn[margin:-margin] *= np.clip(amount / share, 0, 1) > 0.5
-        blot = cv2.GaussianBlur(drawn, (0, 0), spread)[margin:-margin] * np.float32(2 * np.pi * spread**2)
-        image += (np.clip(blot, 0, 1) * strength)[..., None] * np.array([1, 0.95, 0.95], np.float32)
-    return image
+    clumps = 0.7 * large + 0.6 * middle + 0.5 * small - 2.5 + 2.4 * grass * bare
+    clumps = np.clip(clumps * 2, 0, 1)
+
+    def strewn(key: int, each_m2: float, radius_m: float) -> np.ndarray:
+        spread = max(0.6 * radius_m / texel_m, 0.4)
+        reach = int(3 * spread) + 2
+        drawn = sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
+        full = min(7 * spread**2, (radius_m / texel_m) ** 2 * 6)  # what is smaller than a pixel fills it in part
+        return np.minimum(cv2.GaussianBlur(drawn, (0, 0), spread)[reach:-reach] * np.float32(full), 1)
+
+    stones = np.zeros_like(large)
+    for key, (each_m2, radius_m, bright) in enumerate(_STONES):
+        stones += bright * strewn(key, each_m2, radius_m)
+    for key, (each_m2, radius_m, dense) in enumerate(_TUFTS):
+        tufts = strewn(10 + key, each_m2, radius_m) * np.clip(1.5 * (1.3 * grass + 0.3 * large) - 0.3, 0, 1)
+        clumps = np.maximum(clumps, dense * tufts * bare)
+    rough = broad(ground.gravel) * (1 - 0.55 * in_wash - 0.5 * on_road)
+    stones *= rough * (1 - clumps)
+
+    # The small heights that the sun picks out: metres.
+    height = rough * (0.012 * large + 0.01 * middle + 0.008 * small + 0.008 * grain) + 0.015 * clumps + 0.001 * stones
+    bank = np.exp(-(((wash - half - 0.4) / 0.6) ** 2)) * (1 - on_road)
+    height += 0.12 * in_wash * (in_wash - 2)
+    slant = to_sun[:2] / np.maximum(to_sun[2], 0.5)
+    step = max(1, round(0.1 / texel_m))
+    light = np.float32(slant[0]) * (np.roll(height, step, 1) - np.roll(height, -step, 1))
+    light += np.float32(slant[1]) * (np.roll(height, -step, 0) - np.roll(height, step, 0))
+    light = np.clip(1 + light / np.float32(2 * step * texel_m), 0.45, 1.5)
+    away = np.round(-0.2 * slant / np.maximum(np.hypot(*slant), 0.2) / texel_m).astype(int)
+    light *= 1 - 0.55 * np.clip(np.roll(clumps, (-away[1], away[0]), (0, 1)) - clumps, 0, 1)
+
+    dull = 1 + 0.035 * large + 0.035 * middle + 0.035 * small + 0.045 * grain - 0.15 * bank
+    wheels = np.exp(-(((off_road - 0.85 - 0.04 * large) / 0.25) ** 2))
+    dull += on_road * (0.09 * wheels - 0.04) + in_wash * 0.05 * np.sin(2 * wash + 2 * large)
+    light *= dull
+    straw_to_green = np.clip(broad(ground.green) + 0.25 * middle + 0.2 * large, 0, 1)
+    planes = []
+    for k in range(3):
+        plane = broad(ground.tone[k])
+        plane += in_wash * (_SAND[k] - plane)
+        plane += 0.8 * on_road * (_ROAD[k] - plane)
+        plane += 0.6 * on_trail * (_PALE[k] - plane)
+        plane += clumps * (_STRAW[k] + straw_to_green * (_GREEN[k] - _STRAW[k]) - plane)
+        plane += stones
+        plane *= light
+        planes.append(plane[edge : edge + rows[1] - rows[0]])
+    return np.stack(planes)

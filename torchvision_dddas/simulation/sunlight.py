@@ -18,7 +18,7 @@ def on_slopes(up_m: np.ndarray, step_m: float, to_sun: np.ndarray) -> np.ndarray
     north, east = np.gradient(up_m, step_m)
     facing = (to_sun[2] - east * to_sun[0] - north * to_sun[1]) / np.sqrt(1 + east**2 + north**2)
     direct = 1 - float(SHADE_BGR.mean())
-    return np.asarray(1 - direct + direct * np.clip(facing, 0, None) / to_sun[2], np.float32)
+    return np.asarray(1 - direct + direct * np.clip(facing / to_sun[2], 0, 2), np.float32)
 
 
 def above_ground(heights_m: np.ndarray, texel_m: float, to_sun: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from torchvision_dddas.simulation import relief as reliefs
 from torchvision_dddas.simulation import sunlight
 from torchvision_dddas.simulation.cover import Crowns, Things, scatter
 from torchvision_dddas.simulation.noise import enlarged
+from torchvision_dddas.simulation.ortho import Photographed
 from torchvision_dddas.simulation.scenario import WorldKnobs
 from torchvision_dddas.simulation.soil import COARSE, lie, soil
 from torchvision_dddas.types import Elevation, Ortho
@@ -26,8 +27,8 @@ class World:
     """The ground and what stands on it, all for a square of side_m about the origin; local metres, z up.
 
     albedo: (H, W, 3) uint8 BGR, seen from above, with light and cast shadows, row 0 the north edge; the first pixel's
-    centre is at (-side_m / 2 + texel_m / 2, side_m / 2 - texel_m / 2). surface: (H2, W2) float32 metres above the ground
-    of what stands there, on pixels of surface_texel_m over the same square. relief: heights of the bare ground.
+    centre is at (-side_m / 2 + texel_m / 2, side_m / 2 - texel_m / 2). surface: (H2, W2) float32 metres above the
+    ground of what stands there, on pixels of surface_texel_m over the same square. relief: heights of the bare ground.
     to_sun: (3,) unit vector. Beyond its edges the world is mirrored, as by cv2.BORDER_REFLECT.
     """
 
@@ -84,16 +85,23 @@ def build(
 
     factor = 2 if side_px <= _ROWS_OF_SURFACE else 4
     surface = crowns.surface(side_px // factor)
-    over = sunlight.above_ground(surface + _on_texels(relief.up_m, surface.shape[0]), texel * factor, to_sun)
+    hills = np.float32(0) if photo is not None else _on_texels(relief.up_m, surface.shape[0])
+    over = sunlight.above_ground(surface + hills, texel * factor, to_sun)
     light = _on_texels(sunlight.on_slopes(relief.up_m, relief.step_m, to_sun), cells)
+
+    def synthetic(rows: tuple[int, int]) -> np.ndarray:
+        return soil(ground, rows, texel, seed, to_sun) * enlarged(light, rows, COARSE)
+
+    bare = synthetic if photo is None else Photographed(photo, side_m, side_px, synthetic).rows
     albedo = np.empty((side_px, side_px, 3), np.uint8)
     for first in range(0, side_px, _BAND):
         rows = first, min(first + _BAND, side_px)
-        image = soil(ground, rows, texel, seed, to_sun)
+        image = bare(rows)
         crowns.paint(image, first, texel, to_sun)
-        shade = np.clip(enlarged(over, rows, factor) / 0.25 - 0.2, 0, 1)[..., None]
-        image *= enlarged(light, rows, COARSE)[..., None] * (1 - shade * (1 - sunlight.SHADE_BGR))
-        albedo[rows[0] : rows[1]] = np.clip(np.round(image), 0, 255)
+        shade = np.clip(enlarged(over, rows, factor) / 0.25 - 0.2, 0, 1)
+        for k in range(3):
+            lit = image[k] * (1 - shade * (1 - sunlight.SHADE_BGR[k]))
+            albedo[rows[0] : rows[1], :, k] = np.clip(np.round(lit), 0, 255)
     return World(side_m, texel, albedo, surface, texel * factor, relief, things, to_sun)
 
 
