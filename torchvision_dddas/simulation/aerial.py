@@ -1,6 +1,5 @@
 """What the UAV's camera films of a simulated world, and the truth of every pixel."""
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.moment import Moment
@@ -31,5 +30,5 @@ class AerialCamera:
         lie = self._terrain.lie(moment)
         picture = self._terrain.texture(lie)
         targets, bodies = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
-        self._painter.paint(moment, picture, targets, bodies)
+        self._painter.paint(moment, picture, targets, bodies, lie.rise_m)
         return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies

@@ -35,7 +35,8 @@ class Sensor:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), knobs.sharpness_px))
         levels = np.asarray(np.arange(256) * self.gain(time_s), np.float32)
         if self._tile is None:
-            picture = np.asarray(cv2.LUT(picture, np.clip(np.round(levels), 0, 255).astype(np.uint8)))
+            whole = np.asarray(np.clip(np.round(levels), 0, 255), np.uint8)
+            picture = np.asarray(cv2.LUT(picture, whole))
         else:
             sigma = np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2).astype(np.float32)
             rng = np.random.default_rng([*self._key, number])

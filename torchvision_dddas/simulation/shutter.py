@@ -53,10 +53,12 @@ class Shutter:
 
 def turned(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
     """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
-    if not np.any(lag_s):
+    if not np.any(lag_s) or not np.any(turn_rad_s):
         return vectors
-    once = lag_s * np.cross(turn_rad_s, vectors)
-    return vectors + once + lag_s / 2 * np.cross(turn_rad_s, once)
+    x, y, z = turn_rad_s
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]).T
+    once = lag_s * (vectors @ across)
+    return vectors + once + lag_s / 2 * (once @ across)
 
 
 def landing(

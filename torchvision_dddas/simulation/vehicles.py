@@ -64,7 +64,7 @@ def ugv() -> Faces:
     box((0.0, 0.0, 0.5), (UGV_LENGTH_M, 1.08, 0.5), 12.0, 0.9)
     box((1.0, 0.0, 0.95), (0.16, 0.3, 0.5), 40.0, 0.0)
     top = np.array([(1, 1, 0), (1, -1, 0), (-1, -1, 0), (-1, 1, 0)]) * [PLATE_M[0] / 2, PLATE_M[1] / 2, 0]
-    rows.append((top + [0, 0, UGV_HEIGHT_M], np.array([0.0, 0.0, 1.0]), 0.0, 0.0))
+    rows.append((top + np.array([0, 0, UGV_HEIGHT_M]), np.array([0.0, 0.0, 1.0]), 0.0, 0.0))
     plate = np.zeros(len(rows))
     plate[-1] = 1
     return Faces(
