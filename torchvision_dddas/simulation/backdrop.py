@@ -1,14 +1,12 @@
 """Sky and ground as a camera near the ground sees them: hills hide what lies behind, haze takes what is far."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.camera import View
-
-if TYPE_CHECKING:
-    from torchvision_dddas.simulation.world import World
+from torchvision_dddas.simulation.world import World
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
 _ZENITH = np.array([196.0, 140, 84], np.float32)
@@ -23,16 +21,28 @@ _GRAIN_M = (0.009, 0.041)  # its texels, laid out twice
 
 
 class Seen(NamedTuple):
-    """image: (H, W, 3) float32 BGR. inverse_m: (H, W) float32, 1 / the way over the ground to each pixel; 0: sky."""
+    """image: (H, W, 3) uint8 BGR. inverse_m: (H, W) float32, 1 / the way over the ground to each pixel; 0: sky."""
 
     image: np.ndarray
     inverse_m: np.ndarray
 
 
+class _Rays(NamedTuple):
+    """Rays through some columns of a picture, all its rows: (H, C) each.
+
+    east, north: of a ray one metre long in depth. level: its length over the ground. rise: metres up a metre ahead.
+    """
+
+    east: np.ndarray
+    north: np.ndarray
+    level: np.ndarray
+    rise: np.ndarray
+
+
 class Backdrop:
     """The ground of a world, made ready for a look along it."""
 
-    def __init__(self, world: "World", seed: int) -> None:
+    def __init__(self, world: World, seed: int) -> None:
         self._world = world
         self._levels = [world.albedo]
         while len(self._levels) < _LEVELS and min(self._levels[-1].shape[:2]) >= 4:
@@ -46,90 +56,111 @@ class Backdrop:
     def seen(self, view: View, size: tuple[int, int]) -> Seen:
         """What a view (its picture's width, height) holds of it."""
         width, height = size
-        rays = np.linalg.inv(view.image_from_world[:, :3])  # of a pixel (u, v, 1), in east, north, up
-        inverse = self._inverse_distance(view, rays, size)
-        v, u = np.mgrid[:height, :width].astype(np.float32)
-        ray = [(rays[i, 0] * u + rays[i, 1] * v + rays[i, 2]).astype(np.float32) for i in range(3)]
-        level = np.sqrt(ray[0] ** 2 + ray[1] ** 2)
-        image = self._sky(ray[2] / level, np.arctan2(ray[0][height // 2], ray[1][height // 2]), view)
-        rows = np.flatnonzero((inverse > 0).any(axis=1))
-        if len(rows):
-            low = slice(int(rows[0]), height)
-            ground = self._ground(view, inverse[low], ray[0][low] / level[low], ray[1][low] / level[low])
-            away = (inverse[low] > 0)[..., None]
-            image[low] = np.where(away, ground, image[low])
-        return Seen(image, inverse)
-
-    def _inverse_distance(self, view: View, rays: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """(H, W): on each ray the first place at which the ground reaches it."""
-        width, height = size
         columns = np.linspace(0, width - 1, (width - 1) // _COLUMN_PX + 2)
-        v = np.arange(height)
-        directions = np.einsum(
-            "ij,jvu->ivu", rays, np.stack([*np.meshgrid(columns, v), np.ones((height, len(columns)))])
-        )
-        falls = -directions[2] / np.hypot(directions[0], directions[1])
-        middle = directions[:2, np.abs(falls).argmin(axis=0), np.arange(len(columns))]
-        middle = middle / np.linalg.norm(middle, axis=0)
+        rays = _rays(view, columns, height)
+        inverse = self._inverse_distance(view, rays)
+        # Between the columns all goes evenly; cv2.resize would count from the pixels' edges.
+        at = np.linspace(0, len(columns) - 1, width, dtype=np.float32)
+        whole_inverse = _widened(inverse, at)
+        whole_inverse[whole_inverse < 0.5 / _FAR_M] = 0
+        rows = np.flatnonzero((whole_inverse > 0).any(axis=1))
+        first = int(rows[0]) if len(rows) else height
+        image = np.empty((height, width, 3), np.uint8)
+        last = min(first + _COLUMN_PX * 4, height)  # the ground's edge need not be level
+        while last < height and not (whole_inverse[last] > 0).all():
+            last += 1
+        sky = self._sky(_Rays(*(part[:last] for part in rays)), view)
+        image[:last] = _widened(sky, at)
+        if first < height:
+            ground = self._ground(view, whole_inverse[first:], _rays(view, np.arange(width), height, first), first)
+            mixed, onto = last - first, image[first:last]
+            onto[:] = np.where((whole_inverse[first:last] > 0)[..., None], ground[:mixed], onto)
+            image[last:] = ground[mixed:]
+        return Seen(image, whole_inverse)
+
+    def _inverse_distance(self, view: View, rays: _Rays) -> np.ndarray:
+        """(H, C) on each ray the first place at which the ground reaches it, as 1 / metres; 0: none."""
+        count = rays.rise.shape[1]
+        middle = np.abs(rays.rise).argmin(axis=0), np.arange(count)
+        bearing = np.stack([rays.east[middle], rays.north[middle]], axis=1) / rays.level[middle][:, None]
         r = np.geomspace(0.5, _FAR_M, _STEPS)
-        places = view.position_m[:2] + (r[:, None, None] * middle.T).reshape(-1, 2)
+        places = view.position_m[:2] + (r[:, None, None] * bearing).reshape(-1, 2)
         up = self._world.up_m(places).reshape(_STEPS, -1)
         # Slopes below the horizontal under which each place is seen over all that is nearer.
         slopes = np.minimum.accumulate((view.position_m[2] - up) / r[:, None], axis=0)
-        inverse = np.empty((height, len(columns)), np.float32)
-        for k in range(len(columns)):
-            inverse[:, k] = np.interp(falls[:, k], slopes[::-1, k], 1 / r[::-1], left=0.0)
-        at = np.linspace(0, len(columns) - 1, width, dtype=np.float32)
-        whole = cv2.remap(
-            inverse,
-            np.ascontiguousarray(np.broadcast_to(at, (height, width))),
-            np.ascontiguousarray(np.broadcast_to(np.arange(height, dtype=np.float32)[:, None], (height, width))),
-            cv2.INTER_LINEAR,
-        )
-        whole[whole < 0.5 / _FAR_M] = 0
-        return whole
+        inverse = np.empty(rays.rise.shape, np.float32)
+        for k in range(count):
+            inverse[:, k] = np.interp(-rays.rise[:, k], slopes[::-1, k], 1 / r[::-1], left=0.0)
+        return inverse
 
-    def _ground(self, view: View, inverse: np.ndarray, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        far = 1 / np.maximum(inverse, 0.5 / _FAR_M)
-        x = east * far + np.float32(view.position_m[0])
-        y = north * far + np.float32(view.position_m[1])
+    def _ground(self, view: View, inverse: np.ndarray, rays: _Rays, first: int) -> np.ndarray:
+        """(H, W, 3) uint8, rows from the first on which there is ground."""
+        inverse = np.maximum(inverse, np.float32(0.5 / _FAR_M))
+        depth = 1 / (inverse * rays.level)
+        x = rays.east * depth + np.float32(view.position_m[0])
+        y = rays.north * depth + np.float32(view.position_m[1])
         focal = float(np.linalg.norm(view.image_from_world[0, :3]))
         eye = max(float(view.position_m[2] - self._world.up_m(view.position_m[None, :2])[0]), 0.2)
-        # A pixel covers far / focal across and far^2 / (focal eye) along the line of sight.
+        # A pixel covers far / focal across and far^2 / (focal eye) along the line of sight; alike all along a row.
+        far = 1 / np.median(inverse[:, ::16], axis=1)
         across, along = far / focal, far**2 / (focal * eye)
         blur = np.log2(np.maximum(np.sqrt(across * along) / self._world.texel_m, 1))
-        blur = np.minimum(blur, len(self._levels) - 1)
-        image = np.zeros((*far.shape, 3), np.float32)
-        for k, texture in enumerate(self._levels):
-            share = np.maximum(1 - np.abs(blur - k), 0)
-            rows = np.flatnonzero(share.any(axis=1))
-            if len(rows):
-                part = slice(int(rows[0]), int(rows[-1]) + 1)
-                per_m = texture.shape[1] / self._world.side_m
-                u = (x[part] + np.float32(self._world.side_m / 2)) * np.float32(per_m) - np.float32(0.5)
-                v = (np.float32(self._world.side_m / 2) - y[part]) * np.float32(per_m) - np.float32(0.5)
-                colour = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-                image[part] += share[part, :, None] * colour
-        for grain in _GRAIN_M:
-            strength = np.clip(1.3 - along / (6 * grain), 0, 1)
-            rows = np.flatnonzero(strength.any(axis=1))
-            if len(rows):
-                part = slice(int(rows[0]), int(rows[-1]) + 1)
-                u, v = (np.mod(c[part] / np.float32(grain), _TILE).astype(np.float32) for c in (x, y))
-                pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-                image[part] *= 1 + (strength[part] * pebbles)[..., None]
-        clear = np.exp(-far / VISIBILITY_M)[..., None]
-        return image * clear + HAZE * (1 - clear)
+        blur = np.clip(blur, 0, len(self._levels) - 1.001)
+        clear = np.exp(-far / VISIBILITY_M).astype(np.float32)
+        image = np.empty((*x.shape, 3), np.uint8)
+        for k in np.unique(np.floor(blur).astype(int)):
+            rows = np.flatnonzero(np.floor(blur) == k)
+            part = slice(int(rows[0]), int(rows[-1]) + 1)
+            fine = self._texture(int(k), x[part], y[part])
+            share = (blur[part] - k).astype(np.float32)[:, None, None]
+            if share.max() > 0:
+                fine = fine + (self._texture(int(k) + 1, x[part], y[part]) - fine) * share
+            for grain in _GRAIN_M:
+                strength = np.clip(1.3 - along[part] / (6 * grain), 0, 1).astype(np.float32)
+                if strength.max() > 0:
+                    # Beyond 16 bits OpenCV would lose count of the tiles.
+                    u, v = (np.mod(c[part] / np.float32(grain), np.float32(_TILE)) for c in (x, y))
+                    pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                    pebbles = 1 + strength[:, None] * pebbles
+                    fine = cv2.multiply(fine, cv2.merge([pebbles] * 3))
+            share = clear[part, None, None]
+            image[part] = np.clip(fine * share + HAZE * (1 - share), 0, 255)
+        return image
 
-    def _sky(self, rise: np.ndarray, bearing: np.ndarray, view: View) -> np.ndarray:
-        """rise: (H, W) metres up a metre ahead. bearing: (W,) of the picture's columns."""
-        depth = np.exp(-np.maximum(rise, 0) / 0.3)[..., None]
+    def _texture(self, level: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        texture, half = self._levels[level], np.float32(self._world.side_m / 2)
+        per_m = np.float32(texture.shape[1] / self._world.side_m)
+        u, v = (x + half) * per_m - np.float32(0.5), (half - y) * per_m - np.float32(0.5)
+        return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32)
+
+    def _sky(self, rays: _Rays, view: View) -> np.ndarray:
+        """(H, C, 3) float32."""
+        depth = np.exp(-np.maximum(rays.rise, 0) / 0.3)[..., None]
         sky = _ZENITH + (HAZE - _ZENITH) * depth
         share, phase = self._ridge
-        tall = 0.03 + 0.014 * (share[:, None] * np.sin(np.outer(np.arange(2, 14, 2), bearing) + phase[:, None])).sum(0)
+        bearing = np.arctan2(rays.east[-1], rays.north[-1])
+        waves = share[:, None] * np.sin(np.outer(np.arange(2, 14, 2), bearing) + phase[:, None])
+        tall = 0.03 + 0.014 * waves.sum(axis=0)
         focal = float(np.linalg.norm(view.image_from_world[0, :3]))
-        covered = np.clip((tall - rise) * focal + 0.5, 0, 1)[..., None].astype(np.float32)
+        covered = np.clip((tall - rays.rise) * focal + 0.5, 0, 1)[..., None].astype(np.float32)
         return sky + (_RIDGE * 0.6 + HAZE * 0.4 - sky) * covered
+
+
+def _rays(view: View, columns: np.ndarray, height: int, first: int = 0) -> _Rays:
+    """Those through some columns of a picture, from its row `first` on."""
+    matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # of a pixel (u, v, 1)
+    u, v = columns.astype(np.float32), np.arange(first, height, dtype=np.float32)[:, None]
+    east, north, up = (matrix[i, 0] * u + (matrix[i, 1] * v + matrix[i, 2]) for i in range(3))
+    level = cv2.magnitude(east, north)
+    return _Rays(east, north, level, up / level)
+
+
+def _widened(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(H, W) of an image (H, C) whose columns are looked up, evenly between them, at `at` (W,)."""
+    shape = len(image), len(at)
+    v = np.arange(len(image), dtype=np.float32)[:, None]
+    u, v = (np.ascontiguousarray(np.broadcast_to(one, shape)) for one in (at, v))
+    return cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
 
 
 def _pebbles(rng: np.random.Generator) -> np.ndarray:

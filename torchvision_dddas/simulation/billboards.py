@@ -1,24 +1,28 @@
-"""Bushes and trees as pictures that stand upright, and boxes, as a camera near the ground sees them."""
+"""Bushes and trees as pictures that stand upright, buildings and vehicles, as a camera near the ground sees them."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.simulation.backdrop import HAZE
 from torchvision_dddas.simulation.bodies import Canvas
 from torchvision_dddas.simulation.camera import View
+from torchvision_dddas.simulation.cover import Things
+from torchvision_dddas.simulation.vehicles import COVERED, Faces, placed
+from torchvision_dddas.types import Bodies
 
 _SHAPES = 6  # different bushes, and different trees
 _SIZE_PX = (160, 160)  # width, height of a drawn plant
+_DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
 NEAR_M = 0.4  # what is nearer to the camera, in depth, is not drawn
 
 
 @dataclass(frozen=True)
 class Plant:
-    """A drawn plant, smaller and smaller: cover (h, w) in [0, 1] and light (h, w), 1 where it has its own colour."""
+    """A drawn plant, smaller and smaller: (h, w, 2) float32, what it covers, 0 to 1, and its light times that."""
 
-    cover: tuple[np.ndarray, ...]
-    light: tuple[np.ndarray, ...]
+    layers: tuple[np.ndarray, ...]
 
 
 def plants(seed: int) -> dict[str, list[Plant]]:
@@ -27,53 +31,80 @@ def plants(seed: int) -> dict[str, list[Plant]]:
     return {"bush": [_bush(rng) for _ in range(_SHAPES)], "tree": [_tree(rng) for _ in range(_SHAPES)]}
 
 
-def draw_plant(plant: Plant, canvas: Canvas, box: tuple[float, float, float, float], colour: np.ndarray) -> None:
-    """Draw a plant into a box (left, top, right, bottom), px, of the picture; what is outside of it is left out."""
+def draw_plant(
+    plant: Plant, canvas: Canvas, box: tuple[float, float, float, float], colour: np.ndarray, turned: bool = False
+) -> None:
+    """Draw a plant into a box (left, top, right, bottom), px; turned: its left side to the right."""
     left, top, right, bottom = box
     height, width = canvas.picture.shape[:2]
     x0, y0 = max(int(np.floor(left)), 0), max(int(np.floor(top)), 0)
     x1, y1 = min(int(np.ceil(right)) + 1, width), min(int(np.ceil(bottom)) + 1, height)
     if x0 >= x1 or y0 >= y1 or right - left < 0.5 or bottom - top < 0.5:
         return
-    tall = bottom - top
-    k = int(np.clip(np.floor(np.log2(_SIZE_PX[1] / tall)), 0, len(plant.cover) - 1))
-    source = plant.cover[k].shape
-    scale = (right - left) / source[1], tall / source[0]
-    place = np.array([[scale[0], 0, left - x0 + 0.5 * scale[0]], [0, scale[1], top - y0 + 0.5 * scale[1]]])
-    cover, light = (
-        cv2.warpAffine(one, place, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        for one in (plant.cover[k], plant.light[k])
-    )
+    wide, tall = right - left, bottom - top
+    k = int(np.clip(np.floor(np.log2(_SIZE_PX[1] / tall)), 0, len(plant.layers) - 1))
+    layer = plant.layers[k]
+    along, down = wide / layer.shape[1], tall / layer.shape[0]
+    start = left - x0 + 0.5 * along - 0.5
+    if turned:
+        along, start = -along, right - x0 - 0.5 * along - 0.5
+    place = np.array([[along, 0, start], [0, down, top - y0 + 0.5 * down - 0.5]])
+    seen = cv2.warpAffine(layer, place, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    cover, light = seen[..., :1], seen[..., 1:]
     part = canvas.picture[y0:y1, x0:x1]
-    # Where its edge covers half, so much of its light came along.
-    part[:] = np.clip(part * (1 - cover[..., None]) + light[..., None] * colour.astype(np.float32), 0, 255)
-    canvas.mask[y0:y1, x0:x1][cover > 0.5] = 0
+    part[:] = np.minimum(part * (1 - cover) + light * colour.astype(np.float32), 255)
+    canvas.mask[y0:y1, x0:x1][cover[..., 0] > 0.5] = 0
 
 
-def draw_box(
-    corners_m: np.ndarray,
-    low_m: float,
-    high_m: float,
-    colour: np.ndarray,
-    view: View,
-    canvas: Canvas,
-    to_sun: np.ndarray,
+def draw_building(
+    things: Things, k: int, foot_m: float, colour: np.ndarray, view: View, canvas: Canvas, to_sun: np.ndarray
 ) -> None:
-    """Draw an upright box on an outline (4, 2), counter-clockwise seen from above, from one height to another."""
-    pairs = [(k, (k + 1) % 4) for k in range(4)]
-    faces = []
-    for a, b in pairs:
-        along = corners_m[b] - corners_m[a]
-        normal = np.array([along[1], -along[0], 0.0]) / max(float(np.linalg.norm(along)), 1e-9)
-        wall = np.array(
-            [[*corners_m[a], low_m], [*corners_m[b], low_m], [*corners_m[b], high_m], [*corners_m[a], high_m]]
-        )
-        faces.append((wall, normal))
-    faces.append((np.c_[corners_m, np.full(4, high_m)], np.array([0, 0, 1.0])))
-    for face, normal in faces:
-        if normal @ (view.position_m - face[0]) > 0:
-            light = 0.55 + 0.5 * max(float(normal @ to_sun), 0.0)
-            fill(face, np.clip(light * colour, 0, 255), 0, view, canvas)
+    """Draw a building's walls and roof, with a door and windows, that stands at a height."""
+    along = np.array([np.sin(things.heading_rad[k]), np.cos(things.heading_rad[k])])
+    across = np.array([-along[1], along[0]])
+    half, top = things.half_m[k], foot_m + float(things.height_m[k])
+    outline = things.east_north_m[k] + (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half) @ [along, across]
+    for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        start, way = outline[a], outline[b] - outline[a]
+        normal = np.array([way[1], -way[0], 0.0]) / float(np.linalg.norm(way))
+        if normal @ (view.position_m - [*start, foot_m]) <= 0:
+            continue
+        light = 0.5 + 0.5 * max(float(normal @ to_sun), 0.0)
+
+        def panel(first: float, last: float, low: float, high: float, tone: np.ndarray) -> None:
+            ends = start + first * way, start + last * way  # noqa: B023 (used at once)
+            corners = np.array([[*ends[0], low], [*ends[1], low], [*ends[1], high], [*ends[0], high]])
+            fill(corners, np.clip(tone, 0, 255), 0, view, canvas)
+
+        panel(0, 1, foot_m - 0.5, top, light * colour)
+        panel(0, 1, top - 0.25, top, 0.8 * light * colour)
+        length = float(np.linalg.norm(way))
+        openings = int(length // 3)
+        for n in range(openings):
+            middle, door = (n + 0.5) / openings, a == 0 and n == openings // 2
+            low, high, side = (0.0, 2.1, 0.45) if door else (1.0, 2.0, 0.5)
+            panel(middle - side / length, middle + side / length, foot_m + low, foot_m + high, light * _DARK)
+    if view.position_m[2] > top:
+        fill(np.c_[outline, np.full(4, top)], np.clip(colour * (0.5 + 0.5 * to_sun[2]), 0, 255), 0, view, canvas)
+
+
+def draw_vehicle(
+    faces: Faces, bodies: Bodies, k: int, haze: float, view: View, canvas: Canvas, to_sun: np.ndarray
+) -> None:
+    """Draw the faces of a car or a ground vehicle that look at the camera."""
+    corners, normal = placed(faces, bodies.place_m[k], float(bodies.facing_rad[k]))
+    plate = COVERED if bodies.hidden[k] or not np.isfinite(bodies.plate[k]).all() else bodies.plate[k]
+    colour = faces.colour + faces.paint[:, None] * bodies.colour[k] + faces.plate[:, None] * plate
+    light = np.where(faces.lit, 0.55 + 0.45 * np.maximum(normal @ to_sun, 0), 1)[:, None]
+    colour = np.clip(colour * light, 0, 255)
+    colour = colour + haze * (HAZE - colour)
+    middle = corners.mean(axis=1)
+    towards = ((view.position_m - middle) * normal).sum(axis=1) > 0
+    order = np.flatnonzero(towards)
+    if bodies.kind[k] == "ugv":  # a car's faces come in an order of their own: its doors lie on its flanks
+        order = order[np.argsort(-np.linalg.norm(middle[order] - view.position_m, axis=1))]
+    for n in order:
+        fill(corners[n], colour[n], int(bodies.number[k]), view, canvas)
 
 
 def fill(points_m: np.ndarray, colour: np.ndarray, value: int, view: View, canvas: Canvas) -> None:
@@ -164,9 +195,8 @@ def _twig(
 
 
 def _smaller(cover: np.ndarray, light: np.ndarray) -> Plant:
-    covers, lights = [cover], [light]
-    while min(covers[-1].shape) > 5:
-        size = covers[-1].shape[1] // 2, covers[-1].shape[0] // 2
-        covers.append(cv2.resize(covers[-1], size, interpolation=cv2.INTER_AREA))
-        lights.append(cv2.resize(lights[-1], size, interpolation=cv2.INTER_AREA))
-    return Plant(tuple(covers), tuple(lights))
+    layers = [np.stack([cover, light], axis=2)]
+    while min(layers[-1].shape[:2]) > 5:
+        size = layers[-1].shape[1] // 2, layers[-1].shape[0] // 2
+        layers.append(cv2.resize(layers[-1], size, interpolation=cv2.INTER_AREA))
+    return Plant(tuple(layers))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.bodies import Canvas
@@ -11,149 +12,173 @@ from torchvision_dddas.simulation.camera import View
 _TROUSERS = ((92, 66, 48), (40, 38, 36), (70, 70, 72), (84, 112, 132), (56, 74, 96), (120, 124, 128), (62, 48, 40))
 _SKIN = ((142, 172, 214), (104, 140, 188), (78, 108, 156), (52, 74, 112))
 _HAIR = ((22, 24, 28), (34, 48, 66), (60, 82, 110), (110, 112, 116))
-_ROUND = np.linspace(0, np.pi, 9)
+_SHOES = np.array([34.0, 36, 42])
+_ROUND = np.linspace(0, np.pi, 8)
+_BITS = 4  # of sub-pixel accuracy that OpenCV draws with
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Dress:
-    """What a person wears and how they are built; colours BGR. wide: width of the body beside the usual one."""
+    """What a person wears and how they are built and walk. wide, pace: beside the usual width and swing of the legs.
 
-    shirt: np.ndarray
-    trousers: np.ndarray
-    skin: np.ndarray
-    hair: np.ndarray
+    colours: (4, 3) BGR of shirt, trousers, skin and hair.
+    """
+
+    colours: np.ndarray
     wide: float
+    pace: float
     sleeves: bool
     skirt: bool
     hat: bool
     pack: bool
-    pace: float
 
 
-class Parts(NamedTuple):
-    """Tapered limbs, one row each: from, to (N, 3) local metres, radius there (N,), colour (N, 3) BGR."""
+class Figures(NamedTuple):
+    """Limbs of N people, L each. ends_m: (N, L, 2, 3). radius_m: (N, L, 2), NaN: not worn; colour: (N, L, 3)."""
 
-    start_m: np.ndarray
-    end_m: np.ndarray
-    start_radius_m: np.ndarray
-    end_radius_m: np.ndarray
+    ends_m: np.ndarray
+    radius_m: np.ndarray
     colour: np.ndarray
 
 
 def dress(colour: np.ndarray, seed: int, number: int) -> Dress:
     """What the person of a number wears, in a shirt of that colour; the same at each call."""
     rng = np.random.default_rng([seed, 61, number])
-    chance = rng.uniform(size=6)
+    chance = rng.uniform(size=4)
     skin, hair, trousers = (rng.integers(len(choice)) for choice in (_SKIN, _HAIR, _TROUSERS))
-    tone = rng.uniform(0.75, 1.2)
+    legs = np.array(_TROUSERS[trousers]) * rng.uniform(0.75, 1.2)
     return Dress(
-        np.asarray(colour, float),
-        np.clip(np.array(_TROUSERS[trousers]) * tone, 0, 255),
-        np.array(_SKIN[skin], float),
-        np.array(_HAIR[hair], float),
+        np.stack([np.asarray(colour, float), legs, np.array(_SKIN[skin]), np.array(_HAIR[hair])]),
         float(np.clip(rng.normal(1.0, 0.09), 0.8, 1.3)),
-        bool(chance[0] < 0.6),
-        bool(chance[1] < 0.12),
-        bool(chance[2] < 0.35),
-        bool(chance[3] < 0.3),
         float(rng.uniform(0.8, 1.2)),
+        *(bool(chance[k] < share) for k, share in enumerate((0.6, 0.12, 0.35, 0.3))),
     )
 
 
-def person(
-    feet_m: np.ndarray, facing_rad: float, height_m: float, speed_m_s: float, phase: float, wears: Dress
-) -> Parts:
-    """The limbs of someone who stands at a place (3,) or walks; phase in strides, facing clockwise from north."""
-    h = height_m
-    swing = 0.36 * wears.pace * min(speed_m_s / 1.4, 1.8) ** 0.7 if speed_m_s > 0.05 else 0.0
-    turn = 2 * np.pi * phase
-    ahead = np.array([np.sin(facing_rad), np.cos(facing_rad), 0.0])
-    right = np.array([np.cos(facing_rad), -np.sin(facing_rad), 0.0])
-    up = np.array([0.0, 0.0, 1.0])
+def figures(
+    feet_m: np.ndarray,
+    facing_rad: np.ndarray,
+    height_m: np.ndarray,
+    speed_m_s: np.ndarray,
+    phase: np.ndarray,
+    wear: list[Dress],
+) -> Figures:
+    """People who stand at (N, 3) or walk, with so many strides behind them; facing is clockwise from north."""
+    count = len(feet_m)
+    h = np.asarray(height_m, float)[:, None]
+    w = h * np.array([one.wide for one in wear])[:, None]
+    shirt, trousers, skin, hair = (np.array([one.colours[k] for one in wear]).reshape(-1, 3) for k in range(4))
+    ahead = np.stack([np.sin(facing_rad), np.cos(facing_rad), np.zeros(count)], axis=1)
+    right = np.stack([ahead[:, 1], -ahead[:, 0], np.zeros(count)], axis=1)
+    speed = np.clip(speed_m_s, 0, 3)
+    swing = 0.36 * np.array([one.pace for one in wear]) * (np.minimum(speed, 2.5) / 1.4) ** 0.7 * (speed > 0.05)
+    rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def along(angle: float) -> np.ndarray:
+    def along(angle: np.ndarray) -> np.ndarray:
         """Down, turned forward."""
-        return np.sin(angle) * ahead - np.cos(angle) * up
+        return np.sin(angle)[:, None] * ahead - np.cos(angle)[:, None] * _UP
 
-    legs = []
-    for side in (1, -1):
-        thigh = swing * np.sin(turn + (side < 0) * np.pi) + 0.02
-        # The knee bends while its leg comes forward.
-        bend = 0.08 + 1.6 * swing * max(0.0, np.cos(turn + (side < 0) * np.pi)) ** 2 * (swing > 0)
-        legs.append((side, along(thigh), along(thigh - bend)))
-    reach = max(0.245 * -thigh[2] + 0.245 * -shin[2] for _, thigh, shin in legs)
-    hips = np.asarray(feet_m, float) + (reach * h + 0.04 * h) * up
-    chest = hips + 0.30 * h * (up + 0.06 * min(speed_m_s, 3) * ahead / 1.4)
-    neck, head = chest + 0.05 * h * up, chest + 0.125 * h * up + 0.012 * h * ahead
-    w = wears.wide * h
-    rows: list[tuple[np.ndarray, np.ndarray, float, float, np.ndarray]] = []
-    for side, thigh, shin in legs:
+    def limb(start: np.ndarray, end: np.ndarray, first: np.ndarray, last: np.ndarray, colour: np.ndarray) -> None:
+        rows.append((start, end, first, last, np.broadcast_to(colour, (count, 3))))
+
+    turns = [2 * np.pi * (phase + half) for half in (0.0, 0.5)]
+    thighs = [swing * np.sin(turn) + 0.02 for turn in turns]
+    # The knee bends while its leg comes forward.
+    shins = [
+        thigh - 0.08 - 1.6 * swing * np.maximum(np.cos(turn), 0) ** 2 for thigh, turn in zip(thighs, turns, strict=True)
+    ]
+    reach = np.max([np.cos(thigh) + np.cos(shin) for thigh, shin in zip(thighs, shins, strict=True)], axis=0)
+    hips = feet_m + h * (0.245 * reach + 0.04)[:, None] * _UP
+    chest = hips + 0.30 * h * (_UP + (0.043 * speed)[:, None] * ahead)
+    head = chest + h * (0.125 * _UP + 0.012 * ahead)
+    for side, thigh, shin in zip((1, -1), thighs, shins, strict=True):
         hip = hips + side * 0.048 * h * right
-        knee = hip + 0.245 * h * thigh
-        ankle = knee + 0.245 * h * shin
-        rows.append((hip, knee, 0.052 * w, 0.036 * w, wears.trousers))
-        rows.append((knee, ankle, 0.037 * w, 0.026 * h, wears.trousers * 0.96))
-        toe = ankle + 0.085 * h * (ahead * np.cos(0.3) - 0.25 * up)
-        rows.append((ankle - 0.018 * h * up, toe, 0.023 * h, 0.018 * h, np.array([34.0, 36, 42])))
-    if wears.skirt:
-        rows.append((hips, hips - 0.25 * h * up, 0.085 * w, 0.115 * w, wears.trousers))
-    rows.append((hips + 0.02 * h * up, chest - 0.1 * h * up, 0.078 * w, 0.082 * w, wears.shirt))
-    flank = hips + 0.1 * h * up
-    rows += [(flank, chest + side * 0.062 * w * right, 0.07 * w, 0.052 * w, wears.shirt) for side in (1, -1)]
-    for side in (1, -1):
-        back = -0.9 * swing * np.sin(turn + (side < 0) * np.pi)
-        shoulder = chest + side * 0.108 * w * right
-        out = 0.05 * side * right
+        knee = hip + 0.245 * h * along(thigh)
+        ankle = knee + 0.245 * h * along(shin)
+        limb(hip, knee, 0.052 * w, 0.036 * w, trousers)
+        limb(knee, ankle, 0.037 * w, 0.026 * h, 0.96 * trousers)
+        limb(ankle - 0.018 * h * _UP, ankle + 0.085 * h * (0.955 * ahead - 0.25 * _UP), 0.023 * h, 0.018 * h, _SHOES)
+    skirted = np.array([[0.0] if one.skirt else [np.nan] for one in wear]).reshape(-1, 1)
+    limb(hips, hips - 0.25 * h * _UP, 0.085 * w + skirted, 0.115 * w, trousers)
+    limb(hips + 0.02 * h * _UP, chest - 0.1 * h * _UP, 0.078 * w, 0.082 * w, shirt)
+    sleeves = np.array([[one.sleeves] for one in wear]).reshape(-1, 1)
+    for side, turn in zip((1, -1), turns, strict=True):
+        limb(hips + 0.1 * h * _UP, chest + side * 0.062 * w * right, 0.07 * w, 0.052 * w, shirt)
+        back = -0.9 * swing * np.sin(turn)
+        shoulder, out = chest + side * 0.108 * w * right, 0.05 * side * right
         elbow = shoulder + 0.172 * h * (along(back) + out)
         hand = elbow + 0.15 * h * (along(back + 0.25 + 0.5 * swing) + out)
-        rows.append((shoulder, elbow, 0.036 * w, 0.028 * w, wears.shirt * 0.95))
-        rows.append((elbow, hand, 0.027 * w, 0.02 * h, wears.shirt * 0.92 if wears.sleeves else wears.skin))
-        rows.append((hand, hand + 0.03 * h * along(back), 0.021 * h, 0.019 * h, wears.skin))
-    rows.append((neck, head, 0.03 * h, 0.03 * h, wears.skin * 0.9))
-    rows.append((head - 0.018 * h * up + 0.012 * h * ahead, head + 0.03 * h * up, 0.04 * h, 0.044 * h, wears.skin))
-    rows.append((head + 0.02 * h * up - 0.016 * h * ahead, head + 0.045 * h * up, 0.044 * h, 0.042 * h, wears.hair))
-    if wears.hat:
-        brim = head + 0.05 * h * up
-        rows.append((brim - 0.04 * h * ahead, brim + 0.07 * h * ahead, 0.03 * h, 0.02 * h, wears.hair * 1.3))
-    if wears.pack:
-        rows.append(
-            (chest - 0.09 * h * ahead, hips + 0.08 * h * up - 0.09 * h * ahead, 0.07 * h, 0.075 * h, wears.shirt * 0.6)
-        )
-    start, end, first, last, colour = (np.array(column, float) for column in zip(*rows, strict=True))
-    return Parts(start, end, first, last, np.clip(colour, 0, 255))
+        limb(shoulder, elbow, 0.036 * w, 0.028 * w, 0.95 * shirt)
+        limb(elbow, hand, 0.027 * w, 0.02 * h, np.where(sleeves, 0.92 * shirt, skin))
+        limb(hand, hand + 0.03 * h * along(back), 0.021 * h, 0.019 * h, skin)
+    limb(chest + 0.05 * h * _UP, head, 0.03 * h, 0.03 * h, 0.9 * skin)
+    limb(head + h * (0.012 * ahead - 0.018 * _UP), head + 0.03 * h * _UP, 0.04 * h, 0.044 * h, skin)
+    limb(head + h * (0.02 * _UP - 0.016 * ahead), head + 0.045 * h * _UP, 0.044 * h, 0.042 * h, hair)
+    hatted = np.array([[0.0] if one.hat else [np.nan] for one in wear]).reshape(-1, 1)
+    limb(head + h * (0.05 * _UP - 0.04 * ahead), head + h * (0.05 * _UP + 0.07 * ahead), 0.03 * h + hatted, 0.02 * h,
+         1.3 * hair)  # fmt: skip
+    packed = np.array([[0.0] if one.pack else [np.nan] for one in wear]).reshape(-1, 1)
+    limb(chest - 0.09 * h * ahead, hips + h * (0.08 * _UP - 0.09 * ahead), 0.07 * h + packed, 0.075 * h, 0.6 * shirt)
+    ends = np.stack([np.stack([row[0], row[1]], axis=1) for row in rows], axis=1)
+    radius = np.stack([np.concatenate([row[2], row[3]], axis=1) for row in rows], axis=1)
+    return Figures(ends, radius, np.clip(np.stack([row[4] for row in rows], axis=1), 0, 255))
 
 
-def outlines(parts: Parts, view: View, widen: float = 1.0, aside: np.ndarray | None = None) -> np.ndarray:
-    """(N, 18, 2) pixels of the limbs' outlines, so much wider, moved aside (2,) by shares of their radius."""
-    ends = np.stack([parts.start_m, parts.end_m], axis=1)
-    radius = np.stack([parts.start_radius_m, parts.end_radius_m], axis=1)
-    homogeneous = ends @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]
-    depth = homogeneous[..., 2]
-    px = homogeneous[..., :2] / depth[..., None]
-    size = radius * np.linalg.norm(view.image_from_world[0, :3]) / depth
-    if aside is not None:
-        px = px + size[..., None] * aside
-    size = size * widen
+def outlines(
+    ends_m: np.ndarray, radius_m: np.ndarray, view: View, widen: float = 1.0, aside: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    """(L, 16, 2) pixels of limbs (L, 2, 3), (L, 2), so much wider, moved aside by shares of their radius."""
+    seen = ends_m @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]
+    depth = seen[..., 2]
+    size = radius_m * np.linalg.norm(view.image_from_world[0, :3]) / depth
+    px = seen[..., :2] / depth[..., None] + size[..., None] * aside
+    return _hulls(px, widen * size)
+
+
+def _hulls(px: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Outlines (L, 16, 2) of limbs with ends (L, 2, 2) and radii (L, 2), px: half a circle about each end."""
     way = px[:, 1] - px[:, 0]
     angle = np.arctan2(way[:, 1], way[:, 0])
-    # Half a circle about each end, turned away from the other.
-    turns = np.stack([angle[:, None] + np.pi / 2 + _ROUND, angle[:, None] - np.pi / 2 + _ROUND], axis=1)
-    circles = px[:, :, None] + size[:, :, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    turn = np.stack([angle[:, None] + np.pi / 2 + _ROUND, angle[:, None] - np.pi / 2 + _ROUND], axis=1)
+    circles = px[:, :, None] + size[:, :, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     return circles.reshape(len(px), -1, 2)
 
 
-def draw_parts(parts: Parts, view: View, canvas: Canvas, value: int, to_sun: np.ndarray) -> None:
-    """Draw limbs, far ones first, lit from the sun's side."""
-    middle = (parts.start_m + parts.end_m) / 2
-    away = np.linalg.norm(middle - view.position_m, axis=1)
-    towards = view.position_m - middle.mean(axis=0)
-    towards = towards / np.linalg.norm(towards)
-    right = view.image_from_world[0, :3] / np.linalg.norm(view.image_from_world[0, :3])
-    facing = float(towards @ to_sun)
+def draw_figure(
+    ends_m: np.ndarray,
+    radius_m: np.ndarray,
+    colour: np.ndarray,
+    view: View,
+    canvas: Canvas,
+    value: int,
+    to_sun: np.ndarray,
+) -> np.ndarray:
+    """Draw someone's limbs, far ones first, lit from the sun's side. Returns their outlines (L, 16, 2), px."""
+    worn = np.isfinite(radius_m).all(axis=1)
+    ends_m, radius_m, colour = ends_m[worn], radius_m[worn], colour[worn]
+    away = np.linalg.norm(ends_m.mean(axis=1) - view.position_m, axis=1)
+    towards = view.position_m - ends_m.mean(axis=(0, 1))
+    facing = float(towards @ to_sun / np.linalg.norm(towards))
+    # The third row looks ahead; across it, upright, is the right.
+    side = float(np.sign(view.image_from_world[2, 1] * to_sun[0] - view.image_from_world[2, 0] * to_sun[1]))
     # Seen from the sun's side all of it is lit, from the other only its edge.
-    lit = np.array([np.sign(right @ to_sun) * 0.32 * (1 - abs(facing)), -0.12])
-    shaded, bright = 0.62 + 0.12 * max(facing, 0), 0.82 + 0.25 * max(facing, 0)
-    whole, part = outlines(parts, view), outlines(parts, view, 0.66 + 0.2 * max(facing, 0), lit)
+    front = max(facing, 0.0)
+    whole = outlines(ends_m, radius_m, view)
+    part = outlines(ends_m, radius_m, view, 0.66 + 0.2 * front, (side * 0.32 * (1 - abs(facing)), -0.12))
+    dark, bright = (np.clip(colour * tone, 0, 255).tolist() for tone in (0.62 + 0.12 * front, 0.82 + 0.25 * front))
+    fixed_whole, fixed_part = (np.round(np.clip(one, -3e4, 3e4) * 2**_BITS).astype(np.int32) for one in (whole, part))
     for k in np.argsort(-away):
-        canvas.fill(whole[k], np.clip(parts.colour[k] * shaded, 0, 255), value)
-        canvas.fill(part[k], np.clip(parts.colour[k] * bright, 0, 255), value)
+        cv2.fillConvexPoly(canvas.picture, fixed_whole[k], dark[k], cv2.LINE_AA, _BITS)
+        cv2.fillConvexPoly(canvas.mask, fixed_whole[k], value, cv2.LINE_8, _BITS)
+        cv2.fillConvexPoly(canvas.picture, fixed_part[k], bright[k], cv2.LINE_AA, _BITS)
+    return whole
+
+
+def shadow(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: np.ndarray) -> np.ndarray:
+    """(L, 16, 3) outlines of limbs' shadows on level ground of a height, local metres."""
+    worn = np.isfinite(radius_m).all(axis=1)
+    reach = -to_sun[:2] / max(float(to_sun[2]), 0.15)
+    flat = ends_m[worn][..., :2] + (ends_m[worn][..., 2:] - up_m) * reach
+    outline = _hulls(flat, radius_m[worn])
+    return np.concatenate([outline, np.full((*outline.shape[:2], 1), up_m)], axis=2)
