@@ -76,7 +76,9 @@ class Team:
         """The vehicles that are counted on."""
         return sorted(self._known)
 
-    def orders(self, outlook: Outlook, stand: Stand | None, now_s: float, record: Record) -> tuple[Order, ...]:
+    def orders(
+        self, outlook: Outlook, rows: np.ndarray, stand: Stand | None, now_s: float, record: Record
+    ) -> tuple[Order, ...]:
         """What each is asked to do; none while there is nothing to go to. rows: the targets that are followed."""
         present = self.present
         if not len(rows) or not present:
