@@ -139,7 +139,7 @@ class Crowds:
         wanted = groups.velocity[mine] + (goal - self.place) / 1.5
         # Those behind go faster, but nobody much.
         most = np.where(started, 1.5 * groups.speed + 0.4, 0.4)[mine]
-        speed = np.linalg.norm(wanted, axis=1)
+        speed = np.hypot(*wanted.T)
         wanted = wanted * np.minimum(1.0, most / np.maximum(speed, 1e-9))[:, None]
         kept = np.exp(-seconds / 3.0)
         self._stray = kept * self._stray + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._stray.shape)
@@ -157,7 +157,7 @@ class Crowds:
 
     def _walk(self, seconds: float) -> None:
         """Legs move with the way gone, faces turn to where it goes."""
-        speed = np.linalg.norm(self.velocity, axis=1)
+        speed = np.hypot(*self.velocity.T)
         stride = 0.8 * self.height * np.sqrt(np.clip(speed / 1.4, 0.25, 4.0))
         self.phase = (self.phase + speed * seconds / stride) % 1.0
         ahead = np.arctan2(self.velocity[:, 0], self.velocity[:, 1])
@@ -169,7 +169,7 @@ class Crowds:
         """(N, 2) velocities away from those who come too near."""
         first, second = near
         away = self.place[first] - self.place[second]
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        distance = np.maximum(np.hypot(*away.T), 1e-6)
         push = away * (0.8 * (1 - distance / _PERSONAL_M) / distance)[:, None]
         return _summed(push, first, len(self)) - _summed(push, second, len(self))
 
@@ -178,7 +178,7 @@ class Crowds:
         found = np.zeros_like(self.place)
         for vehicle in vehicles:
             away = self.place - vehicle
-            distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+            distance = np.maximum(np.hypot(*away.T), 1e-6)
             found += away * (1.5 * np.clip(1 - distance / 2.5, 0, 1) / distance)[:, None]
         return found
 
@@ -189,7 +189,7 @@ class Crowds:
         rows = np.arange(len(groups.number))
         goal = np.where((groups.behaviour == _MEET)[:, None], groups.meeting, groups.way[rows, groups.at])
         to = goal - groups.middle
-        distance = np.linalg.norm(to, axis=1)
+        distance = np.hypot(*to.T)
         aimed = (groups.behaviour == _WAY) | (groups.behaviour == _MEET)
         course = np.where(aimed, np.arctan2(to[:, 0], to[:, 1]), groups.course)
         going = (groups.behaviour != _STAND) & (time_s >= groups.from_s)
@@ -223,7 +223,7 @@ class Crowds:
         if due.any():
             many = int(due.sum())
             steps = self._rng.uniform(SLOWEST_M, FASTEST_M, (many, 2)) * self._rng.choice([-1.0, 1.0], (many, 2))
-            groups.speed[due] = np.linalg.norm(steps, axis=1) / UNIT_S
+            groups.speed[due] = np.hypot(*steps.T) / UNIT_S
             groups.course[due] = np.arctan2(steps[:, 0], steps[:, 1])
             groups.unit[due] = unit
 
@@ -279,9 +279,9 @@ class Crowds:
         mine = np.flatnonzero(self.group == row)
         middle = self.place[mine].mean(axis=0)
         away = self.place[mine] - middle
-        radius = max(0.4 * np.sqrt(len(mine)), float(np.median(np.linalg.norm(away, axis=1))) * np.sqrt(2))
+        radius = max(0.4 * np.sqrt(len(mine)), float(np.median(np.hypot(*away.T))) * np.sqrt(2))
         self._groups.middle[row], self._groups.radius[row] = middle, radius
-        far = np.linalg.norm(away, axis=1)
+        far = np.hypot(*away.T)
         self._slot[mine] = away * np.minimum(1.0, radius / np.maximum(far, 1e-9))[:, None]
 
     def _split(self, row: int, turn_deg: float) -> list[str]:
@@ -372,7 +372,7 @@ def _apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: floa
     first, second = near
     for _ in range(2):
         away = place[first] - place[second]
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        distance = np.maximum(np.hypot(*away.T), 1e-6)
         push = away * (0.5 * np.clip(least_m - distance, 0, None) / distance)[:, None]
         place = place + _summed(push, first, len(place)) - _summed(push, second, len(place))
     return place

@@ -11,7 +11,9 @@ from torchvision_dddas.types import Bodies, CameraPose, Flight
 class Report:
     """What a ground vehicle says by radio. vehicle: its row in the team, from 0. frame: may be broken.
 
-    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was.
+    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was; plans are told
+    anew each second, and of two waypoints for one frame the one that was told last counts. sigma_m: along each axis, of
+    what the receivers do not share.
     """
 
     vehicle: int

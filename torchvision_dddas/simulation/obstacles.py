@@ -8,6 +8,8 @@ _CELL_M = 4.0
 _REACH_M = 8.0
 _NEAREST = 6
 """So many things, those whose edges are nearest, are looked at from a cell."""
+_TOUCHING = 3
+"""And so many of them by who may be inside."""
 
 
 class Things(Protocol):
@@ -77,14 +79,19 @@ class Obstacles:
         """(N, 2) the places, moved out of trees and buildings."""
         if not len(self.place):
             return place
-        near = self._near(place)
+        near = self._near(place)[:, :_TOUCHING]
         away = place[:, None] - self._places[near]
-        distance = np.linalg.norm(away, axis=2)
-        inside = np.where(self._hards[near], self._radii[near] + clear_m - distance, 0.0).clip(0)
-        deepest = inside.argmax(axis=1)
-        rows = np.arange(len(place))
-        direction = away[rows, deepest] / np.maximum(distance[rows, deepest], 1e-6)[:, None]
-        return place + inside[rows, deepest, None] * direction
+        reach = self._radii[near] + clear_m
+        hit = self._hards[near] & ((away**2).sum(axis=2) < reach**2)
+        if not hit.any():
+            return place
+        row, which = np.nonzero(hit)
+        away, reach = away[row, which], reach[row, which]
+        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+        moved = place.copy()
+        # Of two that one is in, the one that is listed last decides.
+        moved[row] = place[row] + ((reach - distance) / distance)[:, None] * away
+        return moved
 
 
 def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -92,10 +99,10 @@ def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, rad
 
     place, velocity: (N, 2). centre: (N, M, 2); radius: (N, M), clearance included.
     """
-    speed = np.linalg.norm(velocity, axis=1)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     to = centre - place[:, None]
-    along = (to * ahead[:, None]).sum(axis=2)
+    along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
     # Positive: the disc's middle is to the left.
     left = ahead[:, None, 0] * to[..., 1] - ahead[:, None, 1] * to[..., 0]
     reach = np.maximum(3.0, 2.0 * speed)[:, None] + radius
@@ -105,7 +112,7 @@ def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, rad
     row = np.flatnonzero(hit.any(axis=1))
     first = np.where(hit[row], along[row], np.inf).argmin(axis=1)
     to, left, radius = to[row, first], left[row, first], radius[row, first]
-    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
+    distance = np.maximum(np.hypot(to[:, 0], to[:, 1]), 1e-6)
     # Inside the clearance: along the edge, and a little outward.
     turn = np.where(distance > radius, np.arcsin(np.minimum(radius / distance, 1.0)), np.pi / 2 + 0.3)
     turn = np.where(left > 0, -turn, turn)

@@ -1,7 +1,7 @@
 """The ground vehicles: how they drive and look, and the colours that they wear."""
 
 from collections.abc import Sequence
-from copy import deepcopy
+from copy import copy
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ from torchvision_dddas.types import Colours
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
 _ROOM_M = 1.6
 """How far from another's middle they pass it."""
+_LOOK_S = 0.25
+"""Steps in which they think ahead."""
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
 """gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring."""
@@ -54,6 +56,7 @@ class Team:
         self.heading = self.course.copy()
         self.heading_error = _HEADING_SIGMA_RAD * rng.standard_normal(count)
         self._passed = np.zeros(count, int)
+        self._drawn: dict[tuple[int, int], np.ndarray] = {}
         self._ordered = np.full((count, 2), np.nan)
         self._ordered_speed = np.zeros(count)
         self._look_at = np.full((count, 2), np.nan)
@@ -77,13 +80,13 @@ class Team:
         """On by so long, to time_s; the lost stand still. people: (M, 2), before whom they stop."""
         goal, most = self._goals(time_s)
         to = goal - self.place
-        distance = np.linalg.norm(to, axis=1)
+        distance = np.hypot(*to.T)
         arrived = distance < 0.3
         # As fast as it can still brake.
         wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
         direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
         direction = self._obstacles.steer(self.place, direction, 1.2)
-        direction = self._round_one_another(direction, distance)
+        direction = self._round_one_another(direction)
         error = _wrapped(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
         turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
         wanted = np.where(arrived, 0.0, wanted * np.clip(np.cos(error), 0, 1))
@@ -99,16 +102,14 @@ class Team:
         self.course = (self.course + turn * seconds) % (2 * np.pi)
         self._pan(seconds, stopped)
 
-    def waypoints(self, time_s: float, seconds: float, times_s: np.ndarray, lost: Sequence[int]) -> np.ndarray:
-        """(T, K, 2) where they mean to be at coming times, as far as they know: people may stop them."""
-        ahead, now, found = deepcopy(self), time_s, []
-        for time in times_s:
-            while now < time - 1e-6:
-                step = min(seconds, float(time) - now)
-                now += step
-                ahead.step(now, step, lost, np.zeros((0, 2)))
-            found.append(ahead.place.copy())
-        return np.array(found).reshape(len(times_s), len(self), 2)
+    def waypoints(self, time_s: float, seconds: int, lost: Sequence[int]) -> np.ndarray:
+        """(1 + seconds, K, 2) where they mean to be now and each second from now, if nobody stops them."""
+        ahead, found = copy(self), [self.place]
+        for step in range(1, round(seconds / _LOOK_S) + 1):
+            ahead.step(time_s + step * _LOOK_S, _LOOK_S, lost, np.zeros((0, 2)))
+            if step % round(1 / _LOOK_S) == 0:
+                found.append(ahead.place)
+        return np.array(found).reshape(seconds + 1, len(self), 2)
 
     def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """(K, 2) whither, (K,) how fast."""
@@ -116,11 +117,11 @@ class Team:
         speed = np.full(len(self), knobs.patrol_m_s)
         if patrol == "random":
             goal = np.array([self._random(k, int(n)) for k, n in enumerate(self._passed)]).reshape(-1, 2)
-            there = np.linalg.norm(goal - self.place, axis=1) < 1.0
+            there = np.hypot(*(goal - self.place).T) < 1.0
             self._passed = self._passed + there
         elif patrol == "gather":
             goal = self._middle + min(_GATHERED_M, knobs.ring_m) * self._spoke
-            far = np.linalg.norm(goal - self.place, axis=1) > _NEAR_M
+            far = np.hypot(*(goal - self.place).T) > _NEAR_M
             speed = np.where(far, _FAST * speed, speed)
         elif patrol == "along":
             middle, going = self._way.at(time_s)
@@ -134,15 +135,18 @@ class Team:
 
     def _random(self, k: int, n: int) -> np.ndarray:
         """(2,) the n-th place of a vehicle within the ring."""
-        rng = np.random.default_rng([self._seed, 31, k, n])
-        reach, turn = self._knobs.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-        return self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
+        if (k, n) not in self._drawn:
+            rng = np.random.default_rng([self._seed, 31, k, n])
+            reach, turn = self._knobs.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+            self._drawn[k, n] = self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
+        return self._drawn[k, n]
 
-    def _round_one_another(self, direction: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    def _round_one_another(self, direction: np.ndarray) -> np.ndarray:
         if len(self) < 2:
             return direction
-        others = np.array([np.delete(np.arange(len(self)), k) for k in range(len(self))])
-        return round_discs(self.place, direction, self.place[others], np.full(others.shape, _ROOM_M))
+        radius = np.full((len(self), len(self)), _ROOM_M)
+        np.fill_diagonal(radius, -1.0)  # nobody goes round itself
+        return round_discs(self.place, direction, np.broadcast_to(self.place, (*radius.shape, 2)), radius)
 
     def _clear(self, people: np.ndarray) -> np.ndarray:
         """(K,) how fast they may go for who is ahead of them."""
