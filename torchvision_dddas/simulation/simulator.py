@@ -7,6 +7,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.aerial import AerialCamera
 from torchvision_dddas.simulation.agents import Agents
+from torchvision_dddas.simulation.clearance import check_way
 from torchvision_dddas.simulation.groundview import GroundCamera
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, check
@@ -47,6 +48,7 @@ class Simulator:
         check(scenario)
         self.scenario = scenario
         self.world: World = build(scenario.world, scenario.seed, elevation, photo, (starts_m(scenario), CLEAR_M))
+        check_way(scenario.uav, self.world)
         self._aerial = AerialCamera(self.world, scenario)
         self._ground = GroundCamera(self.world, scenario)
         self.camera: Camera = self._aerial.camera
