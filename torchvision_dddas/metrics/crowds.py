@@ -170,10 +170,10 @@ class CrowdScorer:
         self._known: dict[int, _Known] = {}
         self._cost = 0.0
 
-    def feed(self, item: Truth | Surveyed) -> None:
+    def feed(self, item: Truth | Shown | Surveyed) -> None:
         """The truth of a frame, or what was found in one whose truth was fed before."""
-        if isinstance(item, Truth):
-            self._waiting[item.frame] = shown(item)
+        if not isinstance(item, Surveyed):
+            self._waiting[item.frame] = shown(item) if isinstance(item, Truth) else item
             return
         number = item.followed.number
         truth = self._waiting.get(number)

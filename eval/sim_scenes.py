@@ -1,0 +1,189 @@
+"""One simulated clip, drawn and searched for what moves once, and located in several ways: what the studies share."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, site_of
+from torchvision_dddas.metrics.crowd_frames import shown
+from torchvision_dddas.metrics.crowds import CrowdScore, CrowdScorer
+from torchvision_dddas.run import run
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.settings import load as load_settings
+from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
+from torchvision_dddas.sources.simulator import SimulatorSource
+from torchvision_dddas.targets import geodesy
+from torchvision_dddas.types import Colours, Elevation, Followed, Landmarks, Scene, Surveyed, Tracks
+from torchvision_dddas.vision import load, load_colours, load_solver
+
+CONFIG = "patrol"
+"""The shipped configuration of a team that watches crowds."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to locate the same pictures. landmarks: which of the team's, by row; empty: all.
+
+    gps95_m: error of their receivers that is added to the reports, in 95 %; 0: none. settings: knobs beside the usual.
+    """
+
+    name: str
+    landmarks: tuple[int, ...] = ()
+    gps95_m: float = 0.0
+    settings: dict[str, object] = field(default_factory=dict)
+
+
+def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
+    """What `dddas run sim:` takes, with the camera's own focal length, so that sizes in metres hold."""
+    settings = load_settings(CONFIG, (), settings_of(source.scenario))
+    return with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0]), **(more or {})})
+
+
+class Eye:
+    """Locates the scenes of a clip in one way, and scores that. Targets are those of single frames: nobody follows."""
+
+    def __init__(self, source: SimulatorSource, way: Way) -> None:
+        self._source, self._way = source, way
+        self._settings = usual(source, way.settings)
+        self._kept = way.landmarks or tuple(range(len(source.names)))
+        self._error_m = _errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
+        self._watch: Watch | None = None
+        origin = source.scenario.world.origin_deg
+        self._local = partial(geodesy.east_north, origin_deg=origin)
+
+    def step(self, scene: Scene, scorer: CrowdScorer) -> None:
+        """Locate the targets of the next scene; the truth of its frame has been fed to the scorer."""
+        site = self._site()
+        if self._watch is None:
+            self._watch = self._made(site)
+        else:
+            self._watch.locator.learn(site)
+        locator = self._watch.locator
+        watched = gathered(self._watch.step(scene), locator, self._source.rate_hz)
+        found = watched.scene.detections
+        rows = np.arange(len(found))
+        targets = Targets(
+            found.box_px, rows + 1, np.zeros(len(found), bool), found.score.clip(0, 1), bodies=True,
+            middle_px=found.middle_px if self._settings.crowds.join_m else None,
+        )  # fmt: skip
+        grounded = locator.ground(watched.look, targets)
+        tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
+        scorer.feed(Surveyed(Followed(scene.frame.number, scene.frame, found, tracks), grounded, watched.sighted_by))
+
+    def scorer(self) -> CrowdScorer:
+        """A new one in the truth's metres."""
+        return CrowdScorer(self._local)
+
+    def _made(self, site: Site) -> Watch:
+        source = self._source
+        locator = Locator(site, source.camera, self._settings, load_solver("onboard"), source.rate_hz, focal_known=True)
+        colours = source.colours
+        rows = np.array(self._kept)
+        some = Colours(tuple(colours.names[k] for k in rows), colours.low[rows], colours.high[rows])
+        return Watch(locator, some, load_colours("onboard"))
+
+    def _site(self) -> Site:
+        """What was reported until now, in the metres of the first report, with the ground's elevation."""
+        reports = self._reports()
+        telemetry = self._source.telemetry()
+        if self._watch is None:
+            site = site_of(reports, telemetry)
+            return replace(site, elevation=self._elevation(site))
+        site = self._watch.locator.site
+        origin = site.origin_deg
+        assert origin is not None
+        local = replace(reports, place=geodesy.east_north(reports.place, origin), geographic=False)
+        flown = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
+        return replace(site, landmarks=local, telemetry=flown)
+
+    def _elevation(self, site: Site) -> Elevation:
+        elevation, origin = self._source.elevation, site.origin_deg
+        assert origin is not None
+        east, north = self._local(np.array([origin]))[0].tolist()
+        return replace(elevation, corner_m=(elevation.corner_m[0] - east, elevation.corner_m[1] - north))
+
+    def _reports(self) -> Landmarks:
+        """Those of the landmarks in use, with the receivers' errors; without planned waypoints."""
+        table = self._source.landmarks()
+        kept = np.isin(table.landmark, self._kept) & ~table.planned
+        frame, which, place, sigma = table.frame[kept], table.landmark[kept], table.place[kept], table.sigma_m[kept]
+        if self._way.gps95_m:
+            metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
+            place = geodesy.lonlat(metres, self._source.scenario.world.origin_deg)
+            sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / np.sqrt(5.991))
+        return Landmarks(
+            tuple(table.names[k] for k in self._kept), frame, np.searchsorted(self._kept, which),
+            table.image_px[kept], place, sigma, table.planned[kept], table.line[kept], True, table.path,
+        )  # fmt: skip
+
+
+def _errors(scenario: Scenario, gps95_m: float, count: int, frames: int) -> np.ndarray:
+    """(F, K, 2) metres, the receivers' errors in each frame: the same for all ways, but for their size."""
+    gps = scenario.gps
+    rng = np.random.default_rng([scenario.seed, 77])
+    receivers = Receivers(count, gps95_m, gps.white_share, gps.correlation_s, 0.0, rng)
+    errors = []
+    for _ in range(frames):
+        errors.append(receivers.error_m)
+        receivers.advance(1 / scenario.clip.rate_hz)
+    return np.array(errors).reshape(frames, count, 2)
+
+
+def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = ()) -> dict[str, list[CrowdScore]]:
+    """The scores of each way, by its name: one for each part of the clip. parts_s: where later parts begin."""
+    source = SimulatorSource(scenario)
+    eyes = {way.name: Eye(source, way) for way in ways}
+    edges = [*parts_s, np.inf]
+    scorers = {name: [eye.scorer() for _ in edges] for name, eye in eyes.items()}
+    vision = load("onboard", usual(source))
+    for scene in with_truth(source, run(source, vision, usual(source)), scorers):
+        part = int(np.searchsorted(edges, scene.frame.time_s, side="right"))
+        for name, eye in eyes.items():
+            eye.step(scene, scorers[name][part])
+    return {name: [scorer.score() for scorer in parts] for name, parts in scorers.items()}
+
+
+def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
+    """A team about two crowds that walk through its ring in directions of their own, as the seed has it.
+
+    tables: knobs beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
+    """
+    rng = np.random.default_rng([seed, 5])
+    crowds = []
+    heading, turn = rng.uniform(0, 360), rng.uniform(60, 300)
+    for k, people in enumerate(rng.integers(6, 13, 2).tolist()):
+        ahead = np.radians(heading + k * turn)
+        speed, aside = rng.uniform(0.7, 1.4), rng.uniform(-4, 4)
+        way = np.array([np.sin(ahead), np.cos(ahead)])
+        # In the middle of the ring halfway through the run.
+        start = -way * speed * min(seconds / 2, 12) + aside * way[::-1] * (1, -1)
+        crowds.append(
+            CrowdPlan(
+                people=people,
+                start_m=(float(start[0]), float(start[1])),
+                radius_m=float(rng.uniform(1.5, 2.5)),
+                speed_m_s=float(speed),
+                way_m=(tuple((start + way * 24).tolist()),),
+            )
+        )
+    car = CarPlan(start_m=(-60.0, float(rng.uniform(18, 22))), heading_deg=90.0, speed_m_s=5.0)
+    usual_tables: dict[str, dict[str, object]] = {"clip": {"seconds": seconds, "rate_hz": rate_hz}}
+    for name, knobs in tables.items():
+        usual_tables[name] = {**usual_tables.get(name, {}), **knobs}
+    return Scenario.model_validate({"seed": seed, "crowd": tuple(crowds), "car": (car,), **usual_tables})
+
+
+def with_truth(
+    source: SimulatorSource, scenes: Iterator[Scene], scorers: dict[str, list[CrowdScorer]]
+) -> Iterator[Scene]:
+    """The scenes, after the truth of their frames was fed to all scorers."""
+    for scene in scenes:
+        for truth in source.truths():
+            true = shown(truth)
+            for parts in scorers.values():
+                for scorer in parts:
+                    scorer.feed(true)
+        yield scene
