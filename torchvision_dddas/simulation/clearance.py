@@ -35,10 +35,10 @@ def check_way(knobs: AircraftKnobs, world: World) -> None:
     ground = world.up_m(rays.reshape(-1, 2)).reshape(rays.shape[:2])
     over = flown_up + share * (aimed_up - flown_up) - ground
     if (over < 0).any():
-        part, k = np.unravel_index(int(over.argmin()), over.shape)
+        part, aim = divmod(int(over.argmin()), over.shape[1])
         raise InputError(
-            f"uav.altitude_m = {knobs.altitude_m:g} is below the terrain that it looks over: at {_at(rays[part, k])} "
-            f"the ground is {-over[part, k]:.1f} m above its line of sight; fly higher, or look down more steeply than "
+            f"uav.altitude_m = {knobs.altitude_m:g} is below the terrain that it looks over: at {_at(rays[part, aim])} "
+            f"the ground is {-over[part, aim]:.1f} m above its line of sight; fly higher, or look down more steeply than "
             f"uav.pitch_deg = {knobs.pitch_deg:g}"
         )
 

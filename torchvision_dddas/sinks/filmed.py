@@ -144,22 +144,21 @@ class _Texts:
 
 
 class _Reports:
-    """telemetry.csv and landmarks.csv."""
+    """telemetry.csv and landmarks.csv. Of what a vehicle plans for a frame the newest counts: plans come at the end."""
 
     def __init__(self, folder: Path) -> None:
         content = {"telemetry.csv": TELEMETRY, "landmarks.csv": REPORTS}
         self._files = TextFiles({folder / name: ",".join(columns) + "\n" for name, columns in content.items()})
+        self._plans: dict[tuple[str, float], str] = {}
 
     def write(self, item: Filmed) -> None:
         said = [_flight_line(time_s, flight) for time_s, flight in item.flights]
-        heard = [
-            f"{_short(h.frame, 6)},{h.vehicle},{lon:.9f},{lat:.9f},{h.sigma_m:.6g},{h.planned:d}\n"
-            for h in item.heard
-            for lon, lat in [h.lonlat_deg]
-        ]
+        self._plans |= {(h.vehicle, round(h.frame, 6)): _report_line(h) for h in item.heard if h.planned}
+        heard = [_report_line(h) for h in item.heard if not h.planned]
         self._files.write("".join(said), "".join(heard))
 
     def close(self, complete: bool) -> None:
+        self._files.write("", "".join(self._plans.values()))
         self._files.close()
 
     def discard(self) -> None:
@@ -266,8 +265,8 @@ def camera_toml(camera: Camera, standing: bool = False) -> str:
         f'name = "{camera.name}"',
         f"width_px = {camera.size_px[0]}",
         f"height_px = {camera.size_px[1]}",
-        f"focal_px = {camera.focal_px[0]!r}",
-        f"focal_v_px = {camera.focal_px[1]!r}",
+        f"focal_px = {float(camera.focal_px[0])!r}",
+        f"focal_v_px = {float(camera.focal_px[1])!r}",
         f"centre_px = [{camera.centre_px[0]}, {camera.centre_px[1]}]",
         f"k1 = {camera.k1}",
         f"k2 = {camera.k2}",
@@ -284,6 +283,12 @@ def camera_toml(camera: Camera, standing: bool = False) -> str:
             f"position_sigma_m = {camera.position_sigma_m:.6g}",
         ]
     return "\n".join(lines) + "\n"
+
+
+def _report_line(heard: Heard) -> str:
+    """A line of landmarks.csv."""
+    lon, lat = heard.lonlat_deg
+    return f"{_short(heard.frame, 6)},{heard.vehicle},{lon:.9f},{lat:.9f},{heard.sigma_m:.6g},{heard.planned:d}\n"
 
 
 def _flight_line(time_s: float, flight: Flight) -> str:

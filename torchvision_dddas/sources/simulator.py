@@ -1,7 +1,7 @@
 """A simulated run as a clip that can be steered, with all that its vehicles say and the truth beside it."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -85,11 +85,10 @@ class SimulatorSource:
         self._wanted = [order.vehicle for order in command.orders if order.picture]
 
     def landmarks(self) -> Landmarks:
-        """All reports of the ground vehicles until now, in longitude and latitude."""
-        count = len(self._reports)
-        rows = np.array(self._reports, float).reshape(-1, 6)
-        order = np.argsort(rows[:, 0], kind="stable")
-        rows = rows[order]
+        """All reports of the ground vehicles until now, in longitude and latitude; of plans for a frame the newest."""
+        rows = self._reports.rows
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        count = len(rows)
         return Landmarks(
             self.names,
             rows[:, 0],
@@ -105,7 +104,7 @@ class SimulatorSource:
 
     def telemetry(self) -> Telemetry:
         """All that the UAV said of itself until now, in longitude and latitude."""
-        rows = np.array(self._flown, float).reshape(-1, 11)
+        rows = self._flown.rows
         above_sea, heading, pitch, roll, hfov, vehicle_heading = rows[:, 5:].T
         return Telemetry(
             rows[:, 0],
@@ -142,18 +141,39 @@ class SimulatorSource:
         self._simulator.restart()
         self.problems.clear()
         self.last = 0
-        self._reports: list[tuple[float, ...]] = []
-        self._flown: list[tuple[float, ...]] = []
+        self._reports, self._flown = Rows(6), Rows(11)
         self._pictures.clear()
         self._truths.clear()
         self._wanted.clear()
 
     def _heard(self, moment: Moment) -> None:
-        self._reports += [
-            (r.frame, r.vehicle, *np.asarray(r.lonlat_deg).tolist(), r.sigma_m, r.planned) for r in moment.reports
-        ]
+        for r in moment.reports:
+            row = (r.frame, r.vehicle, *np.asarray(r.lonlat_deg).tolist(), r.sigma_m, r.planned)
+            self._reports.add(row, (r.vehicle, round(r.frame, 6), r.planned))
         if moment.flight is not None:
-            self._flown.append((moment.time_s, *_row(moment.flight)))
+            self._flown.add((moment.time_s, *_row(moment.flight)))
+
+
+class Rows:
+    """A table that grows: (N, columns) float64, in the order in which its rows came."""
+
+    def __init__(self, columns: int) -> None:
+        self._table, self._count = np.zeros((256, columns)), 0
+        self._place: dict[Hashable, int] = {}
+
+    def add(self, row: Sequence[float], key: Hashable = None) -> None:
+        """Add a row, or put it in the place of the one that has its key already."""
+        place = self._count if key is None else self._place.setdefault(key, self._count)
+        if place == self._count:
+            if self._count == len(self._table):
+                self._table = np.concatenate([self._table, np.zeros_like(self._table)])
+            self._count += 1
+        self._table[place] = row
+
+    @property
+    def rows(self) -> np.ndarray:
+        """What is there; not to be written to."""
+        return self._table[: self._count]
 
 
 def simulator_of(scenario: Scenario) -> Simulator:
