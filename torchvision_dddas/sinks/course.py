@@ -71,11 +71,11 @@ class Course:
     def panels(self) -> list[Panel]:
         """What happened when; targets; what ground vehicles say of them; knobs that were moved; time spent."""
         rows = self.rows
-        told: list[Panel] = [("what happened: see the table below, or log.txt", self._ticks())]
+        told: list[Panel] = [("what happened", self._ticks())]
         targets = [
             Curve("found", rows["found"], "#b8b8b8"),
             Curve("with an identity", rows["tracked"], "#1f5fa8"),
-            Curve("located (crowds together)", rows["placed"], "#b5541c"),
+            Curve("located", rows["placed"], "#b5541c"),
         ]
         told.append(("targets", [curve for curve in targets if np.isfinite(curve.values).any()]))
         named = zip(KINDS, _KIND_COLOURS, strict=True)
@@ -85,8 +85,11 @@ class Course:
                 [Curve(kind.replace("_", " "), rows[kind], colour) for kind, colour in named],
             )
         )
-        often = sorted(self._moves, key=lambda knob: -len(self._moves[knob]))[:_MOST_KNOBS]
-        told += [(knob, [Curve("", self.values(knob), "#1f5fa8", steps=True)]) for knob in sorted(often)]
+        # One that was set at the first frame and stayed is a line in the log, and no plot.
+        values = {knob: self.values(knob) for knob in self._moves}
+        moved = [knob for knob, v in values.items() if len(np.unique(v[np.isfinite(v)])) > 1]
+        often = sorted(moved, key=lambda knob: -len(self._moves[knob]))[:_MOST_KNOBS]
+        told += [(knob, [Curve("", values[knob], "#1f5fa8", steps=True)]) for knob in sorted(often)]
         return [*told, *self._time_spent()]
 
     def _ticks(self) -> list[Ticks]:
@@ -111,7 +114,7 @@ class Course:
             Curve(stage, height, colour, area=True)
             for (stage, _), height, colour in zip(shown, heights, _STAGE_COLOURS, strict=False)
         ]
-        return [("time spent on a frame, ms, by stage on top of each other", curves[::-1])] if curves else []
+        return [("time spent on a frame, ms, stacked", curves[::-1])] if curves else []
 
 
 def _counts(confirmed: Confirmed | None) -> list[float]:

@@ -1,6 +1,6 @@
 """Key frames of a run: a few small pictures spread over it, and where something happened, in memory that is bounded."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -8,7 +8,7 @@ import numpy as np
 
 MOST = 9
 """Pictures that a report shows."""
-_MARKED = 6  # of them at most, for what happened
+_MARKED = 7  # of them at most, for what happened
 _HELD = 18  # kept of each kind while the run goes on
 _AREA_PX = 520 * 390
 _QUALITY = 78
@@ -16,12 +16,13 @@ _QUALITY = 78
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """A picture as JPEG, when it was, and what happened then, empty if nothing."""
+    """A picture as JPEG, when it was, and what happened then, empty if nothing. weight: how much that matters."""
 
     number: int
     time_s: float
     words: str
     jpeg: bytes
+    weight: float = 1.0
 
 
 class KeyFrames:
@@ -34,9 +35,12 @@ class KeyFrames:
         self._stride = 1
         self._known: set[str] = set()
 
-    def add(self, number: int, time_s: float, kinds: Sequence[str], words: str, draw: Callable[[], np.ndarray]) -> None:
-        """A frame. kinds: of what happened at it; the first frame of each is kept. words: the same, to be read.
+    def add(
+        self, number: int, time_s: float, kinds: Mapping[str, float], words: str, draw: Callable[[], np.ndarray]
+    ) -> None:
+        """A frame. kinds: of what happened at it, each with its weight; the first frame of each is kept.
 
+        words: the same, to be read.
         draw: makes the frame's picture, (H, W, 3) uint8 BGR; only called where it is wanted.
         """
         new = set(kinds) - self._known
@@ -44,12 +48,13 @@ class KeyFrames:
         self._taken += 1
         if not (due or new):
             return
-        taken = KeyFrame(number, time_s, words, _jpeg(draw()))
+        weight = max((kinds[kind] for kind in new), default=0.0)
+        taken = KeyFrame(number, time_s, words, _jpeg(draw()), weight)
         if new:
             self._known |= new
             self._marked.append(taken)
             if len(self._marked) > _HELD:
-                del self._marked[_crowded([taken.number for taken in self._marked])]
+                del self._marked[_spared(self._marked)]
         if due:
             self._even.append(taken)
             if len(self._even) > _HELD:
@@ -60,7 +65,7 @@ class KeyFrames:
         """Those to show, by frame: where something happened, and others that are far from all of these."""
         marked = list(self._marked)
         while len(marked) > _MARKED:
-            del marked[_crowded([taken.number for taken in marked])]
+            del marked[_spared(marked)]
         chosen = {taken.number: taken for taken in marked}
         rest = [taken for taken in self._even if taken.number not in chosen]
         if rest and not chosen:
@@ -72,9 +77,11 @@ class KeyFrames:
         return [chosen[number] for number in sorted(chosen)]
 
 
-def _crowded(numbers: list[int]) -> int:
-    """Which of frames that grow can best be done without: that nearest to the one before it; never the first."""
-    return 1 + int(np.argmin(np.diff(numbers)))
+def _spared(taken: Sequence[KeyFrame]) -> int:
+    """Which of some frames in order can best be done without: one that matters little, or that has another near."""
+    apart = np.diff([one.number for one in taken]).astype(float)
+    nearest = np.minimum(np.r_[np.inf, apart], np.r_[apart, np.inf])
+    return int(np.argmin(nearest * [one.weight for one in taken]))
 
 
 def _jpeg(picture: np.ndarray) -> bytes:

@@ -217,7 +217,7 @@ def _legend(
         else:
             dashes(picture, at + FINE * np.array([[-14.0, 0], [14, 0]]), VIEW, 2)
         write(picture, text, (x + 20, y + 5), 0.5)
-        x += 20 + text_width(text, 0.5) + 34
+        x += 20 + text_width(text, 0.5) + (40 if len(entries) < 6 else 22)
     places = frame.pixels(tracks.east_north_m) / FINE
     outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
     text = f"{len(tracks.of)} targets, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")

@@ -37,7 +37,7 @@ class Signs:
             self.looks.append((np.array(from_m, float), np.array(at_m, float)))
 
 
-def draw_look(plot: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray, long: float = 22.0) -> None:
+def draw_look(plot: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray, long: float = 26.0) -> None:
     """A wedge from where a vehicle was, open towards what it looked at; pixels of the enlarged picture."""
     way = at_xy - from_xy
     angle = np.arctan2(way[1], way[0])

@@ -13,7 +13,7 @@ from torchvision_dddas.sinks.keyframes import KeyFrame
 from torchvision_dddas.sinks.timeline import OverTime, Panel, plots
 
 MOST_ROWS = 200
-"""A table shows so many rows; run.json has them all."""
+"""A table shows so many rows; run.json or log.txt has them all."""
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[Any]], str]
 """A title, the columns' names, rows of cells, and what to say where there are none."""
@@ -34,8 +34,9 @@ img,svg{width:100%;height:auto;display:block}
 svg text{font-size:12px;fill:#555}svg .title{font-size:13px;font-weight:600;fill:#222}
 svg .grid{stroke:#eee}svg .tick{stroke:#888;fill:none}svg .gap{fill:#c0392b;opacity:.15}
 svg .curve{fill:none;stroke-width:1.6;stroke-linejoin:round}
-.frames{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));gap:16px}
-figure{margin:0}figcaption{font-size:13px;color:#444;margin-top:4px;overflow-wrap:anywhere}
+.frames{display:flex;flex-wrap:wrap;gap:16px}
+figure{margin:0;flex:1 1 320px;max-width:380px}
+figcaption{font-size:13px;color:#444;margin-top:4px;overflow-wrap:anywhere}
 .note{color:#666}ul{padding-left:20px}pre{background:#f6f6f6;padding:12px;overflow:auto;font-size:13px}
 """
 
@@ -117,7 +118,7 @@ def table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
     body = [f"<tr>{''.join(f'<td>{escape(_words(cell))}</td>' for cell in row)}</tr>" for row in rows[:MOST_ROWS]]
     more = len(rows) - MOST_ROWS
-    rest = f'<p class="note">and {more} more, in run.json</p>' if more > 0 else ""
+    rest = f'<p class="note">and {more} more, in the files beside this page</p>' if more > 0 else ""
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>{rest}"
 
 

@@ -86,16 +86,20 @@ def lines(entries: Iterable[Entry], frame: np.ndarray, time_s: np.ndarray, headi
     for entry in entries:
         at = entry.time_s if entry.time_s is not None else time_at(entry.first, frame, time_s)
         clock = f"{at:9.3f}" if math.isfinite(at) else f"{'':9}"
-        out.append(f"{clock}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted(entry)}")
+        out.append(f"{clock}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted(entry, frame)}")
     return "\n".join(out) + "\n"
 
 
-def lasted(entry: Entry) -> str:
+def lasted(entry: Entry, frame: np.ndarray) -> str:
     """How long it lasted, in words, if longer than a frame."""
-    if entry.last == entry.first:
-        return ""
-    among = entry.last - entry.first + 1
-    return f" (to frame {entry.last}{'' if entry.count == among else f', in {entry.count} frames'})"
+    seldom = seldom_in(entry, frame)
+    return "" if entry.last == entry.first else f" (to frame {entry.last}{seldom and f', {seldom}'})"
+
+
+def seldom_in(entry: Entry, frame: np.ndarray) -> str:
+    """In how many of the frames looked at while it lasted, in words, if not in all. frame: (N,) those, growing."""
+    among = int(np.searchsorted(frame, entry.last, side="right") - np.searchsorted(frame, entry.first))
+    return f"in {entry.count} of {among} frames" if entry.count < among else ""
 
 
 def time_at(number: int, frame: np.ndarray, time_s: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from torchvision_dddas.sinks.run_log import (
     ADJUSTED,
     MARK,
     NAME,
+    ORDERED,
     PROBLEM,
     REPAIRED,
     TOLD,
@@ -25,6 +26,7 @@ from torchvision_dddas.sinks.run_log import (
     Entry,
     RunLog,
     lines,
+    seldom_in,
     time_at,
 )
 from torchvision_dddas.sinks.survey_overlay import Once
@@ -32,6 +34,8 @@ from torchvision_dddas.sinks.whole import remove, temporary, write_whole
 from torchvision_dddas.types import Surveyed
 
 REPORT = "report.html"
+WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
+"""How much what happened matters for the choice of key frames."""
 _BRIEF = 3
 """A landmark that is not seen in fewer frames is not worth a line."""
 
@@ -58,7 +62,6 @@ class RunStory:
     def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
         """How good the run was against the truth: values by name, and what each is."""
         self._score = [(name, value, (words or {}).get(name, "")) for name, value in measures.items()]
-        self._kept.counts["truth_score"] = dict(measures)
 
     def write(self, surveyed: Surveyed) -> None:
         """Take note of a frame."""
@@ -83,6 +86,14 @@ class RunStory:
         heading = [f"{self._name or 'run'}: {state}, {len(rows)} frames looked at; settings and totals are in run.json"]
         text = lines(self.entries(), rows["frame"], rows["time_s"], heading)
         write_whole(self._folder / NAME, text.encode())
+        happened = [e for e in self.log.ordered() if e.kind == WORLD]
+        if happened:
+            events = [{"frame": e.first, "time_s": self._time(e), "what": e.text} for e in happened]
+            self._kept.counts["events"] = events
+        if self._counts:
+            self._kept.counts |= {"kinds": dict(self._counts), "rows_looked_at": self._looks}
+        if self._score:
+            self._kept.counts["truth_score"] = {name: value for name, value, _ in self._score}
 
     def discard(self) -> None:
         """Remove what was begun."""
@@ -98,7 +109,12 @@ class RunStory:
         self.course.entries = entries = self.entries()
         rows = self.course.rows
         happened = [
-            (_clock(e, rows), e.first if e.last == e.first else f"{e.first} to {e.last}", e.kind, e.text + _share(e))
+            (
+                _clock(self._time(e)),
+                e.first if e.last == e.first else f"{e.first} to {e.last}",
+                e.kind,
+                _told_of(e, rows),
+            )
             for e in entries
         ]
         table = (f"What happened and why ({NAME})", ("time, s", "frames", "what", "how and why"), happened, "nothing")
@@ -120,6 +136,10 @@ class RunStory:
         notes = [*self._kept.notes, *self._kept.problems]
         story = self.told(Story(f"Found and followed: {self._name}", state, figures, facts, [], notes))
         write_whole(self._folder / REPORT, report(replace(story, panels=()), self.course).encode())
+
+    def _time(self, entry: Entry) -> float:
+        rows = self.course.rows
+        return entry.time_s if entry.time_s is not None else time_at(entry.first, rows["frame"], rows["time_s"])
 
     def _step(self, number: int) -> int:
         return number - self._before
@@ -160,12 +180,11 @@ class RunStory:
             was = self._said.get(target)
             self._said[target] = kind
             words = f"target {target} is {kind.replace('_', ' ')}"
-            more = f" (human to {confirmed.probability[i]:.0%})"
+            more = f" (probability of being human {confirmed.probability[i]:.2f})"
             seen = f", seen by {' and '.join(by)}" if by else ""
             changed = f"; it was told {was.replace('_', ' ')} before" if was else ""
             self.log.add(grounded.frame, TOLD, words + more + seen + changed, short=words)
             self.signs.told(target, kind, at.east_north_m[row])
-        self._kept.counts |= {"kinds": dict(self._counts), "rows_looked_at": self._looks}
 
     def _verdicts(self) -> Counter[str]:
         return Counter(self._said.values())
@@ -178,17 +197,19 @@ class RunStory:
         due = [e for e in self._waiting if self._before < e.first <= number and e.kind != MARK]
         self._waiting = [e for e in self._waiting if e.first > number]
         words = "; ".join(dict.fromkeys(e.short for e in due))
-        kinds = [e.short if e.kind in (WORLD, TOLD) else f"{e.kind} {e.short.split(' ')[0]}" for e in due]
+        # Of a world's events and of targets each counts; of knobs and mishaps the first of its kind.
+        kinds = {
+            e.short if e.kind in (WORLD, TOLD) else f"{e.kind} {e.short.split(' ')[0]}": WEIGHTS[e.kind] for e in due
+        }
         self.frames.add(
             number, time_s, kinds, words if len(words) < 260 else f"{words[:256]} ...", lambda: pictures(surveyed)
         )
 
 
-def _clock(entry: Entry, rows: np.ndarray) -> str:
-    at = entry.time_s if entry.time_s is not None else time_at(entry.first, rows["frame"], rows["time_s"])
-    return f"{at:.2f}" if np.isfinite(at) else ""
+def _clock(time_s: float) -> str:
+    return f"{time_s:.2f}" if np.isfinite(time_s) else ""
 
 
-def _share(entry: Entry) -> str:
-    among = entry.last - entry.first + 1
-    return "" if entry.count == among else f" (in {entry.count} frames)"
+def _told_of(entry: Entry, rows: np.ndarray) -> str:
+    seldom = seldom_in(entry, rows["frame"])
+    return f"{entry.text} ({seldom})" if seldom else entry.text
