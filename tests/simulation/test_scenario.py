@@ -1,0 +1,203 @@
+"""Scenarios: read by name or file, changed, written, and refused in one line that says what to do."""
+
+import math
+import shutil
+
+import pytest
+
+from tests.simulation.small import as_file, small
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.simulation.scenario import Scenario, as_toml, check, load, names, settings_of
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_shipped_scenario_loads_and_says_what_it_shows(name):
+    scenario = load(name)
+    assert len(scenario.about) > 20
+    assert 30 <= scenario.clip.seconds <= 60
+    assert (scenario.camera.width_px, scenario.camera.height_px, scenario.camera.hfov_deg) == (640, 480, 60.0)
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_ring_of_landmarks_of_every_shipped_scenario_fits_into_its_picture(name):
+    scenario = load(name)
+    high_m = 2 * scenario.uav.altitude_m * math.tan(math.radians(scenario.camera.hfov_deg) / 2) * 480 / 640
+    assert scenario.team.middle_m == scenario.uav.start_m
+    assert scenario.team.ring_m < 0.4 * high_m
+
+
+def test_there_is_a_scenario_for_each_behaviour_and_altitude():
+    wanted = {"joining", "splitting", "scattering", "random", "crossing", "border50", "border100", "border200"}
+    assert wanted | {"four", "six", "gps", "faults", "quiet"} <= set(names())
+    assert len(load("four").team.model_dump()) and load("six").team.ugvs == 6
+    kinds = {fault.what for fault in load("faults").fault}
+    assert len(kinds) == 8
+
+
+def test_four_and_six_differ_in_the_number_of_landmarks_alone():
+    four, six = load("four").model_dump(), load("six").model_dump()
+    assert (four["team"].pop("ugvs"), six["team"].pop("ugvs")) == (4, 6)
+    del four["about"], six["about"]
+    assert four == six
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_scenario_that_was_written_is_read_as_it_was(name, tmp_path):
+    scenario = load(name, ["settings.crowds.join_m=4", "settings.steering.on=false"])
+    assert load(as_file(tmp_path / "again.toml", scenario)) == scenario
+
+
+def test_words_with_quotes_and_other_letters_survive_being_written(tmp_path):
+    scenario = small().model_copy(update={"about": 'a "crowd"\nof \\ naïve \x7f people'})
+    assert load(as_file(tmp_path / "odd.toml", scenario)).about == scenario.about
+
+
+def test_overrides_change_what_they_name_and_nothing_else():
+    plain = load("joining")
+    changed = load("joining", ["uav.altitude_m=100", "crowd.2.people=20", "crowd.1.way_m=[[1, 2], [3.5, 4]]"], seed=77)
+    assert (changed.uav.altitude_m, changed.crowd[1].people, changed.seed) == (100, 20, 77)
+    assert changed.crowd[0].way_m == ((1, 2), (3.5, 4))
+    back = load("joining", [f"uav.altitude_m={plain.uav.altitude_m}", "crowd.2.people=7"])
+    assert back == plain
+
+
+def test_an_override_can_bring_a_whole_list():
+    scenario = load("quiet", ["fault=[{what='gust', time_s=3, seconds=1}]", "car=[{start_m=[1, 2]}]"])
+    assert scenario.fault[0].what == "gust"
+    assert scenario.car[0].start_m == (1, 2)
+
+
+def test_settings_of_a_scenario_are_the_systems_knobs():
+    scenario = load("joining", ["settings.crowds.join_m=4"])
+    assert settings_of(scenario) == {"crowds.join_m": 4}
+    assert with_knobs(Settings(), settings_of(scenario)).crowds.join_m == 4
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("uav.altitude_m=1", "uav.altitude_m = 1 will not do; wanted 2 to 2000 m"),
+        ("uav.altitud_m=9", "unknown knob 'uav.altitud_m'; did you mean uav.altitude_m"),
+        ("crowd.1.peple=9", "unknown knob 'crowd.1.peple'; did you mean crowd.1.people"),
+        ("crowd.1.people=0.5", "crowd.1.people = 0.5 will not do; wanted a whole number, 1 to 5000 people"),
+        ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ..., of which there are 2"),
+        ("crowd.people=2", "'crowd.people' names no knob; wanted such as crowd.1.people"),
+        ("crowd=3", "crowd = 3 will not do; wanted a list of tables"),
+        ("uav=3", "uav = 3 will not do; wanted a table"),
+        ("weather.rain=3", "unknown knob 'weather'; its tables are clip, world, uav"),
+        ("seed=-1", "seed = -1 will not do; wanted a whole number"),
+        ("crowd.1.start_m=3", "crowd.1.start_m = 3 will not do; wanted two numbers, [east, north]"),
+        ("crowd.1.way_m=[[1, 2], 3]", "crowd.1.way_m = 3 will not do; wanted a list of places"),
+        ("happening.1.what=jump", "happening.1.what = 'jump' will not do; wanted join or split or scatter"),
+        ("settings.crowds.join=3", "settings: unknown knob 'crowds.join'; did you mean crowds.join_m"),
+        ("settings.crowds.join_m=-3", "settings: crowds.join_m = -3 will not do; wanted 0 to 100 m"),
+        ("uav.altitude_m", "is no override; wanted group.knob=value"),
+    ],
+)
+def test_a_wrong_knob_is_refused_with_what_was_wanted(override, line):
+    with pytest.raises(InputError) as refusal:
+        load("joining", [override])
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        (
+            "crowd.1.start_m=[400, 0]",
+            "crowd.1.start_m = [400, 0] with 2.5 m about it is outside the world; wanted within",
+        ),
+        ("crowd.1.start_m=[116, 0]", "is outside the world; wanted within 118 m"),
+        ("crowd.2.way_m=[[0, 0], [0, -119]]", "crowd.2.way_m = [0, -119] is outside the world"),
+        ("car.1.start_m=[0, 119]", "car.1.start_m = [0, 119] is outside"),
+        ("team.ring_m=119", "team.middle_m = [0, 0] with 119 m about it is outside"),
+        ("uav.way_m=[[0, 200]]", "uav.way_m = [0, 200] is outside"),
+        ("team.ugvs=3", "team.ugvs = 3 will not do: a clip located by landmarks needs 4"),
+        ("happening.1.crowds=[1, 3]", "happening.1.crowds names crowd 3, of which there are 2"),
+        ("happening.1.crowds=[1]", "to join takes two or more"),
+        ("happening.1.crowds=[1, 1]", "to join takes two or more"),
+        ("happening.1.time_s=40", "happening.1.time_s = 40 is after the end; clip.seconds = 40"),
+        ("fault=[{what='gust', time_s=50}]", "fault.1.time_s = 50 is after the end"),
+        ("fault=[{what='gps_jump', vehicle=5}]", "fault.1.vehicle = 5 is not there; team.ugvs = 4"),
+        ("world.elevation=no.tif", "world.elevation: there is no file no.tif"),
+        ("world.photo=no.tif", "world.photo: there is no file no.tif"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(override, line):
+    with pytest.raises(InputError, match=r"^scenario joining: ") as refusal:
+        load("joining", [override])
+    assert line in str(refusal.value)
+
+
+def test_a_person_alone_cannot_split():
+    with pytest.raises(InputError, match="crowd 1 is one person, and cannot split"):
+        load("splitting", ["crowd.1.people=1"])
+
+
+def test_few_vehicles_will_do_where_telemetry_locates():
+    assert load("quiet", ["team.ugvs=0", 'clip.located_by="telemetry"']).team.ugvs == 0
+
+
+def test_a_fault_of_the_uav_asks_for_no_vehicle():
+    check(small(team={"ugvs": 4}, fault=({"what": "frozen", "time_s": 0.5, "vehicle": 9},)))
+
+
+@pytest.mark.parametrize("name", ["nowhere", "", "Joining"])
+def test_an_unknown_scenario_is_refused_with_those_there_are(name):
+    with pytest.raises(InputError, match=r"there are border100, .* or give a TOML file"):
+        load(name)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"no such scenario file: .*gone\.toml"):
+        load(tmp_path / "gone.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[uav\n", "line 1: not valid TOML"),
+        ("[uav]\naltitude_m = 'high'\n", "odd.toml: uav.altitude_m = 'high' will not do; wanted 2 to 2000 m"),
+        ("[[uav]]\naltitude_m = 5\n", "will not do; wanted a table"),
+        ("[crowd]\npeople = 5\n", "will not do; wanted a list of tables"),
+        ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown knob"),
+        ("[settings]\ncrowds = 5\n", "wanted a table"),
+        ("altitude_m = 5\n", "unknown knob 'altitude_m'; did you mean uav.altitude_m"),
+    ],
+)
+def test_a_bad_file_is_refused_by_its_name(tmp_path, text, line):
+    path = tmp_path / "odd.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as refusal:
+        load(path)
+    assert str(path) in str(refusal.value)
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_raster_is_looked_for_beside_the_scenario_that_names_it(tmp_path):
+    (tmp_path / "hills.tif").write_bytes(b"")
+    path = tmp_path / "hilly.toml"
+    path.write_text('[world]\nelevation = "hills.tif"\n')
+    assert load(path).world.elevation == str(tmp_path / "hills.tif")
+
+
+def test_a_scenario_may_stand_beside_a_folder_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "joining").mkdir()
+    assert load("joining").about
+
+
+def test_the_defaults_alone_are_a_scenario():
+    check(Scenario())
+    assert as_toml(Scenario()).startswith('about = ""\nseed = 0\n')
+
+
+def test_shipped_scenarios_are_no_configurations_of_the_settings(tmp_path):
+    from torchvision_dddas.settings import config_folder, config_names
+
+    assert not set(names()) & set(config_names())
+    shutil.copytree(config_folder() / "scenarios", tmp_path / "scenarios")
+    assert sorted(p.stem for p in (tmp_path / "scenarios").iterdir()) == names()
