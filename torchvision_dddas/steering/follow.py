@@ -167,7 +167,7 @@ class Follow:
         """Nothing to follow: wait where it was last, see more from higher, and at last go back to the team."""
         gone_s = np.inf if self._found_s is None else self._now_s - self._found_s
         if self._group & set(outlook.target.tolist()):
-            why = f"target {min(self._group)} is not human"
+            why = f"target {min(self._group)} goes on, but is not human"
         elif gone_s > _GIVEN_UP_S:
             why = f"no target for {_GIVEN_UP_S:.0f} s"
         else:

@@ -6,8 +6,13 @@ import numpy as np
 
 from torchvision_dddas.types import Camera, Confirmed, Grounded
 
-# A target steers nothing before it was located so often: most false alarms are gone by then.
-_SIGHTINGS = 3
+# A target steers nothing before it was located so often and for so long: most false alarms are gone by then.
+_SIGHTINGS, _LASTING_S = 3, 0.8
+# A place moves by this share of what it is off its prediction, and a velocity by this share of its change: the blob of
+# a crowd swings about as parts of it are seen or not. A place further off is taken as it is.
+_BELIEVED, _FAR_M = 0.4, 5.0
+# People do not run faster, nor cars go slower for long: what does is not wanted until it is found to be human.
+_RUNNING_M_S, _WALKING_M_S = 4.5, 3.5
 # One that is not located any more is remembered so long; its velocity is believed for a shorter time.
 _KEPT_S, _HORIZON_S = 8.0, 3.0
 # What is lost where another was found within its reach goes on under that one's name.
@@ -25,6 +30,7 @@ class Outlook:
     target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
     probability: (N,) of being human. unseen: (N,) bool, no ground vehicle could tell. wanted: (N,) bool, human or
     unseen. lost_s: (N,) since it was last located, by the clock of the frames. missed: (N,) of the latest frames.
+    steady: (N,) bool, its velocity is known.
     """
 
     target: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -36,6 +42,7 @@ class Outlook:
     wanted: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     lost_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
     missed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    steady: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __len__(self) -> int:
         return len(self.target)
@@ -54,11 +61,38 @@ class _Remembered:
     velocity_m_s: np.ndarray
     radius_m: float
     seen_s: float
-    sightings: int = 1
+    first_s: float
+    sightings: int = 0
     missed: int = 0
     probability: float = 0.5
     unseen: bool = True
-    wanted: bool = True
+    human: bool = True  # or may be
+    fast: bool = False
+    steady: bool = False
+
+    def see(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
+        """It was located again."""
+        predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
+        off = place_m - predicted
+        self.place_m = predicted + (_BELIEVED * off if np.linalg.norm(off) < _FAR_M else off)
+        if np.isfinite(velocity_m_s).all():
+            self.velocity_m_s = self.velocity_m_s + (_BELIEVED if self.steady else 1.0) * (
+                velocity_m_s - self.velocity_m_s
+            )
+            self.steady = True
+        self.radius_m += _BELIEVED * (radius_m - self.radius_m)
+        self.seen_s, self.missed, self.sightings = time_s, 0, self.sightings + 1
+        self.fast = bool(np.linalg.norm(self.velocity_m_s) > (_WALKING_M_S if self.fast else _RUNNING_M_S))
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it has been there for long enough to be believed in."""
+        return self.sightings >= _SIGHTINGS and self.seen_s - self.first_s >= _LASTING_S - 1e-6
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it is human, or may be."""
+        return self.human and (not self.fast or (not self.unseen and self.probability >= _TAKEN_UP))
 
 
 class Memory:
@@ -73,13 +107,11 @@ class Memory:
         radii = radii_m(grounded, self.camera)
         targets = grounded.positions.target.tolist()
         for row, target in enumerate(targets):
-            place, velocity = grounded.positions.east_north_m[row], np.nan_to_num(grounded.velocity_m_s[row])
-            if not np.isfinite(place).all():
-                continue
-            known = self._known.setdefault(target, _Remembered(place, velocity, float(radii[row]), 0.0, 0))
-            known.place_m, known.velocity_m_s, known.seen_s = place, velocity, grounded.time_s
-            known.radius_m += 0.2 * (float(radii[row]) - known.radius_m)
-            known.sightings, known.missed = known.sightings + 1, 0
+            place, velocity = grounded.positions.east_north_m[row], grounded.velocity_m_s[row]
+            if np.isfinite(place).all():
+                when, radius = grounded.time_s, float(radii[row])
+                known = self._known.setdefault(target, _Remembered(place, np.zeros(2), radius, when, when))
+                known.see(place, velocity, radius, when)
         if confirmed is not None:
             for row, kind, probability in zip(confirmed.row, confirmed.kind, confirmed.probability, strict=True):
                 if 0 <= row < len(targets) and targets[row] in self._known:
@@ -96,11 +128,11 @@ class Memory:
             gone_s = time_s - known.seen_s
             place = known.place_m + known.velocity_m_s * min(gone_s, _HORIZON_S)
             renamed = len(here) and np.linalg.norm(here - place, axis=1).min() < _RENAMED_M + known.radius_m
-            if gone_s > _KEPT_S or renamed or (known.sightings < _SIGHTINGS and known.missed > 1):
+            if gone_s > _KEPT_S or renamed or (not known.lasting and known.missed > 2):
                 del self._known[target]
 
     def _expected(self, now_s: float, time_s: float) -> Outlook:
-        rows = {target: known for target, known in self._known.items() if known.sightings >= _SIGHTINGS}
+        rows = {target: known for target, known in self._known.items() if known.lasting}
         if not rows:
             return Outlook()
         all_of = list(rows.values())
@@ -116,15 +148,16 @@ class Memory:
             np.array([known.wanted for known in all_of]),
             np.array([time_s - known.seen_s for known in all_of]),
             np.array([known.missed for known in all_of], np.int64),
+            np.array([known.steady for known in all_of]),
         )
 
 
 def _judge(known: _Remembered, kind: str, probability: float) -> None:
     known.probability, known.unseen = probability, kind == "unseen"
     if kind == "not_human" and probability <= _GIVEN_UP:
-        known.wanted = False
+        known.human = False
     elif kind != "not_human" or probability >= _TAKEN_UP:
-        known.wanted = True
+        known.human = True
 
 
 def radii_m(grounded: Grounded, camera: Camera) -> np.ndarray:

@@ -17,7 +17,9 @@ from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flig
 # Vehicles are given new goals so often at most: what is found is a second old, and they do not turn faster.
 _PERIOD_S = 0.2
 # After something was lost every frame is looked at for so long.
-_ALERT_S = 2.0
+_ALERT_S = 4.0
+# Fewer frames are looked at only when the last change is so long ago.
+_CALM_S = 3.0
 # A target is lost once so many frames in a row do not show it.
 _MISSED = 2
 # A registration in which a smaller share of points agrees is weak.
@@ -34,6 +36,7 @@ class Steering:
         self._follow, self._team = Follow(settings), Team(settings, vehicles)
         self._stand: Stand | None = None
         self._command, self._steered_s = Command(), -np.inf
+        self._sampled_s = -np.inf
         self._every, self._before, self._alert_s, self._alert = 1, 0, -np.inf, ""
 
     def step(
@@ -116,5 +119,9 @@ class Steering:
                 wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], knobs
             )
             why += limit
-        self._every, made = sampled(frame, self._every, wanted, why, knobs)
+        every, made = sampled(frame, self._every, wanted, why, knobs)
+        if every > self._every and now_s - self._sampled_s < _CALM_S:
+            return
+        if made:
+            self._every, self._sampled_s = every, now_s
         self._record.add(made)

@@ -171,7 +171,7 @@ class Team:
             if free <= 0 or needs[row] < 1 - _UNSURE:
                 break
             seen_from_ring = afar[row] < knobs.look_m
-            too_fast = outlook.speed_m_s[row] > knobs.fast_m_s
+            too_fast = outlook.speed_m_s[row] > knobs.fast_m_s or not outlook.steady[row]
             if target in gone_to or let_be or too_fast or seen_from_ring or outlook.lost_s[row] > 1:
                 continue
             idle = [v for v, vehicle in self._known.items() if vehicle.sent_to < 0]
@@ -198,10 +198,10 @@ class Team:
         away = float(np.linalg.norm(station - vehicle.place_m))
         vehicle.near = away < knobs.near_m * (_FAR if vehicle.near else 1.0)
         # It must not fall behind a crowd that walks faster than it should go near it.
-        slow = min(max(knobs.slow_m_s, 1.1 * drift_m_s), max(knobs.fast_m_s, knobs.slow_m_s))
+        slow = round(min(max(knobs.slow_m_s, 1.1 * drift_m_s), max(knobs.fast_m_s, knobs.slow_m_s)), 1)
         record.set(
             f"{name}.speed_m_s",
-            round(slow if vehicle.near else knobs.fast_m_s, 1),
+            slow if vehicle.near else knobs.fast_m_s,
             f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s",
             least=0.5,
         )
