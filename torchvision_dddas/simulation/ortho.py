@@ -39,9 +39,10 @@ def laid(photo: Ortho, side_m: float, side_px: int) -> tuple[np.ndarray, np.ndar
         corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]])
         metres = corners @ np.asarray(photo.east_north_from_pixel, float).T
         (west, south), (east, north) = metres.min(0), metres.max(0)
+        half = side_m / 2
         raise InputError(
             f"the photo shows nothing of the world: it lies from {west:.0f} m to {east:.0f} m east and {south:.0f} m "
-            f"to {north:.0f} m north of world.origin_deg, and the world from {-side_m / 2:.0f} m to {side_m / 2:.0f} m; "
+            f"to {north:.0f} m north of world.origin_deg, and the world from {-half:.0f} m to {half:.0f} m; "
             "set world.origin_deg, or give another photo"
         )
     return cv2.warpAffine(image, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), sure
@@ -80,7 +81,8 @@ class Photographed:
         inner = soil[:, edge : edge + last - first]
         if coarse:
             for k in range(3):
-                image[k] += inner[k] - cv2.GaussianBlur(soil[k], (0, 0), self._blur_px)[edge : edge + last - first]
+                broad = cv2.GaussianBlur(soil[k], (0, 0), self._blur_px)[edge : edge + last - first]
+                image[k] *= np.clip(inner[k] / np.maximum(broad, 1), 0.6, 1.4)
         return inner + share * (image - inner)
 
 

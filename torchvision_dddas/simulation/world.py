@@ -70,7 +70,8 @@ def build(
     to_sun = sunlight.towards(knobs.sun_azimuth_deg, knobs.sun_height_deg)
     rng = np.random.default_rng([seed, 10])
     relief = reliefs.hills(side_m, knobs.relief_m, rng) if elevation is None else reliefs.of_raster(elevation, side_m)
-    ground = lie(side_m, cells, seed)
+    light = _on_texels(sunlight.on_slopes(relief.up_m, relief.step_m, to_sun), cells)
+    ground = lie(side_m, light, seed)
 
     banks = np.exp(-(((ground.wash_m - ground.wash_half_m - 1) / 2.5) ** 2))
     off_road = np.clip((np.abs(ground.road_m) - 2.5) / 1.5, 0, 1)
@@ -87,10 +88,9 @@ def build(
     surface = crowns.surface(side_px // factor)
     hills = np.float32(0) if photo is not None else _on_texels(relief.up_m, surface.shape[0])
     over = sunlight.above_ground(surface + hills, texel * factor, to_sun)
-    light = _on_texels(sunlight.on_slopes(relief.up_m, relief.step_m, to_sun), cells)
 
     def synthetic(rows: tuple[int, int]) -> np.ndarray:
-        return soil(ground, rows, texel, seed, to_sun) * enlarged(light, rows, COARSE)
+        return soil(ground, rows, texel, seed, to_sun)
 
     bare = synthetic if photo is None else Photographed(photo, side_m, side_px, synthetic).rows
     albedo = np.empty((side_px, side_px, 3), np.uint8)
