@@ -1,116 +1,183 @@
 """Relief marching: what stands on the ground leans in the picture, and hides what is behind it."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.world import World
 
-_CELL_M = 0.8  # of the map that tells where anything can be met at all
-_BINS_M = np.array([0.4, 0.8, 1.2, 1.8, 2.5, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 40.0, 100.0, 1000.0])
-_LEANS = (0.25, 0.5, 0.8, 1.2, 2.0, 4.0)
-_LEAST_M = 0.05
-_STEPS = 14
+_CELL_M = 0.8  # of the maps of what is highest nearby
+_SLICES = 16  # heights at which a block of pixels is tested
+_LEAST_M = 0.05  # what is lower lies flat
+_STEPS = (3, 6, 12, 24)  # on the way down of a pixel's line of sight
+_STRIDE_PX = 1.5  # that a step should be long in the picture
 _HALVINGS = 4
 _LEVELS = 5
+_STEEP = 3.0  # what rises so many metres for each metre is a wall
+_INSIDE_M = 0.4  # walls have the colour of the roof so far from its edge
+_SKYLIGHT = 0.42
 _WIDE = 512  # OpenCV remaps no picture wider than 32767: long lists are folded
+
+
+class Sights(NamedTuple):
+    """N lines of sight, float32, and where they meet the bare ground. All (N,).
+
+    lean_east, lean_north: metres for each metre up. pixel_m: size of their pixel on the ground.
+    """
+
+    east_m: np.ndarray
+    north_m: np.ndarray
+    lean_east: np.ndarray
+    lean_north: np.ndarray
+    pixel_m: np.ndarray
+
+    def at(self, up_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places east and north at which they pass so high; up_m (N,) or (K, N)."""
+        return self.east_m + self.lean_east * up_m, self.north_m + self.lean_north * up_m
+
+    @property
+    def lean(self) -> np.ndarray:
+        """(N,) how far they lean, whither ever."""
+        return np.hypot(self.lean_east, self.lean_north)
+
+    def of(self, which: np.ndarray) -> "Sights":
+        """Some of them."""
+        return Sights(*(column[which] for column in self))
+
+
+class Met(NamedTuple):
+    """Where lines of sight meet something: which (M,) of them, how high, of what colour (east, north), how bright."""
+
+    which: np.ndarray
+    east_m: np.ndarray
+    north_m: np.ndarray
+    up_m: np.ndarray
+    light: np.ndarray
 
 
 class Standing:
     """What stands on a world's ground, made ready for lines of sight from above."""
 
     def __init__(self, world: World) -> None:
-        self._world = world
+        self._side_m, self._to_sun = world.side_m, world.to_sun
+        self._texel_m = world.surface_texel_m
         self._levels = [np.ascontiguousarray(world.surface, np.float32)]
         while len(self._levels) < _LEVELS and min(self._levels[-1].shape) >= 4:
             size = (self._levels[-1].shape[1] + 1) // 2, (self._levels[-1].shape[0] + 1) // 2
-            self._levels.append(cv2.resize(self._levels[-1], size, interpolation=cv2.INTER_AREA))
+            self._levels.append(
+                np.asarray(cv2.resize(self._levels[-1], size, interpolation=cv2.INTER_AREA), np.float32)
+            )
         cells = max(int(np.ceil(world.side_m / _CELL_M)), 1)
-        wide = max(int(np.ceil(_CELL_M / world.surface_texel_m)) | 1, 1)
-        most = cv2.dilate(self._levels[0], np.ones((wide, wide), np.uint8))
-        self._most = cv2.resize(most, (cells, cells), interpolation=cv2.INTER_NEAREST)
-        self._near: dict[float, np.ndarray] = {}
+        wide = 2 * int(np.ceil(_CELL_M / world.surface_texel_m)) + 1
+        highest = cv2.dilate(self._levels[0], np.ones((wide, wide), np.uint8), borderType=cv2.BORDER_REFLECT)
+        self._highest = [cv2.resize(highest, (cells, cells), interpolation=cv2.INTER_NEAREST)]
+        self.tallest_m = float(highest.max())
 
-    def met(
-        self, east_m: np.ndarray, north_m: np.ndarray, lean: np.ndarray, pixel_m: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-        """Which lines of sight meet something before the ground, and where; None: none does.
-
-        east_m, north_m: (H, W) where they meet the ground. lean: (H, W, 2) metres east and north that they go for each
-        metre up. pixel_m: (H,). Returns flat indices (M,), east, north and height above ground (M,) of what is met.
-        """
-        if not self._most.any():
-            return None
-        steepest = float(np.sqrt((lean[::8, ::8] ** 2).sum(axis=-1).max()))
-        near = self._nearby(steepest)
-        u, v = self._folded(near, east_m, north_m)
-        bins = cv2.remap(near, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT)
-        which = np.flatnonzero(bins)
+    def met(self, sights: Sights, top_m: np.ndarray, bottom_m: np.ndarray) -> Met | None:
+        """What is met by lines of sight between two heights (N,); None: nothing is."""
+        wanted = (top_m - bottom_m) * sights.lean / (_STRIDE_PX * sights.pixel_m)
+        steps = np.searchsorted(_STEPS[:-1], wanted)
+        level = np.clip(np.log2(sights.pixel_m / self._texel_m), 0, len(self._levels) - 1).astype(int)
+        kinds = level * len(_STEPS) + steps
+        found = []
+        for kind in np.flatnonzero(np.bincount(kinds)):
+            part = np.flatnonzero(kinds == kind)
+            hit, up = self._march(
+                int(kind) // len(_STEPS), _STEPS[kind % len(_STEPS)], sights.of(part), top_m[part], bottom_m[part]
+            )
+            found.append((part[hit], up))
+        which, up = (np.concatenate(column) for column in zip(*found, strict=True))
         if not len(which):
             return None
-        found = []
-        row = which // east_m.shape[1]
-        level = np.clip(np.log2(pixel_m / self._world.surface_texel_m).astype(int), 0, len(self._levels) - 1)[row]
-        edges = [0, *(np.flatnonzero(np.diff(level)) + 1).tolist(), len(which)]
-        for k in range(len(edges) - 1):
-            part = which[edges[k] : edges[k + 1]]
-            place = east_m.ravel()[part], north_m.ravel()[part]
-            way = lean.reshape(-1, 2)[part]
-            top = _BINS_M.astype(np.float32)[bins.ravel()[part] - 1]
-            hit, up = self._march(int(level[edges[k]]), place, way, top)
-            found.append((part[hit], place[0][hit] + way[hit, 0] * up, place[1][hit] + way[hit, 1] * up, up))
-        which, east, north, up = (np.concatenate(column) for column in zip(*found, strict=True))
-        return (which, east, north, up) if len(which) else None
+        east, north = sights.of(which).at(up)
+        light = np.ones(len(which), np.float32)
+        side = np.float32(_INSIDE_M)
+        rise_east = self._up(east + side, north) - self._up(east - side, north)
+        rise_north = self._up(east, north + side) - self._up(east, north - side)
+        rise = np.hypot(rise_east, rise_north)
+        steep = np.flatnonzero(rise > 2 * side * _STEEP)
+        if len(steep):
+            outward = -np.stack([rise_east[steep], rise_north[steep]]) / rise[steep]
+            sun = np.maximum(self._to_sun[:2].astype(np.float32) @ outward, 0) / max(float(self._to_sun[2]), 0.3)
+            light[steep] = np.minimum(_SKYLIGHT + (1 - _SKYLIGHT) * sun, 1.2)
+            east[steep] -= side * outward[0]
+            north[steep] -= side * outward[1]
+        return Met(which, east, north, up, light)
 
-    def up_m(self, east_m: np.ndarray, north_m: np.ndarray, level: int = 0) -> np.ndarray:
-        """Height above ground of what stands at places, each (N,) or (K, N) float32."""
-        shape = east_m.shape
-        count = east_m.size
-        folded = -(-count // _WIDE) * _WIDE
-        east, north = np.zeros(folded, np.float32), np.zeros(folded, np.float32)
-        east[:count], north[:count] = east_m.ravel(), north_m.ravel()
-        texture = self._levels[level]
-        u, v = self._folded(texture, east.reshape(-1, _WIDE), north.reshape(-1, _WIDE))
-        up = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(up.ravel()[:count].reshape(shape))
+    def between(self, sights: Sights, reach_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Between which heights (N,) lines of sight can meet something that is at most reach_m (N,) beside them.
+
+        Where nothing is in reach, both are 0.
+        """
+        edges = np.linspace(self.tallest_m + _LEAST_M, 0, _SLICES + 1, dtype=np.float32)
+        half = (edges[0] - edges[1]) / 2
+        reach = reach_m + sights.lean * half
+        ring = rings(reach)
+        top, bottom = (np.zeros(len(reach), np.float32) for _ in range(2))
+        for k in np.flatnonzero(np.bincount(ring)):
+            part = np.flatnonzero(ring == k)
+            east, north = sights.of(part).at(edges[1:, None] + half)
+            may = self._look(self._nearby(int(k)), east, north, cv2.INTER_NEAREST)
+            may = may > np.maximum(edges[1:, None], _LEAST_M)
+            some = may.any(axis=0)
+            top[part] = np.where(some, edges[may.argmax(axis=0)], 0)
+            bottom[part] = np.where(some, edges[_SLICES - may[::-1].argmax(axis=0)], 0)
+        return top, bottom
+
+    def near(self, east_m: np.ndarray, north_m: np.ndarray, ring: np.ndarray, up_m: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether anything higher than up_m is within so many rings of places, all (N,)."""
+        near = np.zeros(len(ring), bool)
+        for k in np.flatnonzero(np.bincount(ring)):
+            part = np.flatnonzero(ring == k)
+            highest = self._look(self._nearby(int(k)), east_m[part], north_m[part], cv2.INTER_NEAREST)
+            near[part] = highest > up_m[part]
+        return near
 
     def _march(
-        self, level: int, place: tuple[np.ndarray, np.ndarray], way: np.ndarray, top: np.ndarray
+        self, level: int, steps: int, sights: Sights, top_m: np.ndarray, bottom_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which of N lines of sight meet something, (M,) indices, and how high; they are followed down from top."""
-        shares = (1 - np.arange(1, _STEPS + 1) / (_STEPS + 0.5)).astype(np.float32)
-        up = shares[:, None] * top
-        stands = self.up_m(place[0] + way[:, 0] * up, place[1] + way[:, 1] * up, level)
-        inside = stands > np.maximum(up, _LEAST_M)
+        """Which of N lines of sight meet something, (M,) indices, and how high; they are followed downwards."""
+        step = (top_m - bottom_m) / np.float32(steps)
+        up = top_m - np.arange(1, steps + 1, dtype=np.float32)[:, None] * step
+        # The last step ends a little above the ground, which everything flat is not.
+        up[-1] = np.maximum(up[-1], np.minimum(_LEAST_M, step / 2))
+        inside = self._up(*sights.at(up), level) > np.maximum(up, _LEAST_M)
         first = inside.argmax(axis=0)
         hit = np.flatnonzero(inside[first, np.arange(len(first))])
         low = up[first[hit], hit]
-        high = low + top[hit] / np.float32(_STEPS + 0.5)
-        east, north, way = place[0][hit], place[1][hit], way[hit]
+        high, met = low + step[hit], sights.of(hit)
         for _ in range(_HALVINGS if len(hit) else 0):
             middle = (low + high) / 2
-            within = self.up_m(east + way[:, 0] * middle, north + way[:, 1] * middle, level) > middle
+            within = self._up(*met.at(middle), level) > middle
             low, high = np.where(within, middle, low), np.where(within, high, middle)
         return hit, low
 
-    def _folded(self, texture: np.ndarray, east_m: np.ndarray, north_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels of a texture (H, W) of the whole world at places, each (h, w) float32."""
-        half = self._world.side_m / 2
-        across, down = texture.shape[1] / self._world.side_m, texture.shape[0] / self._world.side_m
-        u = cv2.addWeighted(east_m, across, east_m, 0, half * across - 0.5)
-        return u, cv2.addWeighted(north_m, -down, north_m, 0, half * down - 0.5)
+    def _up(self, east_m: np.ndarray, north_m: np.ndarray, level: int = 0) -> np.ndarray:
+        return self._look(self._levels[level], east_m, north_m, cv2.INTER_LINEAR)
 
-    def _nearby(self, lean: float) -> np.ndarray:
-        """(R, C) uint8: what can be met above each cell under so steep a lean at most: 0, or the bin of its height."""
-        lean = next((step for step in _LEANS if step >= lean), _LEANS[-1])
-        if lean not in self._near:
-            near = np.zeros(self._most.shape, np.uint8)
-            below = _LEAST_M
-            for k, top in enumerate(_BINS_M):
-                mine = (self._most > below) & (self._most <= top)
-                below = top
-                if mine.any():
-                    away = cv2.distanceTransform((~mine).astype(np.uint8), cv2.DIST_L2, 5)
-                    highest = float(self._most[mine].max())
-                    near[away * _CELL_M <= lean * highest + 2 * _CELL_M] = k + 1
-            self._near[lean] = near
-        return self._near[lean]
+    def _look(self, texture: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, how: int) -> np.ndarray:
+        """What a texture (H, W) of the whole world says of places, (N,) or (K, N) float32."""
+        count = east_m.size
+        half = self._side_m / 2
+        across, down = texture.shape[1] / self._side_m, texture.shape[0] / self._side_m
+        uv = np.zeros((2, -(-count // _WIDE) * _WIDE), np.float32)
+        uv[0, :count] = (east_m.ravel() + np.float32(half)) * np.float32(across) - np.float32(0.5)
+        uv[1, :count] = (np.float32(half) - north_m.ravel()) * np.float32(down) - np.float32(0.5)
+        u, v = uv.reshape(2, -1, _WIDE)
+        return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT).ravel()[:count]).reshape(
+            east_m.shape
+        )
+
+    def _nearby(self, ring: int) -> np.ndarray:
+        """(R, C) the greatest height within 2**ring cells of each cell."""
+        while len(self._highest) <= ring:
+            wide = 2 ** len(self._highest) // 2 * 2 + 1
+            last = self._highest[-1]
+            self._highest.append(cv2.dilate(last, np.ones((wide, wide), np.uint8), borderType=cv2.BORDER_REFLECT))
+        return self._highest[ring]
+
+
+def rings(reach_m: np.ndarray) -> np.ndarray:
+    """How many rings cover a reach (N,): each is twice as wide as the one before."""
+    return np.ceil(np.log2(np.maximum(reach_m, _CELL_M) / _CELL_M)).astype(np.int8)

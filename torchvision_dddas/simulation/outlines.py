@@ -123,8 +123,10 @@ class Shapes:
         return rows[person], ends[order], shape.radius_m[person, limb], shape.colour[person, limb]
 
     def _faces(self, moment: Moment, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The faces of vehicles: body (M,), corners (M, C, 3), colour (M, 3), and which are turned to the camera, in
-        the order to draw them."""
+        """The faces of vehicles in the order to draw them.
+
+        body (M,), corners (M, C, 3), colour (M, 3), and which are turned to the camera (M,).
+        """
         bodies, sun = moment.bodies, self._world.to_sun
         parts = []
         for row in rows:

@@ -61,7 +61,7 @@ class Painter:
         sheets = Sheets(solids, float(scale.max()), targets.shape)
         for body, at, canvas in sheets.drawn():
             hide(canvas, sheets.step, rise_m, at)
-            cover = _averaged(cv2.compare(cv2.extractChannel(canvas, 3), 0, cv2.CMP_GT), sheets.step)
+            cover = _averaged(_covered(canvas), sheets.step)
             paint = _averaged(canvas, sheets.step)[..., :3]
             below = picture[at]
             clear = cv2.cvtColor(255 - cover, cv2.COLOR_GRAY2BGR)
@@ -94,7 +94,7 @@ class Painter:
         half = self._world.side_m / 2
         u, v = (place[:, 0] + half) / self._cell_m - 0.5, (half - place[:, 1]) / self._cell_m - 0.5
         above = np.zeros(len(rows), np.float32)
-        for k, at in enumerate(np.array_split(np.arange(len(rows)), -(-len(rows) // 30_000))):
+        for at in np.array_split(np.arange(len(rows)), -(-len(rows) // 30_000)):
             above[at] = cv2.remap(self._shade_m, u[at], v[at], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[:, 0]
         return np.clip(above / 1.6, 0, 1)
 
@@ -104,11 +104,11 @@ class Painter:
         places = []
         for _, at, canvas in sheets.drawn():
             hide(canvas, sheets.step, rise_m, at)
-            cover = _averaged(cv2.compare(cv2.extractChannel(canvas, 3), 0, cv2.CMP_GT), sheets.step)
+            cover = _averaged(_covered(canvas), sheets.step)
             layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
             places.append(at)
-        keep = (1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)) * 255
-        keep = np.asarray(np.round(keep), np.uint8).reshape(1, 256, 3)
+        share = 1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)
+        keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
         for at in places:
             # Taken off the layer when done: where boxes overlap nothing is darkened twice.
             dark = cv2.LUT(cv2.cvtColor(layer[at], cv2.COLOR_GRAY2BGR), keep)
@@ -125,7 +125,7 @@ class Sheets:
         self._limit = np.array(shape[1::-1])
 
     def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray]]:
-        """Each body, where in the picture it is, and its canvas (h * step, w * step, 4): colour, height above ground."""
+        """Each body, where it is in the picture, and its canvas (h * step, w * step, 4): colour and height."""
         outlines, step = self._outlines, self.step
         if not len(outlines.body):
             return
@@ -156,6 +156,11 @@ def hide(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[sli
         code = np.clip(1 + (rise - _HIDDEN_M) * _CODES, 0, 256).astype(np.uint16)
         code = np.repeat(np.repeat(code, step, axis=0), step, axis=1)
         canvas[canvas[..., 3] < code] = 0
+
+
+def _covered(canvas: np.ndarray) -> np.ndarray:
+    """255 where anything is drawn on a canvas."""
+    return cv2.threshold(cv2.extractChannel(canvas, 3), 0, 255, cv2.THRESH_BINARY)[1]
 
 
 def _averaged(canvas: np.ndarray, step: int) -> np.ndarray:

@@ -38,14 +38,14 @@ class Sensor:
             whole = np.asarray(np.clip(np.round(levels), 0, 255), np.uint8)
             picture = np.asarray(cv2.LUT(picture, whole))
         else:
-            sigma = np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2).astype(np.float32)
+            sigma = np.asarray(np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2), np.float32)
             rng = np.random.default_rng([*self._key, number])
             y, x = rng.integers(0, _SPARE_PX, 2)
             grain = self._tile[y : y + picture.shape[0], x : x + picture.shape[1]]
             # Turned over and the sign changed, so that no two pictures show the same pattern moved aside.
             flip = int(rng.integers(0, 4))
             if flip < 3:
-                grain = cv2.flip(grain, flip - 1)
+                grain = np.asarray(cv2.flip(grain, flip - 1), np.float32)
             if rng.integers(0, 2):
                 sigma = -sigma
             noise = cv2.multiply(cv2.LUT(picture, sigma), grain)

@@ -6,26 +6,28 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.march import Standing
+from torchvision_dddas.simulation.march import Met, Sights, Standing, rings
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.shutter import Shutter, landing
 from torchvision_dddas.simulation.world import World
 
 _STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
 _LEVELS = 8
-_LEVEL = 0.1  # lines of sight are taken to sink at least so much for each metre, where they meet what stands
+_LEAST_M, _MOST_LEAN = 1.0, 8.0  # below the camera; lines of sight further from upright are taken to lean so much
 
 
 class Lie(NamedTuple):
     """Where pixels lie: east_m, north_m (H, W) float32; pixel_m (H,) size of a row's pixels on the ground.
 
-    rise_m: (H, W) float32, above the ground where something stands that is seen there; None where all is bare.
+    rise_m: (H, W) float32, above the ground where something stands that is seen there, None where all is bare.
+    met: the same as a list of flat indices.
     """
 
     east_m: np.ndarray
     north_m: np.ndarray
     pixel_m: np.ndarray
     rise_m: np.ndarray | None = None
+    met: Met | None = None
 
 
 class Terrain:
@@ -44,40 +46,65 @@ class Terrain:
         # The middles of blocks of pixels: so that enlarging them by whole blocks puts each where it belongs.
         u, v = ((np.arange(n) - 1) * _STEP_PX + (_STEP_PX - 1) / 2 for n in self._cells)
         self._block_px = np.stack(np.meshgrid(u, v), axis=-1)
+        row, column = (np.arange(n) // _STEP_PX + 1 for n in (height, width))
+        self._block = (row[:, None] * self._cells[0] + column).ravel().astype(np.int32)
 
     def lie(self, moment: Moment) -> Lie:
         """Where the pixels of a moment's picture lie."""
         columns, rows = self._cells
         start, way = self._shutter.rays(moment, self._block_px.reshape(-1, 2))
-        far, _ = landing(start, way, self._world.up_m)
+        far, up = landing(start, way, self._world.up_m)
         place = (start + far[:, None] * way)[:, :2].reshape(rows, columns, 2)
         # On a plane the inverse of the distance is linear over the picture, and so is the place over the distance.
-        inverse = (1 / np.maximum(far, 1e-3)).reshape(rows, columns, 1)
+        inverse = (1 / np.maximum(far, 1e-3)).reshape(rows, columns)
+        scale = self._enlarged(inverse)
+        east, north = (cv2.divide(self._enlarged(place[..., k] * inverse), scale) for k in range(2))
+        along, aside = (np.gradient(place, axis=axis) / _STEP_PX for axis in range(2))
+        pixel_m = np.sqrt(np.abs(along[..., 0] * aside[..., 1] - along[..., 1] * aside[..., 0]))
         height = self._shutter.camera.size_px[1]
-        east, north, scale = cv2.split(self._enlarged(np.concatenate([place * inverse, inverse], axis=2)))
-        along = np.diff(place, axis=0)[:, :-1] / _STEP_PX
-        aside = np.diff(place, axis=1)[:-1] / _STEP_PX
-        area = np.abs(along[..., 0] * aside[..., 1] - along[..., 1] * aside[..., 0])
-        size = np.sqrt(np.median(area, axis=1))
-        middles = (np.arange(rows - 1) - 0.5) * _STEP_PX + (_STEP_PX - 1) / 2
-        pixel_m = np.interp(np.arange(height), middles, size)
-        east, north = cv2.divide(east, scale), cv2.divide(north, scale)
-        lean = (-way[:, :2] / np.maximum(-way[:, 2:], _LEVEL)).reshape(rows, columns, 2)
-        met = self._standing.met(east, north, self._enlarged(lean), pixel_m)
+        each_row = np.interp(np.arange(height), self._block_px[:, 0, 1], np.median(pixel_m, axis=1))
+        lie = Lie(east, north, each_row)
+        if self._standing.tallest_m <= 0:
+            return lie
+        sights = _sights(place.reshape(-1, 2), start, up, pixel_m.ravel())
+        longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
+        top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
+        return self._risen(lie, moment, sights, up, top, bottom) if top.any() else lie
+
+    def _risen(
+        self, lie: Lie, moment: Moment, blocks: Sights, up: np.ndarray, top: np.ndarray, bottom: np.ndarray
+    ) -> Lie:
+        """Where pixels lie once lines of sight have met what stands, between the heights that blocks say (N,)."""
+        which = np.flatnonzero((top > 0)[self._block])
+        block = self._block[which]
+        # Most pixels of such blocks pass it by: those with nothing near the middle of the stretch in question.
+        middle, half = (top + bottom) / 2, (top - bottom) / 2
+        east, north = lie.east_m.ravel()[which], lie.north_m.ravel()[which]
+        aside_east, aside_north = blocks.lean_east * middle, blocks.lean_north * middle
+        ring = rings(blocks.lean * half + 2 * blocks.pixel_m)
+        near = self._standing.near(east + aside_east[block], north + aside_north[block], ring[block], bottom[block])
+        which, block, east, north = which[near], block[near], east[near], north[near]
+        if not len(which):
+            return lie
+        height, width = lie.east_m.shape
+        lag = self._shutter.lag_s(np.arange(height))[:, None]
+        eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32)[which // width]
+        sights = _sights(np.stack([east, north], axis=1), eye, up.astype(np.float32)[block], blocks.pixel_m[block])
+        met = self._standing.met(sights, top[block], bottom[block])
         if met is None:
-            return Lie(east, north, pixel_m)
-        rise = np.zeros(east.shape, np.float32)
-        for picture, values in zip((east, north, rise), met[1:], strict=True):
-            picture.ravel()[met[0]] = values
-        return Lie(east, north, pixel_m, rise)
+            return lie
+        rise = np.zeros((height, width), np.float32)
+        for picture, values in ((lie.east_m, met.east_m), (lie.north_m, met.north_m), (rise, met.up_m)):
+            picture.ravel()[which[met.which]] = values
+        return lie._replace(rise_m=rise, met=met._replace(which=which[met.which]))
 
     def _enlarged(self, blocks: np.ndarray) -> np.ndarray:
-        """What is known of the middles of blocks, (rows, columns, C), for all pixels (H, W, C) float32."""
+        """What is known of the middles of blocks, (rows, columns), for all pixels, (H, W) float32."""
         columns, rows = self._cells
         width, height = self._shutter.camera.size_px
         size = columns * _STEP_PX, rows * _STEP_PX
         full = cv2.resize(np.asarray(blocks, np.float32), size, interpolation=cv2.INTER_LINEAR)
-        return np.ascontiguousarray(full[_STEP_PX : _STEP_PX + height, _STEP_PX : _STEP_PX + width])
+        return np.asarray(full[_STEP_PX : _STEP_PX + height, _STEP_PX : _STEP_PX + width])
 
     def texture(self, lie: Lie) -> np.ndarray:
         """(H, W, 3) uint8: the colours where the pixels lie, averaged over as much ground as a pixel covers."""
@@ -95,6 +122,10 @@ class Terrain:
                 weight = np.repeat(share[:, None], fine.shape[1], axis=1)
                 fine = cv2.blendLinear(fine, coarse, 1 - weight, weight)
             picture[rows] = fine
+        if lie.met is not None:
+            dim = lie.met.light != 1
+            flat, which = picture.reshape(-1, 3), lie.met.which[dim]
+            flat[which] = np.clip(flat[which] * lie.met.light[dim, None], 0, 255)
         return picture
 
     def _look(self, level: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
@@ -104,3 +135,12 @@ class Terrain:
         u = cv2.addWeighted(east_m, across, east_m, 0, half * across - 0.5)
         v = cv2.addWeighted(north_m, -down, north_m, 0, half * down - 0.5)
         return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def _sights(place_m: np.ndarray, eye_m: np.ndarray, up_m: np.ndarray, pixel_m: np.ndarray) -> Sights:
+    """The lines of sight from eyes (N, 3) to places (N, 2) that are so high (N,)."""
+    down = np.maximum(eye_m[:, 2] - up_m, _LEAST_M)
+    east, north = (eye_m[:, k] - place_m[:, k] for k in range(2))
+    down = np.maximum(down, np.hypot(east, north) / _MOST_LEAN)
+    columns = place_m[:, 0], place_m[:, 1], east / down, north / down, pixel_m
+    return Sights(*(np.ascontiguousarray(column, np.float32) for column in columns))
