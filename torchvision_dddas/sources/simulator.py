@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, load
 from torchvision_dddas.simulation.simulator import Simulator
@@ -187,7 +188,11 @@ def simulator_of(scenario: Scenario) -> Simulator:
 
 def open_scenario(spec: str, overrides: Sequence[str] = (), seed: int | None = None) -> SimulatorSource:
     """A scenario by its name or file, as `simulation.scenario.load` takes it. Raises InputError with one line."""
-    return SimulatorSource(load(spec, overrides, seed), Path(spec).stem)
+    scenario = load(spec, overrides, seed)
+    try:
+        return SimulatorSource(scenario, Path(spec).stem)
+    except InputError as error:
+        raise InputError(f"scenario {spec}: {error}") from None
 
 
 def _row(flight: Flight) -> tuple[float, ...]:
