@@ -14,7 +14,8 @@ _STEPS = (3, 6, 12, 24)  # on the way down of a pixel's line of sight
 _STRIDE_PX = 1.5  # that a step should be long in the picture
 _HALVINGS = 4
 _LEVELS = 5
-_STEEP = 3.0  # what rises so many metres for each metre is a wall
+_STEEP = 3.0  # what rises so many metres for each metre is a wall,
+_BELOW_M = 0.3  # where it is met so far below its edge
 _INSIDE_M = 0.4  # walls have the colour of the roof so far from its edge
 _SKYLIGHT = 0.42
 _WIDE = 512  # OpenCV remaps no picture wider than 32767: long lists are folded
@@ -93,10 +94,10 @@ class Standing:
         east, north = sights.of(which).at(up)
         light = np.ones(len(which), np.float32)
         side = np.float32(_INSIDE_M)
-        rise_east = self._up(east + side, north) - self._up(east - side, north)
-        rise_north = self._up(east, north + side) - self._up(east, north - side)
+        beside = [self._up(east + x, north + y) for x, y in ((side, 0), (-side, 0), (0, side), (0, -side))]
+        rise_east, rise_north = beside[0] - beside[1], beside[2] - beside[3]
         rise = np.hypot(rise_east, rise_north)
-        steep = np.flatnonzero(rise > 2 * side * _STEEP)
+        steep = np.flatnonzero((rise > 2 * side * _STEEP) & (np.max(beside, axis=0) > up + _BELOW_M))
         if len(steep):
             outward = -np.stack([rise_east[steep], rise_north[steep]]) / rise[steep]
             sun = np.maximum(self._to_sun[:2].astype(np.float32) @ outward, 0) / max(float(self._to_sun[2]), 0.3)

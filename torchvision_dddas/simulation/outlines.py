@@ -66,10 +66,10 @@ class Shapes:
         px, depth = self._shutter.project(moment, np.concatenate([solid, cast]), np.tile(velocity, (2, 1)))
         px, depth = px.reshape(2, -1, 2), depth.reshape(2, -1)
         limbs = 2 * len(ends)
-        ends_px = px[:, :limbs].reshape(2, -1, 2, 2)
+        ends_px = px[:, :limbs].reshape(2, len(ends), 2, 2)
         focal = self._shutter.camera.focal_px[0] * moment.pose.focal
-        radius_px = radius * focal / depth[:, :limbs].reshape(2, -1, 2)
-        corners_px = px[:, limbs:].reshape(2, -1, *corners.shape[1:2], 2)
+        radius_px = radius * focal / depth[:, :limbs].reshape(2, len(ends), 2)
+        corners_px = px[:, limbs:].reshape(2, *corners.shape[:2], 2)
 
         sun = self._world.to_sun @ moment.pose.axes
         facing = max(-float(sun[2]), 0.0)
@@ -83,7 +83,7 @@ class Shapes:
         else:
             whole = _capsules(ends_px[0], radius_px[0], points)
             part = _capsules(ends_px[0] + radius_px[0, ..., None] * sun[:2] * 0.35, radius_px[0] * 0.72, points)
-            both = np.stack([whole, part], axis=1).reshape(-1, *whole.shape[1:])
+            both = np.stack([whole, part], axis=1).reshape(2 * len(whole), *whole.shape[1:])
             tones = np.stack([limb_colour * dark, limb_colour * bright], axis=1).reshape(-1, 3)
             people_seen = Outlines(limb_body.repeat(2), both, tones, up.repeat(2))
         thick = radius.max(axis=1) > _THIN_M
@@ -188,4 +188,4 @@ def _capsules(ends_px: np.ndarray, radius_px: np.ndarray, points: int) -> np.nda
     # Half a circle about each end, turned away from the other.
     half = np.cos(turn) * aside[:, None] - np.sin(turn) * ahead[:, None]
     circles = radius_px[:, :, None, None] * np.stack([half, -half], axis=1)
-    return (ends_px[:, :, None] + circles).reshape(len(ends_px), -1, 2)
+    return (ends_px[:, :, None] + circles).reshape(len(ends_px), 2 * points, 2)
