@@ -189,7 +189,11 @@ class Agents:
         time, team = self.time_s, self._team
         wrong = self._faults.at(time)
         pose, velocity, turn = self._aircraft.pose()
-        said = self._lonlat(team.place + self._gps.error_m + self._jumped(wrong))
+        # The UAV's place is the last.
+        places = np.concatenate([team.place, pose.place_m[None, :2]])
+        errors = np.concatenate([self._gps.error_m + self._jumped(wrong), self._telemetry_errors[None, 4:]])
+        said = self._lonlat(places + errors)
+        said, own = said[:-1], said[-1]
         silent = [k for k in range(len(team)) if k in wrong.lost or k in wrong.silent]
         said[silent] = np.nan
         return Moment(
@@ -199,7 +203,7 @@ class Agents:
             pose,
             velocity,
             turn,
-            None if wrong.mute else self._flight(pose, velocity),
+            None if wrong.mute else self._flight(pose, velocity, own),
             tuple(self._reports),
             team.heading.copy(),
             said,
@@ -208,14 +212,14 @@ class Agents:
             tuple(self._events),
         )
 
-    def _flight(self, pose: CameraPose, velocity: np.ndarray) -> Flight:
-        """What the UAV says of itself."""
+    def _flight(self, pose: CameraPose, velocity: np.ndarray, lonlat_deg: np.ndarray) -> Flight:
+        """What the UAV says of itself. lonlat_deg: (2,) where it says that it is."""
         wrong, place = self._telemetry_errors, pose.place_m
         ground = float(self._world.up_m(place[None, :2])[0])
         high = (place[2] - ground) * (1 + wrong[3])
         said = CameraPose(place, rotation(wrong[:3]) @ pose.axes)
         heading, pitch, roll = said.angles_rad
-        longitude, latitude = self._lonlat((place[:2] + wrong[4:])[None])[0].tolist()
+        longitude, latitude = lonlat_deg.tolist()
         hfov = float(np.radians(self._scenario.camera.hfov_deg))
         return Flight(
             float(high),

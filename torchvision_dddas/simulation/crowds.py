@@ -18,15 +18,22 @@ SLOWEST_M, FASTEST_M = 1.11, 3.34
 """Metres a unit, along east and along north each, of a crowd that goes at random."""
 BODY_M = 0.5
 """Middles of two people are no nearer."""
+_ROUNDS = 8
+"""So often places are moved apart in a step, at most."""
 _MARGIN_M = 10.0
 _PERSONAL_M = 0.8
+_LOOSE_S = 2.5
+"""Time in which somebody comes back to the own place in the crowd."""
+_STRAY_M_S, _STRAY_S = (0.2, 0.03), 3.0
+"""How fast one strays, walking and standing, along each axis, and for how long the same way."""
 _PATIENCE_S = 120.0
-_RUN_M_S = (2.5, 4.0)
+_RUN_M_S, _TIRED_S, _WALK_M_S = (2.5, 4.0), 20.0, 1.4
+"""Speeds of those who run off, and the time in which they fall into a walk."""
 _STAND, _HEADING, _WAY, _RANDOM, _MEET = range(5)
 _SHIRTS = np.array(
     [
-        [225, 225, 225], [200, 205, 210], [60, 60, 62], [40, 38, 38], [95, 80, 70], [120, 95, 75], [70, 75, 110],
-        [90, 110, 130], [140, 150, 160], [75, 95, 85], [110, 120, 105], [165, 150, 140], [60, 70, 120], [150, 130, 100],
+        [225, 225, 225], [200, 205, 210], [60, 60, 62], [40, 38, 38], [95, 82, 72], [120, 100, 86], [78, 82, 108],
+        [90, 110, 130], [140, 150, 160], [75, 95, 85], [110, 120, 105], [165, 150, 140], [82, 86, 118], [150, 134, 112],
     ],
     float,
 )  # fmt: skip
@@ -34,7 +41,10 @@ _SHIRTS = np.array(
 
 @dataclass
 class _Groups:
-    """One row a crowd. way: (G, W, 2), the first `places` of them count; at, step: whither it goes among them."""
+    """One row a crowd. way: (G, W, 2), the first `places` of them count; at, step: whither it goes among them.
+
+    course, clockwise from north; unit: the time unit for which its velocity was drawn; runs: bool, from all others.
+    """
 
     number: np.ndarray
     middle: np.ndarray
@@ -50,6 +60,7 @@ class _Groups:
     step: np.ndarray
     unit: np.ndarray
     meeting: np.ndarray
+    runs: np.ndarray
 
     def add(self, row: int, count: int) -> np.ndarray:
         """The rows of new crowds that are like one there is."""
@@ -136,14 +147,14 @@ class Crowds:
         groups, mine = self._groups, self.group
         started = (time_s >= groups.from_s) & (groups.behaviour != _STAND)
         goal = groups.middle[mine] + self._slot
-        wanted = groups.velocity[mine] + (goal - self.place) / 1.5
+        wanted = groups.velocity[mine] + (goal - self.place) / _LOOSE_S
         # Those behind go faster, but nobody much.
         most = np.where(started, 1.5 * groups.speed + 0.4, 0.4)[mine]
         speed = np.hypot(*wanted.T)
         wanted = wanted * np.minimum(1.0, most / np.maximum(speed, 1e-9))[:, None]
-        kept = np.exp(-seconds / 3.0)
+        kept = np.exp(-seconds / _STRAY_S)
         self._stray = kept * self._stray + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._stray.shape)
-        wanted = wanted + np.where(started, 0.12, 0.03)[mine, None] * self._stray
+        wanted = wanted + np.where(started, *_STRAY_M_S)[mine, None] * self._stray
         near = pairs(self.place, _PERSONAL_M)
         wanted = self._obstacles.steer(self.place, wanted, 0.5)
         wanted = wanted + self._give_way(near) + self._past(vehicles)
@@ -187,6 +198,8 @@ class Crowds:
         groups = self._groups
         self._draw(time_s)
         rows = np.arange(len(groups.number))
+        tired = groups.runs * (1 - np.exp(-seconds / _TIRED_S))
+        groups.speed = groups.speed + tired * (_WALK_M_S - groups.speed)
         goal = np.where((groups.behaviour == _MEET)[:, None], groups.meeting, groups.way[rows, groups.at])
         to = goal - groups.middle
         distance = np.hypot(*to.T)
@@ -267,6 +280,8 @@ class Crowds:
             self._meetings.remove(meeting)
             numbers = groups.number[rows].copy()
             mine = np.isin(self.group, rows)
+            if not mine.any():
+                continue
             self.group[mine] = first
             self._gather(first)
             groups.behaviour[first], groups.speed[first] = meeting.behaviour, meeting.speed_m_s
@@ -320,7 +335,7 @@ class Crowds:
         groups.middle[new], groups.radius[new], groups.from_s[new] = self.place[mine], 0.0, 0.0
         groups.behaviour[new] = _HEADING
         groups.course[new] = np.arctan2(away[:, 0], away[:, 1]) + self._rng.normal(0, 0.4, len(mine))
-        groups.speed[new] = self._rng.uniform(*_RUN_M_S, len(mine))
+        groups.speed[new], groups.runs[new] = self._rng.uniform(*_RUN_M_S, len(mine)), True
         return [f"the {len(mine)} of crowd {number} scatter"]
 
 
@@ -350,6 +365,7 @@ def _groups_of(plans: tuple[CrowdPlan, ...], limit_m: float) -> _Groups:
         step=np.ones(many, int),
         unit=np.full(many, -1),
         meeting=np.zeros((many, 2)),
+        runs=np.zeros(many, bool),
     )
 
 
@@ -370,10 +386,13 @@ def _slots(people: int, radius_m: float, rng: np.random.Generator) -> np.ndarray
 def _apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: float) -> np.ndarray:
     """(N, 2) places, those of pairs that are too near moved half the way apart each."""
     first, second = near
-    for _ in range(2):
+    for _ in range(_ROUNDS):
         away = place[first] - place[second]
         distance = np.maximum(np.hypot(*away.T), 1e-6)
-        push = away * (0.5 * np.clip(least_m - distance, 0, None) / distance)[:, None]
+        short = np.clip(least_m - distance, 0, None)
+        if not (short > 0.01).any():
+            break
+        push = away * (0.5 * short / distance)[:, None]
         place = place + _summed(push, first, len(place)) - _summed(push, second, len(place))
     return place
 

@@ -78,6 +78,8 @@ class Team:
 
     def step(self, time_s: float, seconds: float, lost: Sequence[int], people: np.ndarray) -> None:
         """On by so long, to time_s; the lost stand still. people: (M, 2), before whom they stop."""
+        if not len(self):
+            return
         goal, most = self._goals(time_s)
         to = goal - self.place
         distance = np.hypot(*to.T)
@@ -91,7 +93,8 @@ class Team:
         turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
         wanted = np.where(arrived, 0.0, wanted * np.clip(np.cos(error), 0, 1))
         wanted = np.minimum(wanted, self._clear(people))
-        stopped = np.isin(np.arange(len(self)), list(lost))
+        stopped = np.zeros(len(self), bool)
+        stopped[[k for k in lost if k < len(self)]] = True
         wanted, turn = np.where(stopped, 0.0, wanted), np.where(stopped, 0.0, turn)
         hardest = ACCELERATION_M_S2 * seconds
         self.speed = np.maximum(self.speed + np.clip(wanted - self.speed, -2 * hardest, hardest), 0.0)
