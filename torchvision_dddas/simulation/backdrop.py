@@ -17,7 +17,7 @@ _COLUMN_PX = 16  # rays are cast so many columns apart
 _STEPS = 110  # places on the ground on each ray
 _LEVELS = 7
 _TILE = 512  # side of the pattern of pebbles, in its own texels
-_GRAIN_M = (0.009, 0.041)  # its texels, laid out twice
+_GRAIN_M = (0.007, 0.031)  # its texels, laid out twice
 
 
 class Seen(NamedTuple):
@@ -167,7 +167,7 @@ def _pebbles(rng: np.random.Generator) -> np.ndarray:
     """(_TILE, _TILE) float32, about 0: grit and small stones, each with its dark side, that go on over the border."""
     grit = rng.normal(0, 1, (_TILE, _TILE)).astype(np.float32)
     pattern = np.zeros_like(grit)
-    for sigma, share in ((0.7, 0.1), (2.5, 0.5), (9, 2.0)):
+    for sigma, share in ((0.7, 0.16), (2.5, 0.6), (9, 1.8)):
         wide = cv2.copyMakeBorder(grit, 40, 40, 40, 40, cv2.BORDER_WRAP)
         pattern += share * cv2.GaussianBlur(wide, (0, 0), sigma)[40:-40, 40:-40]
     stones = np.zeros_like(pattern)

@@ -1,6 +1,7 @@
 """Bushes and trees as pictures that stand upright, buildings and vehicles, as a camera near the ground sees them."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -9,12 +10,14 @@ from torchvision_dddas.simulation.backdrop import HAZE
 from torchvision_dddas.simulation.bodies import Canvas
 from torchvision_dddas.simulation.camera import View
 from torchvision_dddas.simulation.cover import Things
-from torchvision_dddas.simulation.vehicles import COVERED, Faces, placed
+from torchvision_dddas.simulation.vehicles import COVERED, Faces, placed, ugv
 from torchvision_dddas.types import Bodies
 
 _SHAPES = 6  # different bushes, and different trees
 _SIZE_PX = (160, 160)  # width, height of a drawn plant
 _DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
+_WHEEL_M = (0.7, 0.3, 0.33)  # from the middle to a wheel's, its width, its radius
+_SPOKES = 14
 NEAR_M = 0.4  # what is nearer to the camera, in depth, is not drawn
 
 
@@ -88,6 +91,57 @@ def draw_building(
         fill(np.c_[outline, np.full(4, top)], np.clip(colour * (0.5 + 0.5 * to_sun[2]), 0, 255), 0, view, canvas)
 
 
+@cache
+def rover() -> Faces:
+    """A ground vehicle as `vehicles.ugv` has it, seen from near: round wheels behind skirts, and a slender mast."""
+    plain = ugv()
+    # The wheels come first, and nothing else has their grey; the mast alone has none of the paint, but for the marker.
+    kept = (plain.colour != plain.colour[0]).any(axis=1) & (plain.paint + plain.plate > 0)
+    turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
+    ring = np.stack([np.cos(turn), np.zeros(_SPOKES), np.sin(turn)], axis=1)
+    corners, normals, tones = [], [], []
+    for along in (-0.82, 0.0, 0.82):
+        for hand in (-1.0, 1.0):
+            aside = hand * np.array([0.0, 1.0, 0.0])
+            middle = np.array([along, 0.0, _WHEEL_M[2]]) + _WHEEL_M[0] * aside
+            half, rim = _WHEEL_M[1] / 2 * aside, middle + _WHEEL_M[2] * ring
+            for k in range(_SPOKES):
+                a, b = rim[k], rim[(k + 1) % _SPOKES]
+                tread = np.array([a + half, b + half, b - half, a - half])
+                corners.append(np.pad(tread, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
+                normals.append(ring[k] + ring[(k + 1) % _SPOKES])
+                tones.append(30.0 + 8 * (k % 2))
+            corners += [rim + half, middle + 0.55 * (rim - middle) + 1.02 * half]
+            normals += [aside, aside]
+            tones += [36.0, 50.0]
+    for hand in (-1.0, 1.0):
+        y = hand * (_WHEEL_M[0] + 0.54 * _WHEEL_M[1])
+        skirt = np.array([[-1.2, y, 0.42], [1.2, y, 0.42], [1.15, y, 0.78], [-1.15, y, 0.78]])
+        corners.append(np.pad(skirt, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
+        normals.append(np.array([0.0, hand, 0.0]))
+        tones.append(14.0)
+    for low, high, half_long, half_wide in ((0.75, 1.15, 0.03, 0.03), (1.15, 1.27, 0.06, 0.14)):
+        block = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (half_long, half_wide) + (1.05, 0.0)
+        for k in range(4):
+            (x0, y0), (x1, y1) = block[k], block[(k + 1) % 4]
+            side = np.array([[x0, y0, low], [x1, y1, low], [x1, y1, high], [x0, y0, high]])
+            corners.append(np.pad(side, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
+            normals.append(np.array([y1 - y0, x0 - x1, 0.0]))
+            tones.append(44.0)
+    paint = np.array([0.85 if tone == 14 else 0.0 for tone in tones])
+    hull = np.pad(plain.corners_m[kept], ((0, 0), (0, _SPOKES - plain.corners_m.shape[1]), (0, 0)), mode="edge")
+    normal = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
+    added = len(tones)
+    return Faces(
+        np.concatenate([hull, np.array(corners)]),
+        np.concatenate([plain.normal[kept], normal]),
+        np.concatenate([plain.colour[kept], np.repeat(np.array(tones)[:, None], 3, axis=1)]),
+        np.concatenate([plain.paint[kept], paint]),
+        np.concatenate([plain.plate[kept], np.zeros(added)]),
+        np.ones(kept.sum() + added, bool),
+    )
+
+
 def draw_vehicle(
     faces: Faces, bodies: Bodies, k: int, haze: float, view: View, canvas: Canvas, to_sun: np.ndarray
 ) -> None:
@@ -109,25 +163,26 @@ def draw_vehicle(
 
 def fill(points_m: np.ndarray, colour: np.ndarray, value: int, view: View, canvas: Canvas) -> None:
     """Fill a convex outline (N, 3) of which what is behind the camera is cut off."""
-    depth = points_m @ view.image_from_world[2, :3] + view.image_from_world[2, 3]
-    if (depth < NEAR_M).any():
+    matrix = view.image_from_world
+    seen = points_m @ matrix[:, :3].T + matrix[:, 3]
+    depth = seen[:, 2]
+    if depth.min() < NEAR_M:
         kept = []
-        for k in range(len(points_m)):
-            a, b = depth[k], depth[(k + 1) % len(points_m)]
+        for k in range(len(seen)):
+            a, b = depth[k], depth[(k + 1) % len(seen)]
             if a >= NEAR_M:
-                kept.append(points_m[k])
+                kept.append(seen[k])
             if (a >= NEAR_M) != (b >= NEAR_M):
-                share = (NEAR_M - a) / (b - a)
-                kept.append(points_m[k] + share * (points_m[(k + 1) % len(points_m)] - points_m[k]))
+                kept.append(seen[k] + (NEAR_M - a) / (b - a) * (seen[(k + 1) % len(seen)] - seen[k]))
         if len(kept) < 3:
             return
-        points_m = np.array(kept)
+        seen = np.array(kept)
+    px = seen[:, :2] / seen[:, 2:]
+    low, high = px.min(axis=0), px.max(axis=0)
     height, width = canvas.picture.shape[:2]
-    px = view.project(points_m)
-    if px[:, 0].max() < 0 or px[:, 0].min() >= width or px[:, 1].max() < 0 or px[:, 1].min() >= height:
-        return
-    # OpenCV counts pixels in 16 bits where it counts them in sixteenths.
-    canvas.fill(np.clip(px, -3e4, 3e4), colour, value)
+    if (high > 0).all() and low[0] < width and low[1] < height:
+        # OpenCV counts pixels in 16 bits where it counts them in sixteenths.
+        canvas.fill(np.clip(px, -3e4, 3e4), colour, value)
 
 
 def _bush(rng: np.random.Generator) -> Plant:
@@ -139,7 +194,7 @@ def _bush(rng: np.random.Generator) -> Plant:
         for _ in range(rng.integers(4, 8))
     ]
     for _ in range(14):
-        _twig(rng, cover, light, (rng.uniform(0.35, 0.65) * width, height - 1), rng.uniform(-0.9, 0.9), 0.95 * height)
+        _twig(rng, cover, light, (rng.uniform(0.35, 0.65) * width, height - 1), rng.uniform(-0.9, 0.9), 0.75 * height)
     for _ in range(rng.integers(700, 1300)):
         x, foot, across, tall = lobes[rng.integers(len(lobes))]
         angle, r = rng.uniform(0, np.pi), np.sqrt(rng.uniform(0.05, 1))
@@ -154,15 +209,15 @@ def _tree(rng: np.random.Generator) -> Plant:
     cover, light = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     for _ in range(rng.integers(2, 5)):
         start = (rng.uniform(0.46, 0.54) * width, height - 1)
-        _twig(rng, cover, light, start, rng.uniform(-0.55, 0.55), 0.7 * height, int(rng.integers(3, 7)))
+        _twig(rng, cover, light, start, rng.uniform(-0.6, 0.6), 0.65 * height, int(rng.integers(3, 6)))
     lumps = [
-        (rng.uniform(0.18, 0.82), rng.uniform(0.42, 0.85), rng.uniform(0.09, 0.18)) for _ in range(rng.integers(9, 15))
+        (rng.uniform(0.14, 0.86), rng.uniform(0.24, 0.87), rng.uniform(0.09, 0.2)) for _ in range(rng.integers(11, 17))
     ]
     for _ in range(rng.integers(1000, 1500)):
         x, up, size = lumps[rng.integers(len(lumps))]
         angle, r = rng.uniform(0, 2 * np.pi), np.sqrt(rng.uniform(0, 1))
         a, b = r * np.cos(angle), r * np.sin(angle)
-        rise = 0.2 * a + 0.45 * b + 0.7 * (up - 0.6)
+        rise = 0.2 * a + 0.45 * b + 0.5 * (up - 0.6)
         _leaf(rng, cover, light, (x + size * a) * width, (1 - up - 0.8 * size * b) * height, rise)
     return _smaller(cover, light)
 
@@ -186,7 +241,7 @@ def _twig(
     thick: int = 1,
 ) -> None:
     x, y = start
-    bright = float(rng.uniform(0.35, 0.8))
+    bright = float(rng.uniform(0.25, 0.6))
     for k in range(6):
         x1, y1 = x + lean * length / 6, y - length / 6 * np.sqrt(max(1 - lean**2, 0.05))
         for layer, value in ((cover, 1.0), (light, bright)):

@@ -16,22 +16,30 @@ _SHOES = np.array([34.0, 36, 42])
 _ROUND = np.linspace(0, np.pi, 8)
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _UP = np.array([0.0, 0.0, 1.0])
+_LEAST_WRINKLED_PX = 30
 
 
 @dataclass(frozen=True)
 class Dress:
     """What a person wears and how they are built and walk. wide, pace: beside the usual width and swing of the legs.
 
-    colours: (4, 3) BGR of shirt, trousers, skin and hair.
+    colours: (4, 3) BGR of shirt, trousers, skin and hair. loose: how much wider their clothes are than they.
+    elbows_rad: (2,) how far the arms are bent, as of someone who holds something. lean_rad: forward.
     """
 
     colours: np.ndarray
     wide: float
     pace: float
+    loose: float
+    elbows_rad: np.ndarray
+    lean_rad: float
     sleeves: bool
     skirt: bool
+    coat: bool
     hat: bool
+    brim: bool
     pack: bool
+    bag: bool
 
 
 class Figures(NamedTuple):
@@ -45,14 +53,17 @@ class Figures(NamedTuple):
 def dress(colour: np.ndarray, seed: int, number: int) -> Dress:
     """What the person of a number wears, in a shirt of that colour; the same at each call."""
     rng = np.random.default_rng([seed, 61, number])
-    chance = rng.uniform(size=4)
+    chance = rng.uniform(size=7)
     skin, hair, trousers = (rng.integers(len(choice)) for choice in (_SKIN, _HAIR, _TROUSERS))
     legs = np.array(_TROUSERS[trousers]) * rng.uniform(0.75, 1.2)
     return Dress(
         np.stack([np.asarray(colour, float), legs, np.array(_SKIN[skin]), np.array(_HAIR[hair])]),
-        float(np.clip(rng.normal(1.0, 0.09), 0.8, 1.3)),
-        float(rng.uniform(0.8, 1.2)),
-        *(bool(chance[k] < share) for k, share in enumerate((0.6, 0.12, 0.35, 0.3))),
+        float(np.clip(rng.normal(1.0, 0.1), 0.8, 1.35)),
+        float(rng.uniform(0.75, 1.2)),
+        float(rng.uniform(1.0, 1.35)),
+        np.where(rng.uniform(size=2) < 0.35, rng.uniform(0.7, 2.0, 2), 0.15),
+        float(np.abs(rng.normal(0, 0.07))),
+        *(bool(chance[k] < share) for k, share in enumerate((0.6, 0.1, 0.12, 0.4, 0.4, 0.35, 0.25))),
     )
 
 
@@ -68,6 +79,7 @@ def figures(
     count = len(feet_m)
     h = np.asarray(height_m, float)[:, None]
     w = h * np.array([one.wide for one in wear])[:, None]
+    cloth = w * np.array([one.loose for one in wear])[:, None]
     shirt, trousers, skin, hair = (np.array([one.colours[k] for one in wear]).reshape(-1, 3) for k in range(4))
     ahead = np.stack([np.sin(facing_rad), np.cos(facing_rad), np.zeros(count)], axis=1)
     right = np.stack([ahead[:, 1], -ahead[:, 0], np.zeros(count)], axis=1)
@@ -89,37 +101,47 @@ def figures(
         thigh - 0.08 - 1.6 * swing * np.maximum(np.cos(turn), 0) ** 2 for thigh, turn in zip(thighs, turns, strict=True)
     ]
     reach = np.max([np.cos(thigh) + np.cos(shin) for thigh, shin in zip(thighs, shins, strict=True)], axis=0)
-    hips = feet_m + h * (0.245 * reach + 0.04)[:, None] * _UP
-    chest = hips + 0.30 * h * (_UP + (0.043 * speed)[:, None] * ahead)
-    head = chest + h * (0.125 * _UP + 0.012 * ahead)
+    hips = feet_m + h * (0.245 * reach + 0.037)[:, None] * _UP
+    lean = np.array([one.lean_rad for one in wear]) + 0.043 * speed
+    chest = hips + 0.285 * h * (np.cos(lean)[:, None] * _UP + np.sin(lean)[:, None] * ahead)
+    head = chest + h * (0.113 * _UP + 0.012 * ahead)
     for side, thigh, shin in zip((1, -1), thighs, shins, strict=True):
         hip = hips + side * 0.048 * h * right
         knee = hip + 0.245 * h * along(thigh)
         ankle = knee + 0.245 * h * along(shin)
-        limb(hip, knee, 0.052 * w, 0.036 * w, trousers)
-        limb(knee, ankle, 0.037 * w, 0.026 * h, 0.96 * trousers)
+        limb(hip, knee, 0.052 * w, 0.036 * cloth, trousers)
+        limb(knee, ankle, 0.036 * cloth, 0.025 * cloth, 0.96 * trousers)
         limb(ankle - 0.018 * h * _UP, ankle + 0.085 * h * (0.955 * ahead - 0.25 * _UP), 0.023 * h, 0.018 * h, _SHOES)
-    skirted = np.array([[0.0] if one.skirt else [np.nan] for one in wear]).reshape(-1, 1)
-    limb(hips, hips - 0.25 * h * _UP, 0.085 * w + skirted, 0.115 * w, trousers)
-    limb(hips + 0.02 * h * _UP, chest - 0.1 * h * _UP, 0.078 * w, 0.082 * w, shirt)
+
+    def worn(what: str) -> np.ndarray:
+        return np.array([[0.0] if getattr(one, what) else [np.nan] for one in wear]).reshape(-1, 1)
+
+    limb(hips, hips - 0.25 * h * _UP, 0.085 * w + worn("skirt"), 0.115 * cloth, trousers)
+    limb(hips + 0.02 * h * _UP, chest - 0.1 * h * _UP, 0.078 * w, 0.078 * cloth, shirt)
+    limb(chest - 0.1 * h * _UP, hips - 0.2 * h * _UP, 0.085 * w + worn("coat"), 0.1 * cloth, 0.9 * shirt)
     sleeves = np.array([[one.sleeves] for one in wear]).reshape(-1, 1)
-    for side, turn in zip((1, -1), turns, strict=True):
-        limb(hips + 0.1 * h * _UP, chest + side * 0.062 * w * right, 0.07 * w, 0.052 * w, shirt)
+    bends = np.array([one.elbows_rad for one in wear]).reshape(-1, 2)
+    for side, turn, bend in zip((1, -1), turns, bends.T, strict=True):
+        limb(hips + 0.1 * h * _UP, chest + side * 0.062 * w * right, 0.07 * cloth, 0.052 * w, shirt)
         back = -0.9 * swing * np.sin(turn)
         shoulder, out = chest + side * 0.108 * w * right, 0.05 * side * right
         elbow = shoulder + 0.172 * h * (along(back) + out)
-        hand = elbow + 0.15 * h * (along(back + 0.25 + 0.5 * swing) + out)
-        limb(shoulder, elbow, 0.036 * w, 0.028 * w, 0.95 * shirt)
-        limb(elbow, hand, 0.027 * w, 0.02 * h, np.where(sleeves, 0.92 * shirt, skin))
+        # A bent arm goes before the body.
+        inward = -np.sin(bend)[:, None] * 0.5 * side * right
+        hand = elbow + 0.15 * h * (along(back + 0.1 + bend + 0.5 * swing) + out + inward)
+        limb(shoulder, elbow, 0.036 * w, 0.028 * cloth, 0.95 * shirt)
+        limb(elbow, hand, 0.026 * cloth, 0.02 * h, np.where(sleeves, 0.92 * shirt, skin))
         limb(hand, hand + 0.03 * h * along(back), 0.021 * h, 0.019 * h, skin)
     limb(chest + 0.05 * h * _UP, head, 0.03 * h, 0.03 * h, 0.9 * skin)
     limb(head + h * (0.012 * ahead - 0.018 * _UP), head + 0.03 * h * _UP, 0.04 * h, 0.044 * h, skin)
-    limb(head + h * (0.02 * _UP - 0.016 * ahead), head + 0.045 * h * _UP, 0.044 * h, 0.042 * h, hair)
-    hatted = np.array([[0.0] if one.hat else [np.nan] for one in wear]).reshape(-1, 1)
-    limb(head + h * (0.05 * _UP - 0.04 * ahead), head + h * (0.05 * _UP + 0.07 * ahead), 0.03 * h + hatted, 0.02 * h,
-         1.3 * hair)  # fmt: skip
-    packed = np.array([[0.0] if one.pack else [np.nan] for one in wear]).reshape(-1, 1)
-    limb(chest - 0.09 * h * ahead, hips + h * (0.08 * _UP - 0.09 * ahead), 0.07 * h + packed, 0.075 * h, 0.6 * shirt)
+    limb(head + h * (0.02 * _UP - 0.016 * ahead), head + 0.04 * h * _UP, 0.043 * h, 0.04 * h, hair)
+    limb(head + h * (0.05 * _UP - 0.04 * ahead), head + h * (0.05 * _UP + 0.07 * ahead), 0.03 * h + worn("hat"),
+         0.02 * h, 1.3 * hair)  # fmt: skip
+    limb(head + h * (0.045 * _UP - 0.08 * right), head + h * (0.045 * _UP + 0.08 * right), 0.018 * h + worn("brim"),
+         0.018 * h, 0.6 * trousers + 40)  # fmt: skip
+    limb(chest - 0.09 * h * ahead, hips + h * (0.08 * _UP - 0.09 * ahead), 0.07 * h + worn("pack"), 0.075 * h,
+         0.6 * shirt)  # fmt: skip
+    limb(hand - 0.05 * h * _UP, hand - 0.17 * h * _UP, 0.04 * h + worn("bag"), 0.055 * h, 0.5 * hair + 60)
     ends = np.stack([np.stack([row[0], row[1]], axis=1) for row in rows], axis=1)
     radius = np.stack([np.concatenate([row[2], row[3]], axis=1) for row in rows], axis=1)
     return Figures(ends, radius, np.clip(np.stack([row[4] for row in rows], axis=1), 0, 255))
@@ -172,7 +194,40 @@ def draw_figure(
         cv2.fillConvexPoly(canvas.picture, fixed_whole[k], dark[k], cv2.LINE_AA, _BITS)
         cv2.fillConvexPoly(canvas.mask, fixed_whole[k], value, cv2.LINE_8, _BITS)
         cv2.fillConvexPoly(canvas.picture, fixed_part[k], bright[k], cv2.LINE_AA, _BITS)
+    _wrinkle(whole, canvas, value)
     return whole
+
+
+def _wrinkle(outlines_px: np.ndarray, canvas: Canvas, value: int) -> None:
+    """Give drawn clothes folds and soft borders of light and shade, as cloth has and flat colours have not."""
+    low, high = outlines_px.min(axis=(0, 1)), outlines_px.max(axis=(0, 1))
+    tall = float(high[1] - low[1])
+    height, width = canvas.picture.shape[:2]
+    x0, x1 = (int(np.clip(x, 0, width)) for x in (np.floor(low[0]), np.ceil(high[0]) + 1))
+    y0, y1 = (int(np.clip(y, 0, height)) for y in (np.floor(low[1]), np.ceil(high[1]) + 1))
+    if tall < _LEAST_WRINKLED_PX or x1 - x0 < 2 or y1 - y0 < 2:
+        return
+    picture, inside = canvas.picture[y0:y1, x0:x1], (canvas.mask[y0:y1, x0:x1] == value).astype(np.uint8)
+    # Its outline stays sharp.
+    within = cv2.erode(inside, np.ones((3, 3), np.uint8), iterations=max(1, round(0.01 * tall)), borderValue=1)
+    soft = cv2.GaussianBlur(picture, (0, 0), max(0.5, 0.01 * tall))
+    cv2.copyTo(soft, within, picture)
+    scale = tall / _FOLDS.shape[0]
+    place = np.array([[scale, 0, low[0] - x0 - scale * (37 * value % 90)], [0, scale, low[1] - y0]])
+    folds = cv2.warpAffine(_FOLDS, place, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    folds[inside == 0] = 128
+    picture[:] = cv2.multiply(picture, cv2.merge([folds] * 3), scale=1 / 128)
+
+
+def _folds() -> np.ndarray:
+    """(180, 180) uint8 about 128: a pattern of folds, on a body 180 pixels tall."""
+    rng = np.random.default_rng(64)
+    pattern = np.zeros((180, 180), np.float32)
+    for turn in (60.0, 95.0, 130.0):
+        noise = cv2.GaussianBlur(rng.standard_normal((300, 300), np.float32), (0, 0), sigmaX=9, sigmaY=2.2)
+        turned = cv2.warpAffine(noise, cv2.getRotationMatrix2D((150, 150), turn, 1), (300, 300))[60:240, 60:240]
+        pattern += turned / turned.std()
+    return np.clip(128 * (1 + 0.09 * pattern), 0, 255).astype(np.uint8)
 
 
 def shadow(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: np.ndarray) -> np.ndarray:
@@ -182,3 +237,6 @@ def shadow(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: np.nda
     flat = ends_m[worn][..., :2] + (ends_m[worn][..., 2:] - up_m) * reach
     outline = _hulls(flat, radius_m[worn])
     return np.concatenate([outline, np.full((*outline.shape[:2], 1), up_m)], axis=2)
+
+
+_FOLDS = _folds()

@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.simulation import vehicles
 from torchvision_dddas.simulation.backdrop import HAZE, VISIBILITY_M, Backdrop
-from torchvision_dddas.simulation.billboards import NEAR_M, draw_building, draw_plant, draw_vehicle, plants
+from torchvision_dddas.simulation.billboards import NEAR_M, draw_building, draw_plant, draw_vehicle, plants, rover
 from torchvision_dddas.simulation.bodies import Canvas
 from torchvision_dddas.simulation.camera import View, axes, view_of
 from torchvision_dddas.simulation.figures import Dress, Figures, draw_figure, dress, figures, shadow
@@ -168,7 +168,7 @@ class GroundCamera:
                     one = limbs.ends_m[row], limbs.radius_m[row], colour
                     whole[value] = draw_figure(*one, view, canvas, value, self._world.to_sun)
                 else:
-                    faces = vehicles.car() if bodies.kind[k] == "car" else vehicles.ugv()
+                    faces = vehicles.car() if bodies.kind[k] == "car" else rover()
                     draw_vehicle(faces, bodies, k, haze, view, canvas, self._world.to_sun)
             if before is not None:
                 nearer = inverse_m[part] > 1 / distance[n] + self._slack
