@@ -58,26 +58,26 @@ def scatter(
     radius = np.where(of["building"], np.hypot(*half.T), half[:, 0])
     height = np.where(of["building"], rng.uniform(2.8, 4.5, total), radius * rng.uniform(1.0, 1.5, total))
     heading = rng.uniform(0, np.pi, total)
-    places, stands = np.zeros((total, 2)), np.zeros(total, bool)
-    for k in range(total):
-        ground = built if of["building"][k] else wished
-        for east, north, chance in rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (_TRIES, 3)):
-            place = side_m * np.array([east, north])
-            row, column = int((0.5 - north) * ground.shape[0]), int((east + 0.5) * ground.shape[1])
-            if chance > ground[min(row, ground.shape[0] - 1), min(column, ground.shape[1] - 1)]:
-                continue
-            if np.abs(place).max() + radius[k] > side_m / 2:
-                continue
-            if len(clear[0]) and np.hypot(*(clear[0] - place).T).min() < clear[1] + radius[k]:
-                continue
-            walls = stands & of["building"]
-            if (np.hypot(*(places[walls] - place).T) < radius[walls] + radius[k] + 0.5).any():
-                continue
-            places[k], stands[k] = place, True
-            break
+    tries = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (total, _TRIES, 3))
+    places, good = side_m * tries[..., :2], np.empty((total, _TRIES), bool)
+    for plant, ground in ((True, wished), (False, built)):
+        some = of["building"] != plant
+        row = np.minimum((0.5 - tries[some, :, 1]) * ground.shape[0], ground.shape[0] - 1).astype(int)
+        column = np.minimum((0.5 + tries[some, :, 0]) * ground.shape[1], ground.shape[1] - 1).astype(int)
+        good[some] = tries[some, :, 2] <= ground[row, column]
+    good &= np.abs(places).max(axis=2) + radius[:, None] < side_m / 2
+    for place in clear[0]:
+        good &= np.hypot(*(places - place).transpose(2, 0, 1)) >= clear[1] + radius[:, None]
+    # Buildings come first, and whatever comes later keeps off them.
+    for k in range(counts[2]):
+        if good[k].any():
+            off = np.hypot(*(places - places[k, np.argmax(good[k])]).transpose(2, 0, 1))
+            good[k + 1 :] &= off[k + 1 :] > radius[k] + radius[k + 1 :, None] + 0.5
+    stands = good.any(axis=1)
+    chosen = places[np.arange(total), np.argmax(good, axis=1)]
     colour = np.array([_TINTS[name][rng.integers(len(_TINTS[name]))] for name in kind]).reshape(-1, 3)
     colour = np.clip(colour * rng.uniform(0.85, 1.15, (total, 1)), 0, 255)
-    return Things(*(field[stands] for field in (kind, places, radius, height, colour, half, heading)))
+    return Things(*(field[stands] for field in (kind, chosen, radius, height, colour, half, heading)))
 
 
 class Crowns:
@@ -126,8 +126,16 @@ class Crowns:
         mould, turn = self._which[k]
         shape = np.rot90(self._moulds[mould], turn % 4)
         shape = np.ascontiguousarray(shape.T if turn >= 4 else shape)
-        smaller = cv2.INTER_AREA if size < len(shape) else cv2.INTER_LINEAR
-        return cv2.resize(shape, (size, size), interpolation=smaller) * height, row, column
+        wide = 2 * things.radius_m[k] / texel_m
+        if wide < len(shape):
+            shape = cv2.resize(shape, (max(round(wide), 3),) * 2, interpolation=cv2.INTER_AREA)
+        # To the very place and size, which are no whole numbers of pixels.
+        scale = len(shape) / wide
+        east, north = things.east_north_m[k]
+        middle = np.array([(east + self.side_m / 2) / texel_m - column, (self.side_m / 2 - north) / texel_m - row])
+        matrix = np.c_[scale * np.eye(2), scale * (0.5 - middle) + (len(shape) - 1) / 2]
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(shape, matrix, (size, size), flags=flags) * height, row, column
 
     def _look(self, k: int, shape: np.ndarray, texel_m: float, to_sun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colours of a thing in the sun (3, n, n), and how much of each pixel it hides (n, n)."""
@@ -187,5 +195,5 @@ def _mould(rng: np.random.Generator, size: int = 96) -> np.ndarray:
         apart = np.hypot(u - off * np.cos(turn), v - off * np.sin(turn)) / reach + 0.12 * noise
         dome = np.sqrt(np.clip(1 - apart**2, 0, 1)) * np.float32(0.5 + 0.7 * reach)
         crown = np.maximum(crown, dome)
-    rough = crown * (1 + 0.2 * noise) - 0.05
+    rough = (crown * (1 + 0.2 * noise) - 0.05) * (np.hypot(u, v) < 1)
     return np.clip(rough / rough.max(), 0, 1).astype(np.float32)

@@ -32,7 +32,9 @@ def laid(photo: Ortho, side_m: float, side_px: int) -> tuple[np.ndarray, np.ndar
     metres_from_texel = np.array([[texel, 0, first[0]], [0, -texel, first[1]], [0, 0, 1]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     matrix, size = pixel_from_metres @ metres_from_texel, (side_px, side_px)
-    sure = cv2.warpAffine(known, matrix, size, flags=flags, borderValue=0)
+    # The outermost pixels are known to their edges.
+    wider, moved = cv2.copyMakeBorder(known, 1, 1, 1, 1, cv2.BORDER_REPLICATE), matrix + np.array([0.0, 0, 1])
+    sure = cv2.warpAffine(wider, moved, size, flags=flags, borderValue=0)
     sure = cv2.threshold(sure, 250, 255, cv2.THRESH_BINARY)[1]
     if not sure.any():
         height, width = photo.image.shape[:2]

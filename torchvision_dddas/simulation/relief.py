@@ -1,6 +1,5 @@
 """The shape of the ground: smooth hills, or those of an elevation raster, on one grid that spans the world."""
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
@@ -34,17 +33,10 @@ def of_raster(given: Elevation, side_m: float) -> Elevation:
     """
     steps, step = _grid(side_m)
     metres = np.linspace(-side_m / 2, side_m / 2, steps + 1)
-    column = ((metres - given.corner_m[0]) / given.step_m).astype(np.float32)
-    row = ((metres - given.corner_m[1]) / given.step_m).astype(np.float32)
     heights = np.asarray(given.up_m, np.float64)
-    slack = 1e-3
-    on_column = (column >= -slack) & (column <= heights.shape[1] - 1 + slack)
-    on_row = (row >= -slack) & (row <= heights.shape[0] - 1 + slack)
-    inside = on_row[:, None] & on_column[None]
     known = np.isfinite(heights)
-    u, v = np.meshgrid(column, row)
-    sure = cv2.remap(known.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    covered = inside & (sure > 1 - slack)
+    rows, columns = ((metres - given.corner_m[k]) / given.step_m for k in (1, 0))
+    covered = _between(rows, heights.shape[0], 1) @ known @ _between(columns, heights.shape[1], 1).T > 1 - 1e-6
     if not covered.all():
         low = given.corner_m
         high = [low[k] + given.step_m * (heights.shape[1 - k] - 1) for k in (0, 1)]
@@ -55,9 +47,9 @@ def of_raster(given: Elevation, side_m: float) -> Elevation:
             "set world.side_m or world.origin_deg, or give a larger raster"
         )
     base = float(np.median(heights[known]))
-    filled = np.where(known, heights - base, 0).astype(np.float32)
-    up = cv2.remap(filled, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(float)
-    return _about_origin(up, side_m, step, base + given.base_m)
+    filled = np.where(known, heights - base, 0.0)
+    up_m = _between(rows, heights.shape[0], 3) @ filled @ _between(columns, heights.shape[1], 3).T
+    return _about_origin(up_m, side_m, step, base + given.base_m)
 
 
 def up(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
@@ -76,6 +68,33 @@ def up(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
 def mirrored(at: np.ndarray, length: float) -> np.ndarray:
     """Coordinates folded into [0, length] as by mirrors at both ends."""
     return length - np.abs(np.mod(at, 2 * length) - length)
+
+
+def _between(at: np.ndarray, count: int, order: int) -> np.ndarray:
+    """(N, count) weights of the nodes 0, 1, .. for places between them: linear (1), or cubic (3) through the nodes.
+
+    Rows of places beyond the nodes are 0.
+    """
+    slack = 1e-6
+    inside = (at >= -slack) & (at <= count - 1 + slack)
+    at = np.clip(at, 0, count - 1)
+    first = np.minimum(at.astype(int), max(count - 2, 0))
+    t = at - first
+    weights = np.zeros((len(at), count))
+    row = np.arange(len(at))
+    if order == 1:
+        parts = {0: 1 - t, 1: t}
+    else:
+        # Catmull and Rom's cubic: the slope at a node is that between its neighbours.
+        parts = {
+            -1: -t / 2 + t**2 - t**3 / 2,
+            0: 1 - 5 / 2 * t**2 + 3 / 2 * t**3,
+            1: t / 2 + 2 * t**2 - 3 / 2 * t**3,
+            2: -(t**2) / 2 + t**3 / 2,
+        }
+    for offset, share in parts.items():
+        np.add.at(weights, (row, np.clip(first + offset, 0, count - 1)), share)
+    return weights * inside[:, None]
 
 
 def _grid(side_m: float) -> tuple[int, float]:

@@ -159,7 +159,7 @@ def _coloured(
     ragged = 0.25 * large + 0.2 * middle
     dull = 1 + 0.05 * of["broad"] + 0.2 * ragged + 0.045 * small + 0.05 * grain
     height = of["gravel"] * (0.012 * large + 0.01 * middle + 0.008 * small + 0.008 * grain)
-    stones, bare = of["stones"] * of["gravel"], np.ones_like(large)
+    stones, bare = np.minimum(of["stones"] * of["gravel"], 50), np.ones_like(large)
     overlays = []
     if (of["wash"] - of["wash_half_m"]).min() < 3:
         from_bank = of["wash"] - of["wash_half_m"]
@@ -191,7 +191,7 @@ def _coloured(
     step = max(1, round(0.1 / texel_m))
     light = slant[0] * (np.roll(height, step, 1) - np.roll(height, -step, 1))
     light += slant[1] * (np.roll(height, -step, 0) - np.roll(height, step, 0))
-    light = np.clip(1 + light / np.float32(2 * step * texel_m), 0.45, 1.5)
+    light = np.clip(1 + light / np.float32(2 * step * texel_m), 0.45, 1.4)
     east, north = np.round(-0.2 * slant / np.maximum(np.hypot(*slant), 0.2) / texel_m).astype(int)
     light *= 1 - 0.55 * np.clip(np.roll(clumps, (-north, east), (0, 1)) - clumps, 0, 1)
     light *= dull * of["light"]

@@ -38,12 +38,11 @@ def above_ground(heights_m: np.ndarray, texel_m: float, to_sun: np.ndarray) -> n
     size = int(np.ceil(np.hypot(rows, columns))) + 2
     centre = np.array([(columns - 1) / 2, (rows - 1) / 2])
     matrix = np.c_[aside, away, centre - (size - 1) / 2 * (aside + away)]
-    low = float(heights_m.min()) - 1
     turned = cv2.warpAffine(
         heights_m.astype(np.float32), matrix, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=low,
+        borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    edge = np.full(size, low, np.float32)
+    edge = turned[0].copy()
     for row in range(size):
         height = turned[row].copy()
         turned[row] = np.clip(edge - height, -1, None)
