@@ -39,7 +39,7 @@ class _Vehicle:
     watches: int = -1
     watched_s: float = -np.inf
     sure: bool = False
-    pictured_s: float = -np.inf
+    pictured_s: float = -1e6
     sent_to: int = -1
     sent_s: float = 0.0
 
@@ -60,8 +60,7 @@ class Team:
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
                 if row not in self._known:
-                    first = now_s - self.knobs.picture_s * (1 - row / len(self.names))  # one after the other
-                    self._known[row] = _Vehicle(np.asarray(place, float), now_s, pictured_s=first)
+                    self._known[row] = _Vehicle(np.asarray(place, float), now_s)
                 self._known[row].place_m, self._known[row].heard_s = np.asarray(place, float), now_s
         before = len(self._known)
         for row in [row for row, vehicle in self._known.items() if now_s - vehicle.heard_s > _SILENT_S]:
@@ -223,11 +222,12 @@ class Team:
             goal,
             slow if vehicle.near else knobs.fast_m_s,
             at,
-            self._pictured(vehicle, name, outlook, row, now_s, record),
+            self._pictured(v, outlook, row, now_s, record),
         )
 
-    def _pictured(self, vehicle: _Vehicle, name: str, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
+    def _pictured(self, v: int, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
         """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
+        vehicle, name = self._known[v], self.names[v]
         probability = float(outlook.probability[row])
         surely = max(probability, 1 - probability)
         vehicle.sure = not outlook.unseen[row] and surely > (_UNSURE if vehicle.sure else _SURE)
@@ -235,7 +235,10 @@ class Team:
         why = f"target {outlook.target[row]}: {_known(outlook, row)}"
         record.set(f"{name}.picture_s", period, why, old=self.knobs.picture_s)
         apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
-        if apart > self.knobs.look_m or now_s - vehicle.pictured_s < period - 1e-6:
+        # One vehicle after the other, each in its part of the period.
+        shift_s = 1e-6 - v * period / len(self.names)
+        turn, last = (int((when_s + shift_s) // period) for when_s in (now_s, vehicle.pictured_s))
+        if apart > self.knobs.look_m or turn == last:
             return False
         vehicle.pictured_s = now_s
         return True
