@@ -2,7 +2,8 @@
 
 import math
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 
@@ -23,7 +24,9 @@ _EVENTS = {WORLD: "#5b3f94", ADJUSTED: "#1f5fa8", TOLD: "#2b7d4f", ORDERED: "#c9
 class Course:
     """A row of figures a frame: 72 bytes and 4 for each stage, up to three times that while the space grows."""
 
-    def __init__(self) -> None:
+    def __init__(self, names: Collection[str] = ()) -> None:
+        """names: of the ground vehicles; what is adjusted of each of them is one plot."""
+        self._names = frozenset(names)
         self._rows = np.zeros(256, _ROW)
         self._count = 0
         self._seconds: dict[str, array[float]] = {}
@@ -88,8 +91,16 @@ class Course:
         # One that was set at the first frame and stayed is a line in the log, and no plot.
         values = {knob: self.values(knob) for knob in self._moves}
         moved = [knob for knob, v in values.items() if len(np.unique(v[np.isfinite(v)])) > 1]
-        often = sorted(moved, key=lambda knob: -len(self._moves[knob]))[:_MOST_KNOBS]
-        told += [(knob, [Curve("", values[knob], "#1f5fa8", steps=True)]) for knob in sorted(often)]
+        plots: dict[str, list[str]] = {}
+        for knob in sorted(moved):
+            who, _, what = knob.partition(".")
+            plots.setdefault(f"{what} of each ground vehicle" if who in self._names else knob, []).append(knob)
+        often = sorted(plots, key=lambda title: -sum(len(self._moves[knob]) for knob in plots[title]))[:_MOST_KNOBS]
+        for title in sorted(often):
+            alone = plots[title] == [title]
+            shown = zip(plots[title], cycle(_STAGE_COLOURS), strict=False)
+            curves = [Curve("" if alone else k.partition(".")[0], values[k], c, steps=True) for k, c in shown]
+            told.append((title, curves))
         return [*told, *self._time_spent()]
 
     def _ticks(self) -> list[Ticks]:

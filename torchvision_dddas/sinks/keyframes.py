@@ -69,7 +69,8 @@ class KeyFrames:
         chosen = {taken.number: taken for taken in marked}
         rest = [taken for taken in self._even if taken.number not in chosen]
         if rest and not chosen:
-            chosen[rest[0].number] = rest.pop(0)
+            first = rest.pop(0)
+            chosen[first.number] = first
         while rest and len(chosen) < MOST:
             far = [min(abs(taken.number - number) for number in chosen) for taken in rest]
             taken = rest.pop(int(np.argmax(far)))

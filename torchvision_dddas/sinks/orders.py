@@ -1,14 +1,16 @@
 """What the instruments were asked to do, in words, where it is new."""
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 
 from torchvision_dddas.sinks.run_log import ORDERED, RunLog
 from torchvision_dddas.types import Command, Grounded, Order, Surveyed
 
-_FAR_M = 5.0
-"""A goal that moved by less is the same."""
+_FAR_M = 15.0
+"""A goal that moved by less is the same: it goes with a crowd."""
+UAV = "uav"
 
 
 class Orders:
@@ -16,28 +18,27 @@ class Orders:
 
     def __init__(self) -> None:
         self._goal: dict[str, np.ndarray] = {}
-        self._manner: dict[str, tuple[object, ...]] = {}
 
-    def note(self, surveyed: Surveyed, log: RunLog) -> None:
-        """Tell of a frame's orders what is new in them."""
+    def note(self, surveyed: Surveyed, log: RunLog, explained: Collection[str] = ()) -> None:
+        """Tell of a frame's orders what is new in them, but for those of `explained`: adjustments tell of them."""
         command, frame = surveyed.command, surveyed.followed.number
         if command is None:
             return
         scale = metres(surveyed)
-        if command.look_at is not None and self._new("uav", command.look_at, (command.altitude_m,), scale):
+        if command.look_at is not None and UAV not in explained and self._new(UAV, command.look_at, scale):
             height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
             log.add(frame, ORDERED, f"the UAV keeps {_place(command.look_at, scale)} in view{height}", short="UAV sent")
         for order in command.orders:
-            if self._new(order.vehicle, order.goal, (order.look_at is None, order.picture), scale):
+            if order.vehicle not in explained and self._new(order.vehicle, order.goal, scale):
                 log.add(frame, ORDERED, _words(order, scale), short=f"{order.vehicle} sent")
 
-    def _new(self, who: str, goal: np.ndarray, manner: tuple[object, ...], scale: "Metres | None") -> bool:
+    def _new(self, who: str, goal: np.ndarray, scale: "Metres | None") -> bool:
         there = np.asarray(goal, float) if scale is None else scale(goal)
         far = _FAR_M if scale is not None else 0.0
         last = self._goal.get(who)
-        if last is not None and float(np.linalg.norm(there - last)) <= far and self._manner[who] == manner:
+        if last is not None and float(np.linalg.norm(there - last)) <= far:
             return False
-        self._goal[who], self._manner[who] = there, manner
+        self._goal[who] = there
         return True
 
 
@@ -50,7 +51,9 @@ class Metres:
         self._scale = np.ptp(east_north_m, axis=0) / np.ptp(degrees, axis=0)
 
     def __call__(self, place: np.ndarray) -> np.ndarray:
-        """(2,) east, north."""
+        """(2,) east, north. What is no such longitude and latitude are local metres already: so the steering speaks."""
+        if np.abs(np.asarray(place, float) - self._degree).max() > 1.0:
+            return np.asarray(place, float)
         return self._metre + (np.asarray(place, float) - self._degree) * self._scale
 
 
@@ -86,7 +89,7 @@ def _words(order: Order, scale: Metres | None) -> str:
     text = f"{order.vehicle} goes to {_place(order.goal, scale)} at {order.speed_m_s:g} m/s"
     if order.look_at is not None:
         text += f" and looks at {_place(order.look_at, scale)}"
-    return text + (", to take pictures" if order.picture else "")
+    return text
 
 
 def in_picture(grounded: Grounded) -> np.ndarray | None:

@@ -1,5 +1,6 @@
 """What a run tells of itself at the end: its log, the plots, key frames and signs for its report and map."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from torchvision_dddas.sinks.journal import Record
 from torchvision_dddas.sinks.keyframes import KeyFrames
 from torchvision_dddas.sinks.map_signs import Signs
 from torchvision_dddas.sinks.orders import Orders
-from torchvision_dddas.sinks.report import Story, report
+from torchvision_dddas.sinks.report import Story, Table, report
 from torchvision_dddas.sinks.run_log import (
     ADJUSTED,
     MARK,
@@ -38,6 +39,7 @@ WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REP
 """How much what happened matters for the choice of key frames."""
 _BRIEF = 3
 """A landmark that is not seen in fewer frames is not worth a line."""
+_DIGITS = re.compile(r"\d+")
 
 
 class RunStory:
@@ -46,9 +48,11 @@ class RunStory:
     def __init__(self, folder: Path, name: str, kept: Record, names: Sequence[str], pictures: Once | None) -> None:
         """name: of the clip. names: of the landmarks. pictures: of the frames, None where no key frames are wanted."""
         self._folder, self._name, self._kept, self._names, self._pictures = folder, name, kept, tuple(names), pictures
-        self.log, self.course, self.frames, self.signs = RunLog(), Course(), KeyFrames(), Signs()
+        self.log, self.course, self.frames, self.signs = RunLog(), Course(names), KeyFrames(), Signs()
         self._orders = Orders()
-        self._score: list[tuple[str, Any, str]] = []
+        self._explained: set[str] = set()
+        self._score: dict[str, Any] = {}
+        self._in_words: tuple[str, ...] = ()
         self._waiting: list[Entry] = []  # told, but not yet seen in a picture
         self._read = self._before = 0
         self._said: dict[int, str] = {}
@@ -59,9 +63,9 @@ class RunStory:
         """Something that the frames do not tell themselves. time_s: None where the frame tells when."""
         self.log.add(frame, kind, text, time_s)
 
-    def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
-        """How good the run was against the truth: values by name, and what each is."""
-        self._score = [(name, value, (words or {}).get(name, "")) for name, value in measures.items()]
+    def scored(self, measures: Mapping[str, Any], said: Sequence[str] = ()) -> None:
+        """How good the run was against the truth: values by name, and the most telling of them in words."""
+        self._score, self._in_words = dict(measures), tuple(said)
 
     def write(self, surveyed: Surveyed) -> None:
         """Take note of a frame."""
@@ -75,7 +79,8 @@ class RunStory:
         if grounded is not None:
             self._laid(surveyed, self._step(number))
         self._told(surveyed)
-        self._orders.note(surveyed, self.log)
+        self._explained |= {moved.knob.partition(".")[0] for moved in source.adjustments}
+        self._orders.note(surveyed, self.log, self._explained)
         if self._pictures is not None:
             self._picture(surveyed, float(self.course.rows["time_s"][-1]), self._pictures)
         self._before = number
@@ -93,7 +98,7 @@ class RunStory:
         if self._counts:
             self._kept.counts |= {"kinds": dict(self._counts), "rows_looked_at": self._looks}
         if self._score:
-            self._kept.counts["truth_score"] = {name: value for name, value, _ in self._score}
+            self._kept.counts["truth_score"] = self._score
 
     def discard(self) -> None:
         """Remove what was begun."""
@@ -117,15 +122,27 @@ class RunStory:
             )
             for e in entries
         ]
-        table = (f"What happened and why ({NAME})", ("time, s", "frames", "what", "how and why"), happened, "nothing")
+        told: Table = (
+            f"What happened and why ({NAME})",
+            ("time, s", "frames", "what", "how and why"),
+            happened,
+            "nothing",
+        )
+        tables: list[Table] = [told, *story.tables]
         figures = [(f"told {kind.replace('_', ' ')}", f"{count}") for kind, count in self._verdicts().items() if count]
         figures.append(("adjustments", f"{sum(e.kind == ADJUSTED for e in entries)}"))
-        truth = [("Against the truth", ("measure", "value", "what it is"), self._score, "")] if self._score else []
+        said: list[Table] = []
+        if self._in_words:
+            said.append(("Against the truth", ("in words",), [(line,) for line in self._in_words], ""))
+        if self._score:
+            title = "All measures against the truth" if said else "Against the truth"
+            measured: Table = (title, ("measure", "value"), list(self._score.items()), "")
+            (tables if said else said).append(measured)
         return replace(
             story,
             figures=[*story.figures, *figures],
-            tables=[table, *story.tables],
-            first=truth,
+            tables=tables,
+            first=said,
             pictures=self.frames.chosen(),
             panels=self.course.panels(),
         )
@@ -197,13 +214,15 @@ class RunStory:
         due = [e for e in self._waiting if self._before < e.first <= number and e.kind != MARK]
         self._waiting = [e for e in self._waiting if e.first > number]
         words = "; ".join(dict.fromkeys(e.short for e in due))
-        # Of a world's events and of targets each counts; of knobs and mishaps the first of its kind.
-        kinds = {
-            e.short if e.kind in (WORLD, TOLD) else f"{e.kind} {e.short.split(' ')[0]}": WEIGHTS[e.kind] for e in due
-        }
+        kinds = {_sort(e): WEIGHTS[e.kind] for e in due}
         self.frames.add(
             number, time_s, kinds, words if len(words) < 260 else f"{words[:256]} ...", lambda: pictures(surveyed)
         )
+
+
+def _sort(entry: Entry) -> str:
+    """What sort of thing happened: each event of a world and each target is one; of knobs and mishaps all alike are."""
+    return entry.short if entry.kind in (WORLD, TOLD) else f"{entry.kind} {_DIGITS.sub('', entry.short.split(' ')[0])}"
 
 
 def _clock(time_s: float) -> str:

@@ -51,9 +51,9 @@ class FoundOutput(RunFolder[Surveyed]):
         """As in SurveyOutput."""
         self._story.event(frame, text, time_s, kind)
 
-    def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
+    def scored(self, measures: Mapping[str, Any], said: Sequence[str] = ()) -> None:
         """As in SurveyOutput."""
-        self._story.scored(measures, words)
+        self._story.scored(measures, said)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place, as in RunFolder; what an earlier run here located goes."""
@@ -100,9 +100,9 @@ class SurveyOutput(GroundedOutput):
         """
         self._story.event(frame, text, time_s, kind)
 
-    def scored(self, measures: Mapping[str, Any], words: Mapping[str, str] | None = None) -> None:
-        """Say, after the last frame, how good the run was against the truth: values by name, and what each is."""
-        self._story.scored(measures, words)
+    def scored(self, measures: Mapping[str, Any], said: Sequence[str] = ()) -> None:
+        """Say, after the last frame, how good the run was against the truth: values by name, and in words."""
+        self._story.scored(measures, said)
 
     def survey(self, item: Surveyed) -> None:
         """Write a frame to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
