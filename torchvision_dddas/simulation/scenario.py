@@ -144,8 +144,8 @@ class CameraKnobs(Group):
     exposure_s: float = knob(0.002, "s", 0, 0.5, meaning="time of exposure: what moves is blurred along its way")
     readout_s: float = knob(0.015, "s", 0, 0.5, meaning="rolling shutter: the last row is read so much later")
     sharpness_px: float = knob(0.6, "px", 0, 10, meaning="standard deviation of the lens's blur")
-    shot_noise: float = knob(0.15, "-", 0, 10, meaning="variance of the noise, in grey levels, for each grey level")
-    read_noise: float = knob(1.2, "grey levels", 0, 50, meaning="standard deviation of the noise in the dark")
+    shot_noise: float = knob(0.015, "-", 0, 10, meaning="variance of the noise, in grey levels, for each grey level")
+    read_noise: float = knob(0.6, "grey levels", 0, 50, meaning="standard deviation of the noise in the dark")
     drift: float = knob(0.03, "-", 0, 0.5, meaning="amplitude of slow changes of exposure, as a share")
     quality: int = knob(92, "-", 10, 100, meaning="of the JPEG compression; 100: none")
 
@@ -182,7 +182,7 @@ class Scenario(Group):
     """A whole scenario. seed: of everything that chance decides in it; about: what it shows, in a sentence."""
 
     about: str = ""
-    seed: int = Field(0, ge=0, le=2**31 - 1)
+    seed: int = Field(default=0, ge=0, le=2**31 - 1)
     clip: ClipKnobs = ClipKnobs()
     world: WorldKnobs = WorldKnobs()
     uav: AircraftKnobs = AircraftKnobs()
