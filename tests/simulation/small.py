@@ -1,5 +1,7 @@
 """Scenarios that are made in a moment: a small world, a small picture."""
 
+from typing import Any
+
 from torchvision_dddas.simulation.scenario import Scenario
 
 WORLD = {"side_m": 60.0, "texel_m": 0.25, "buildings": 0, "bushes_per_ha": 10.0, "trees_per_ha": 0.0}
@@ -7,7 +9,7 @@ WORLD = {"side_m": 60.0, "texel_m": 0.25, "buildings": 0, "bushes_per_ha": 10.0,
 
 def small(**tables):
     """A scenario of two seconds: one crowd, four vehicles; tables replace or add to its own."""
-    content = {
+    content: dict[str, Any] = {
         "seed": 3,
         "clip": {"seconds": 2.0},
         "world": WORLD,

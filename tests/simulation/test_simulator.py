@@ -9,6 +9,7 @@ import pytest
 from tests.simulation.small import small
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.simulator import Simulator
+from torchvision_dddas.simulation.world import build
 from torchvision_dddas.types import Command, Elevation, Order
 
 
@@ -52,6 +53,8 @@ def test_a_run_started_anew_is_the_same_run():
 def test_another_seed_is_another_run():
     other = Simulator(small(seed=4))
     shot = other.next()
+    assert shot is not None
+    assert shot.frame is not None
     assert np.abs(shot.frame.image.astype(int) - plain()[1][0].frame.image).mean() > 2
 
 
@@ -136,7 +139,7 @@ def test_looking_from_the_ground_changes_nothing_in_the_air():
 @pytest.fixture
 def tall(monkeypatch):
     """A world where 12 m stand at [5, 0], told to the simulator in place of the one that it would build."""
-    import torchvision_dddas.simulation.simulator as module
+    name = "torchvision_dddas.simulation.simulator.build"
 
     def raised(*args):
         world = build(*args)
@@ -145,8 +148,7 @@ def tall(monkeypatch):
         surface[row - 2 : row + 3, column - 2 : column + 3] = 12.0
         return replace(world, surface=surface)
 
-    build = module.build
-    monkeypatch.setattr(module, "build", raised)
+    monkeypatch.setattr(name, raised)
 
 
 def test_a_way_below_what_stands_there_is_refused(tall):

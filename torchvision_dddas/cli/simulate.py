@@ -57,26 +57,32 @@ def simulate(
         raise InputError(f"--frames is {frames}; wanted 1 or more")
     chosen = load(scenario, set_ or [], seed)
     kinds = saved(save, SAVED)
-    journal = simulate_into(out, chosen, kinds, frames, quiet)
+    journal = simulate_into(out, chosen, kinds, frames, quiet, scenario)
     if not quiet:
         for line in summary(journal, out, chosen):
             typer.echo(line)
 
 
 def simulate_into(
-    folder: Path, scenario: "Scenario", save: tuple[str, ...], frames: int | None = None, quiet: bool = False
+    folder: Path,
+    scenario: "Scenario",
+    save: tuple[str, ...],
+    frames: int | None = None,
+    quiet: bool = False,
+    name: str = "simulated",
 ) -> "Record":
-    """Run a scenario and write it under a folder; returns the record of the run.
+    """Run a scenario and write it under a folder; returns the record of the run. name: the scenario's, for messages.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.simulation.scenario import as_toml
     from torchvision_dddas.sinks.filmed import FilmedOutput
-    from torchvision_dddas.sources.simulator import simulator_of
+    from torchvision_dddas.sources.simulator import named, simulator_of
     from torchvision_dddas.targets import geodesy
 
     with FilmedOutput(folder, save) as output:
-        simulator = simulator_of(scenario)
+        with named(name):
+            simulator = simulator_of(scenario)
         count = min(simulator.frames, frames or simulator.frames)
         facts = {
             "scenario": scenario.model_dump(mode="json"),
@@ -91,7 +97,7 @@ def simulate_into(
             as_toml(scenario),
             lambda metres: geodesy.lonlat(metres, origin),
         )
-        with progress("simulate", count, quiet) as tick:
+        with progress(Path(name).stem, count, quiet) as tick:
             for number, filmed in enumerate(_filmed(simulator, "ground" in save), 1):
                 output.write(filmed)
                 tick()
@@ -144,11 +150,11 @@ def _heard(shot: "Shot", names: tuple[str, ...]) -> "Iterator[Heard]":
 def write_dem(path: Path, simulator: "Simulator") -> list[str]:
     """The ground's heights above the sea as a GeoTIFF; returns a note where rasterio is missing.
 
-    Raises OSError if the disk refuses.
+    Raises InputError if the disk refuses.
     """
     import numpy as np
 
-    from torchvision_dddas.sinks.whole import temporary
+    from torchvision_dddas.sinks.whole import cannot_write, remove, temporary
 
     try:
         import rasterio
@@ -164,21 +170,25 @@ def write_dem(path: Path, simulator: "Simulator") -> list[str]:
     step = relief.step_m
     top = relief.corner_m[1] + (heights.shape[0] - 0.5) * step
     part = temporary(path)
-    with rasterio.open(
-        part,
-        "w",
-        driver="GTiff",
-        height=heights.shape[0],
-        width=heights.shape[1],
-        count=1,
-        dtype="float32",
-        crs=local,
-        transform=from_origin(relief.corner_m[0] - step / 2, top, step, step),
-        nodata=np.nan,
-    ) as raster:
-        raster.write(heights, 1)
-        raster.units = ("m",)
-    part.replace(path)
+    try:
+        with rasterio.open(
+            part,
+            "w",
+            driver="GTiff",
+            height=heights.shape[0],
+            width=heights.shape[1],
+            count=1,
+            dtype="float32",
+            crs=local,
+            transform=from_origin(relief.corner_m[0] - step / 2, top, step, step),
+            nodata=np.nan,
+        ) as raster:
+            raster.write(heights, 1)
+            raster.units = ("m",)
+        part.replace(path)
+    except OSError as error:
+        remove(part)
+        raise cannot_write(path, error) from error
     return []
 
 

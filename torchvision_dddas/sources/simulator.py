@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -189,8 +190,15 @@ def simulator_of(scenario: Scenario) -> Simulator:
 def open_scenario(spec: str, overrides: Sequence[str] = (), seed: int | None = None) -> SimulatorSource:
     """A scenario by its name or file, as `simulation.scenario.load` takes it. Raises InputError with one line."""
     scenario = load(spec, overrides, seed)
-    try:
+    with named(spec):
         return SimulatorSource(scenario, Path(spec).stem)
+
+
+@contextmanager
+def named(spec: str) -> Iterator[None]:
+    """Say before each InputError of which scenario it speaks."""
+    try:
+        yield
     except InputError as error:
         raise InputError(f"scenario {spec}: {error}") from None
 

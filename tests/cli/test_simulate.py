@@ -1,0 +1,251 @@
+"""`dddas simulate`: files in the very formats that the other commands read."""
+
+import csv
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from tests.simulation.small import as_file, small
+from torchvision_dddas.metrics import truth as judges
+from torchvision_dddas.simulation.scenario import load, names
+from torchvision_dddas.sources import open_source
+from torchvision_dddas.sources.cameras import poses_at, read_camera, read_poses
+from torchvision_dddas.sources.colours import read_colours
+from torchvision_dddas.sources.landmarks import read_landmarks
+from torchvision_dddas.sources.positions import read_positions
+from torchvision_dddas.sources.telemetry import read_telemetry
+from torchvision_dddas.targets import geodesy
+
+FAULTS = ({"what": "dropped", "time_s": 0.5, "seconds": 0.15}, {"what": "gps_dropout", "time_s": 1.0, "seconds": 0.55})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A scenario of two seconds, simulated with everything that there is."""
+    from typer.testing import CliRunner
+
+    from torchvision_dddas.cli import app
+
+    folder = tmp_path_factory.mktemp("made")
+    path = as_file(folder / "tiny.toml", small(fault=FAULTS, settings={"steering": {"picture_s": 0.5}}))
+    result = CliRunner().invoke(app, ["simulate", str(path), "--out", str(folder / "out"), "--save", "all"])
+    assert result.exit_code == 0, result.output
+    return folder / "out", result.stdout
+
+
+def test_the_pictures_are_a_clip_that_keeps_its_numbers(made):
+    folder, _ = made
+    source = open_source(folder / "frames")
+    frames = list(source)
+    assert [f.number for f in frames] == [n for n in range(1, 21) if n not in (6, 7)]
+    assert source.size == (160, 120)
+    assert len(source.problems) == 2
+    run = {f.number: f.image for f in open_source(f"sim:{folder / 'scenario.toml'}")}
+    apart = np.abs(frames[0].image.astype(int) - run[1])
+    assert apart.mean() < 3  # what JPEG takes away
+
+
+def test_the_film_has_a_picture_for_every_frame(made):
+    folder, _ = made
+    assert len(list(open_source(folder / "clip.mp4"))) == 20
+
+
+def test_the_scenario_is_written_as_it_was_run(made):
+    folder, _ = made
+    assert load(folder / "scenario.toml") == load(folder.parent / "tiny.toml")
+
+
+def test_reports_are_read_and_true(made):
+    folder, _ = made
+    landmarks = read_landmarks(folder / "landmarks.csv")
+    assert landmarks.names == ("ugv1", "ugv2", "ugv3", "ugv4")
+    assert landmarks.geographic
+    assert landmarks.planned.any()
+    said = {
+        (landmarks.names[k], f)
+        for k, f, p in zip(landmarks.landmark, landmarks.frame, landmarks.planned, strict=True)
+        if not p
+    }
+    assert ("ugv1", 9.0) in said
+    assert ("ugv1", 13.0) not in said  # its receiver is silent
+    assert ("ugv2", 13.0) in said
+    true = [r for r in csv.DictReader((folder / "truth" / "positions.csv").open()) if r["kind"] == "ugv"][:4]
+    first = np.flatnonzero((landmarks.frame == 1) & ~landmarks.planned)
+    places = np.array([[float(r["longitude_deg"]), float(r["latitude_deg"])] for r in true])
+    origin = float(places[0, 0]), float(places[0, 1])
+    apart = geodesy.east_north(landmarks.place[first], origin) - geodesy.east_north(places, origin)
+    assert np.abs(apart).max() < 0.02
+
+
+def test_telemetry_is_read(made):
+    folder, _ = made
+    flown = read_telemetry(folder / "telemetry.csv")
+    assert len(flown) == 20
+    assert flown.geographic
+    assert np.isfinite(flown.altitude_m).all()
+    assert np.degrees(flown.hfov_rad) == pytest.approx(60)
+
+
+def test_camera_and_colours_are_read(made):
+    folder, _ = made
+    camera = read_camera(folder / "camera.toml")
+    assert camera.size_px == (160, 120)
+    assert camera.focal_px[0] == pytest.approx(80 / np.tan(np.radians(30)))
+    assert read_colours(folder / "colours.toml").names == ("ugv1", "ugv2", "ugv3", "ugv4")
+
+
+def test_the_elevation_is_that_of_the_world(made):
+    pytest.importorskip("rasterio")
+    from torchvision_dddas.simulation.relief import up
+    from torchvision_dddas.sources.elevation import read_elevation
+    from torchvision_dddas.sources.simulator import simulator_of
+
+    folder, _ = made
+    scenario = load(folder / "scenario.toml")
+    places = np.random.default_rng(0).uniform(-25, 25, (50, 2))
+    read = read_elevation(folder / "dem.tif", places, scenario.world.origin_deg, 10.0)
+    np.testing.assert_allclose(up(read, places), simulator_of(scenario).world.up_m(places), atol=0.02)
+    assert read.base_m == pytest.approx(scenario.world.above_sea_m, abs=0.05)
+
+
+def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
+    folder, _ = made
+    camera = read_camera(folder / "ground" / "ugv2" / "camera.toml")
+    table = read_poses(folder / "ground" / "ugv2" / "poses.csv")
+    pictures = list(open_source(folder / "ground" / "ugv2"))
+    assert [p.number for p in pictures] == table.at.tolist() == [1, 2, 3, 4]
+    assert [int(r["aerial_frame"]) for r in csv.DictReader((folder / "ground" / "ugv2" / "poses.csv").open())] == [
+        1,
+        6,
+        11,
+        16,
+    ]
+    camera, poses = poses_at(camera, table, np.array([1, 4]))
+    assert camera.geographic
+    true = read_positions(folder / "truth" / "positions.csv")
+    vehicles = [r for r in csv.DictReader((folder / "truth" / "positions.csv").open()) if r["kind"] == "ugv"]
+    number = int(vehicles[1]["target"])
+    assert true.lonlat_deg is not None
+    lon, lat = true.lonlat_deg[(true.target == number) & (true.frame == 16)][0].tolist()
+    assert np.hypot(*geodesy.east_north(poses.place[1:], (lon, lat))[0]) < 0.1
+    # Its receiver is silent at frames 11 and 16: nobody would know where the picture was taken.
+    assert len(list((folder / "ground" / "ugv1").glob("*.jpg"))) == 2
+
+
+def test_the_truth_is_read_by_its_judges(made):
+    folder, _ = made
+    boxes = judges.load(folder / "truth" / "gt.txt")
+    assert boxes.tracks is not None
+    assert set(boxes.tracks.identity.tolist()) == {1}
+    masks = judges.load(folder / "truth")
+    assert masks.kind == "masks"
+    assert masks.frames == list(range(1, 21))
+    assert judges.read_mask(masks.masks[10]).max() >= 1
+
+
+def test_the_record_tells_what_happened(made):
+    folder, said = made
+    record = json.loads((folder / "run.json").read_text())
+    assert record["state"] == "complete"
+    assert (record["frames"]["written"], record["dropped"]) == (20, 2)
+    assert [e["frame"] for e in record["events"]]
+    assert record["scenario"]["clip"]["seconds"] == 2
+    assert "20 frames of 160×120" in said
+    assert f"dddas run {folder / 'frames'} --landmarks {folder / 'landmarks.csv'}" in said
+
+
+def test_the_same_seed_gives_the_same_files_and_another_does_not(made, dddas, tmp_path):
+    folder, _ = made
+    scenario = folder / "scenario.toml"
+    for name, more in (("same", ()), ("other", ("--seed", 9))):
+        result = dddas("simulate", scenario, "--out", tmp_path / name, "--frames", 3, "--quiet", *more)
+        assert result.exit_code == 0, result.output
+        assert result.output == ""
+    jpg, csv_text = "frames/000003.jpg", "truth/positions.csv"
+    assert (tmp_path / "same" / jpg).read_bytes() == (folder / jpg).read_bytes()
+    assert (folder / csv_text).read_text().startswith((tmp_path / "same" / csv_text).read_text())
+    assert (tmp_path / "other" / jpg).read_bytes() != (folder / jpg).read_bytes()
+    assert tomllib.loads((tmp_path / "other" / "scenario.toml").read_text())["seed"] == 9
+
+
+def test_a_shorter_run_leaves_nothing_of_a_longer_one(made, dddas, tmp_path):
+    folder, _ = made
+    out = tmp_path / "out"
+    for count in (6, 2):
+        assert dddas("simulate", folder / "scenario.toml", "--out", out, "--frames", count, "--quiet").exit_code == 0
+    assert len(list((out / "frames").iterdir())) == len(list((out / "truth" / "masks").iterdir())) == 2
+    assert len(list((out / "ground" / "ugv1").glob("*.jpg"))) == 1
+
+
+def test_what_is_not_to_be_saved_is_not(made, dddas, tmp_path):
+    folder, _ = made
+    out = tmp_path / "out"
+    result = dddas("simulate", folder / "scenario.toml", "--out", out, "--frames", 2, "--save", "none")
+    assert result.exit_code == 0, result.output
+    assert not [name for name in ("frames", "clip.mp4", "ground", "truth/masks") if (out / name).exists()]
+    assert (out / "truth" / "gt.txt").is_file()
+    assert "Next" not in result.stdout
+
+
+def test_without_a_name_it_lists_the_scenarios(dddas):
+    result = dddas("simulate")
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.stdout.splitlines()] == names()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["nowhere"], "no scenario is named 'nowhere'; there are border100, border200"),
+        (["joining", "--set", "uav.altitud_m=3"], "unknown knob 'uav.altitud_m'; did you mean uav.altitude_m"),
+        (
+            ["joining", "--set", "team.ugvs=3"],
+            "scenario joining: team.ugvs = 3 will not do: a clip located by landmarks",
+        ),
+        (["joining", "--seed", "-1"], "seed = -1 will not do"),
+        (["joining", "--frames", "0"], "--frames is 0; wanted 1 or more"),
+        (["joining", "--save", "film"], "--save does not know 'film'; there are frames, video, masks, ground"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(dddas, tmp_path, words, line):
+    assert line in bad(dddas("simulate", *words, "--out", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_way_that_is_too_low_is_told_with_the_file(dddas, file, tmp_path):
+    path = as_file(
+        tmp_path / "low.toml", small(uav={"altitude_m": 2.0, "way_m": ((25.0, 25.0),)}, world={"trees_per_ha": 500.0})
+    )
+    line = bad(dddas("simulate", path, "--out", tmp_path / "out"))
+    assert "low.toml: uav.altitude_m = 2 is too low" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_someone_elses_files_are_not_replaced(dddas, tmp_path, made):
+    (tmp_path / "telemetry.csv").write_text("mine")
+    line = bad(dddas("simulate", made[0] / "scenario.toml", "--out", tmp_path))
+    assert "was not written by dddas and would be replaced" in line
+    assert (tmp_path / "telemetry.csv").read_text() == "mine"
+
+
+def test_run_locates_what_was_simulated(made, dddas, tmp_path):
+    """The files go together: the chain takes them all, and lays every picture on the ground."""
+    folder, _ = made
+    options = [
+        (f"--{n}", folder / f)
+        for n, f in (
+            ("landmarks", "landmarks.csv"),
+            ("telemetry", "telemetry.csv"),
+            ("colours", "colours.toml"),
+            ("camera", "camera.toml"),
+        )
+    ]
+    words = [w for pair in options for w in pair]
+    result = dddas("run", folder / "frames", *words, "--out", tmp_path / "run", "--save", "none", "--quiet")
+    assert result.exit_code == 0, result.output
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["frames"]["written"] == 20
+    assert record["by"]["pose"] >= 18
