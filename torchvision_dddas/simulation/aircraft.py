@@ -28,20 +28,26 @@ class Swaying:
 
     def __init__(self, sigma: np.ndarray, constant_s: float, rng: np.random.Generator) -> None:
         self._sigma, self._rate, self._rng = np.asarray(sigma, float), 1 / constant_s, rng
+        self._steps: dict[float, tuple[np.ndarray, np.ndarray]] = {}
         drawn = rng.standard_normal((2, len(self._sigma)))
         self.value, self.rate = self._sigma * drawn[0], self._sigma * self._rate * drawn[1]
 
     def step(self, seconds: float, push: np.ndarray | float = 0.0, rougher: float = 1.0) -> None:
         """On by so long, exactly; push: a constant acceleration meanwhile; rougher: factor of the random pushes."""
-        k, t = self._rate, seconds
-        decay = np.exp(-k * t)
-        step = decay * np.array([[1 + k * t, t], [-(k**2) * t, 1 - k * t]])
-        rest = np.asarray(push) / k**2  # where it would come to rest under that push
+        if seconds not in self._steps:
+            self._steps[seconds] = self._step_of(seconds)
+        step, factor = self._steps[seconds]
+        rest = np.asarray(push) / self._rate**2  # where it would come to rest under that push
         moved = step @ np.stack([self.value - rest, self.rate])
-        stationary = np.diag([1.0, k**2])
-        factor = np.linalg.cholesky(stationary - step @ stationary @ step.T + 1e-15 * np.eye(2))
         noise = factor @ self._rng.standard_normal((2, len(self._sigma))) * self._sigma * rougher
         self.value, self.rate = moved[0] + noise[0] + rest, moved[1] + noise[1]
+
+    def _step_of(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """(2, 2) what becomes of value and rate in a step, and (2, 2) what the random pushes add."""
+        k, t = self._rate, seconds
+        step = np.exp(-k * t) * np.array([[1 + k * t, t], [-(k**2) * t, 1 - k * t]])
+        lasting = np.diag([1.0, k**2])
+        return step, np.linalg.cholesky(lasting - step @ lasting @ step.T + 1e-15 * np.eye(2))
 
 
 class _Pursuer:
@@ -118,7 +124,7 @@ class Aircraft:
 
     def step(self, time_s: float, seconds: float, push: np.ndarray | None = None, rougher: float = 1.0) -> None:
         """On by so long, to time_s. push: acceleration by a gust, (3,) m/s2; rougher: how much more all shakes."""
-        point, going = self._way.at(time_s)
+        point, going = self._way.at(time_s - seconds)
         back = (self._back_m() + self._relief_m * (self._cotangent() > 0)) * self._ahead()
         if self._fly_to is not None:
             goal, going = self._fly_to, np.zeros(2)

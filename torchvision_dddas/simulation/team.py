@@ -12,7 +12,7 @@ from torchvision_dddas.simulation.ways import Way
 from torchvision_dddas.types import Colours
 
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
-_ROOM_M = 1.6
+_ROOM_M = 2.0
 """How far from another's middle they pass it."""
 _LOOK_S = 0.25
 """Steps in which they think ahead."""
@@ -128,7 +128,8 @@ class Team:
             speed = np.where(far, _FAST * speed, speed)
         elif patrol == "along":
             middle, going = self._way.at(time_s)
-            goal = middle + self._start - self._way.at(0.0)[0]
+            # Who brakes for a goal that moves stays behind it by as much.
+            goal = middle + self._start - self._way.at(0.0)[0] + going * np.linalg.norm(going) / ACCELERATION_M_S2
             speed = np.full(len(self), 1.5 * float(np.linalg.norm(going)) + 0.2)
         else:
             goal = self._start.copy()
@@ -152,14 +153,16 @@ class Team:
         return round_discs(self.place, direction, np.broadcast_to(self.place, (*radius.shape, 2)), radius)
 
     def _clear(self, people: np.ndarray) -> np.ndarray:
-        """(K,) how fast they may go for who is ahead of them."""
-        if not len(people) or not len(self):
-            return np.full(len(self), np.inf)
+        """(K,) how fast they may go for who is ahead: people, and vehicles that come before them in the list."""
+        count = len(self)
+        others = np.concatenate([people, self.place])
         ahead = _ahead(self.course)
-        to = people[None] - self.place[:, None]
-        along = (to * ahead[:, None]).sum(axis=2)
+        to = others[None] - self.place[:, None]
+        along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
         aside = np.abs(ahead[:, None, 1] * to[..., 0] - ahead[:, None, 0] * to[..., 1])
-        room = np.where((along > 0) & (aside < 1.0), along, np.inf).min(axis=1)
+        blocks = (along > 0) & (aside < 1.0)
+        blocks[:, len(people) :] &= np.tri(count, k=-1, dtype=bool)
+        room = np.where(blocks, along, np.inf).min(axis=1)
         return np.sqrt(2 * ACCELERATION_M_S2 * np.maximum(room - 1.8, 0))
 
     def _pan(self, seconds: float, stopped: np.ndarray) -> None:
