@@ -12,13 +12,15 @@ from torchvision_dddas.control import (
     best_spread,
     bounded,
     chosen,
+    every_wanted,
     interval_from_flow,
     interval_from_telemetry,
     regime_at,
+    sampled,
     spread_m2,
     steered,
 )
-from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, with_knobs
+from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
 from torchvision_dddas.types import Marks
 
 KNOBS = IntervalKnobs(minimum_frames=1, maximum_frames=12)
@@ -128,6 +130,41 @@ def test_where_telemetry_ends_the_bounds_in_metres_end_and_that_is_recorded():
     assert after == Regime(BASE)
     assert {r.cause for r in records} == {"no telemetry for this frame"}
     assert steered(10, after, None, 10, BASE) == (after, ())
+
+
+# Of how many frames one is looked at.
+
+EVERY = SteeringKnobs(sampling_share=0.5, maximum_every=6)
+
+
+def test_of_so_many_frames_one_is_looked_at_as_a_share_of_the_interval_says():
+    none = np.zeros(0)
+    assert every_wanted(8.0, 10, none, none, EVERY) == (4.0, "")
+    assert every_wanted(8.0, 10, np.array([np.nan]), np.array([2.0]), EVERY) == (4.0, "")
+
+
+def test_between_two_looks_no_target_moves_by_more_than_half_its_size():
+    """4 m at 10 m/s and 10 Hz: 2 m in two frames; and a slow one does not matter."""
+    wanted, why = every_wanted(8.0, 10, np.array([0.5, 10.0]), np.array([2.0, 4.0]), EVERY)
+    assert wanted == 2.0 and why == "; a target of 4.0 m goes at 10.0 m/s"
+    assert every_wanted(8.0, 10, np.array([1e9]), np.array([1.0]), EVERY)[0] == 1.0
+
+
+@pytest.mark.parametrize(("wanted", "every"), [(0.0, 1), (3.2, 3), (1e30, 6)])
+def test_the_sampling_is_rounded_and_bounded_and_its_change_recorded(wanted, every):
+    new, made = sampled(5, 1, wanted, "altitude 50 m", EVERY)
+    assert new == every
+    assert [(a.frame, a.knob, a.old, a.new, a.cause) for a in made] == (
+        [] if every == 1 else [(5, "sampling.every", 1, every, "altitude 50 m")]
+    )
+
+
+def test_noise_about_the_middle_between_two_samplings_does_not_make_it_flutter():
+    now, changes = 2, 0
+    for k in range(40):
+        now, made = sampled(k, now, 2.5 + 0.2 * (-1) ** k, "", EVERY)
+        changes += len(made)
+    assert changes == 0
 
 
 # The 4-or-more rule.

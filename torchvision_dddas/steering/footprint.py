@@ -63,7 +63,7 @@ def inside(points_m: np.ndarray, pose: CameraPose, camera: Camera) -> np.ndarray
     """(N,) how far within the picture from a pose places (N, 2) on the ground are, as in Stand.inside."""
     points = np.asarray(points_m, float).reshape(-1, 2)
     # The lens's distortion is left out: it moves no border by more than the margins that are kept.
-    right, down, depth = pose.axes.T @ (np.c_[points, np.zeros(len(points))] - pose.place_m).T
+    right, down, depth = ((points - pose.place_m[:2]) @ pose.axes[:2] - pose.place_m[2] * pose.axes[2]).T
     slope = np.array(camera.size_px) / 2 / camera.focal_px
     within = 1 - np.maximum(np.abs(right) / slope[0], np.abs(down) / slope[1]) / np.maximum(depth, 1e-9)
     return np.where(depth > 0, within, -10.0)
