@@ -195,8 +195,8 @@ def test_a_crowd_that_walks_stays_in_the_picture_and_so_do_four_landmarks(pitch_
         marks.append(int(w.inside(w.team).sum()))
 
     walk = world([[0, 0]], [velocity], kinds=("human",), pitch_deg=pitch_deg)
-    walk.run(40, look)
-    assert np.linalg.norm(walk.targets) > 50  # it left the first picture
+    walk.run(30, look)
+    assert np.linalg.norm(walk.targets) > 40  # it left the first picture
     assert all(shown)
     assert min(marks) >= 4
 
@@ -251,7 +251,7 @@ def test_it_waits_for_landmarks_that_lag_behind():
     """The vehicles are not steered, and stay: the picture goes no further than shows four of them."""
     settings = with_steering(look=False)
     walk = world([[0, 0]], [[1.0, 0.0]], kinds=("human",), settings=settings)
-    walk.run(60, lambda w: None)
+    walk.run(45)
     assert walk.inside(walk.team).sum() == 4
     assert any("landmarks" in change.cause for change in of(walk.made, "uav.altitude_m"))
 
@@ -306,20 +306,20 @@ def test_silent_telemetry_is_survived_by_what_the_pictures_tell():
 # The ground vehicles.
 
 
-@pytest.mark.parametrize("count", [4, 5, 6])
+@pytest.mark.parametrize("count", [4, 5])
 def test_ground_vehicles_surround_a_crowd_that_walks_and_are_never_on_one_line(count):
     """Also where they come from all on one side, on one line."""
     spread, inside = [], []
 
     def look(w):
-        if w.now_s > 30:
+        if w.now_s > 24:
             spread.append(spread_m2(w.team[best_spread(w.team, 4)]))
             bearing = np.sort(np.arctan2(*(w.team - w.targets[0]).T))
             gaps = np.diff(np.r_[bearing, bearing[0] + 2 * np.pi])
             inside.append(gaps.max() < np.pi)
 
     team = np.c_[np.linspace(-16, 16, count), np.full(count, -14.0)]
-    world([[0, 0]], [[0.8, 0.3]], team=team, kinds=("human",)).run(50, look)
+    world([[0, 0]], [[0.8, 0.3]], team=team, kinds=("human",)).run(36, look)
     assert min(spread) > 40
     assert all(inside)
 
