@@ -16,7 +16,7 @@ from torchvision_dddas.simulation.receiver import Receivers
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
 from torchvision_dddas.sources.simulator import SimulatorSource
 from torchvision_dddas.targets import geodesy
-from torchvision_dddas.types import Colours, Elevation, Followed, Landmarks, Scene, Surveyed, Tracks
+from torchvision_dddas.types import Colours, Elevation, Followed, Frame, Landmarks, Scene, Surveyed, Tracks, Truth
 from torchvision_dddas.vision import load, load_colours, load_solver
 
 CONFIG = "patrol"
@@ -42,11 +42,29 @@ def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Set
     return with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0]), **(more or {})})
 
 
+class OnceAFrame:
+    """A search for all colours of a team, done once for all that look at the same picture for some of them."""
+
+    name = "onboard"
+
+    def __init__(self, colours: Colours) -> None:
+        self._finder, self._colours = load_colours("onboard"), colours
+        self._image: np.ndarray | None = None
+        self._masks = np.zeros((0, 0, 0), np.uint8)
+
+    def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """As every `ColourFinder`."""
+        if image is not self._image:
+            self._image, self._masks = image, self._finder.masks(image, self._colours.low, self._colours.high)
+        same = (low[:, None] == self._colours.low).all(axis=2) & (high[:, None] == self._colours.high).all(axis=2)
+        return self._masks[same.argmax(axis=1)]
+
+
 class Eye:
     """Locates the scenes of a clip in one way, and scores that. Targets are those of single frames: nobody follows."""
 
-    def __init__(self, source: SimulatorSource, way: Way) -> None:
-        self._source, self._way = source, way
+    def __init__(self, source: SimulatorSource, way: Way, finder: OnceAFrame) -> None:
+        self._source, self._way, self._finder = source, way, finder
         self._settings = usual(source, way.settings)
         self._kept = way.landmarks or tuple(range(len(source.names)))
         self._error_m = _errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
@@ -83,7 +101,7 @@ class Eye:
         colours = source.colours
         rows = np.array(self._kept)
         some = Colours(tuple(colours.names[k] for k in rows), colours.low[rows], colours.high[rows])
-        return Watch(locator, some, load_colours("onboard"))
+        return Watch(locator, some, self._finder)
 
     def _site(self) -> Site:
         """What was reported until now, in the metres of the first report, with the ground's elevation."""
@@ -135,7 +153,8 @@ def _errors(scenario: Scenario, gps95_m: float, count: int, frames: int) -> np.n
 def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = ()) -> dict[str, list[CrowdScore]]:
     """The scores of each way, by its name: one for each part of the clip. parts_s: where later parts begin."""
     source = SimulatorSource(scenario)
-    eyes = {way.name: Eye(source, way) for way in ways}
+    finder = OnceAFrame(source.colours)
+    eyes = {way.name: Eye(source, way, finder) for way in ways}
     edges = [*parts_s, np.inf]
     scorers = {name: [eye.scorer() for _ in edges] for name, eye in eyes.items()}
     vision = load("onboard", usual(source))
@@ -187,3 +206,24 @@ def with_truth(
                 for scorer in parts:
                     scorer.feed(true)
         yield scene
+
+
+class Kept:
+    """All frames of a scenario that flies as planned, drawn once, to be searched several times.
+
+    truths: by the number of the frame. log: the telemetry of the whole run.
+    """
+
+    def __init__(self, source: SimulatorSource) -> None:
+        self.rate_hz, self.size = source.rate_hz, source.size
+        self.frames: list[Frame] = []
+        self.truths: dict[int, Truth] = {}
+        for frame in source:
+            self.frames.append(frame)
+            self.truths |= {truth.frame: truth for truth in source.truths()}
+        self.last = source.last
+        # A method of that name would be asked at every frame what was reported so far.
+        self.log = source.telemetry()
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)

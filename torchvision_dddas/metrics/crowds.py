@@ -121,6 +121,8 @@ class CrowdScore:
             )
         if of.count:
             told.append(f"error of a crowd's place: mean {of.mean:.2f} m, median {of.median:.2f}, 95 % {of.p95:.2f}")
+        if (of := self.target_error_m).count:
+            told.append(f"error of a target from its people: mean {of.mean:.2f} m, median {of.median:.2f}")
         if not math.isnan(self.inside):
             told.append(f"95 % ellipses hold the truth in {100 * self.inside:.1f} %")
         if not math.isnan(self.switches_a_minute):
