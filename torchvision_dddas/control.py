@@ -107,6 +107,7 @@ class Regime:
         return {
             "gates.min_area_px": self.settings.gates.min_area_px,
             "small.on": float(self.settings.small.on),
+            "morphology.close_px": self.settings.morphology.close_px,
             "gates.min_size_px": gates.min_size_px,
             "gates.max_size_px": gates.max_size_px,
             "gates.max_speed_px": gates.max_speed_px,
@@ -116,6 +117,7 @@ class Regime:
 def regime_at(altitude_m: float, rate_hz: float, base: Settings) -> Regime:
     """The regime for an altitude above ground: e = expected_size_m x focal / altitude pixels is what a target measures.
 
+    Gaps of close_m, where it is set, are closed, as far as close_px goes: a kernel in pixels joins ever more from above.
     The smallest area is expected_share x e^2, between the small path's and the one in the settings. The small path is
     on while e^2 is within its largest box: larger targets show without it.
     """
@@ -123,7 +125,10 @@ def regime_at(altitude_m: float, rate_hz: float, base: Settings) -> Regime:
     square = (gates.expected_size_m * pixels_per_metre(altitude_m, gates.focal_px)) ** 2
     area = int(min(gates.min_area_px, max(small.min_area_px, round(gates.expected_share * square))))
     on = small.on and square <= small.max_box_px
-    settings = with_knobs(base, {"gates.min_area_px": area, "small.on": on})
+    close = base.morphology.close_px
+    if base.morphology.close_m:
+        close = int(np.clip(round(base.morphology.close_m * pixels_per_metre(altitude_m, gates.focal_px)), 1, close))
+    settings = with_knobs(base, {"gates.min_area_px": area, "small.on": on, "morphology.close_px": close})
     return Regime(settings, altitude_m, gates_at(altitude_m, rate_hz, gates))
 
 

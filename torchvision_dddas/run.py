@@ -297,6 +297,7 @@ class Loop:
             tuple(places(pair) for pair in near),
             places(wide) if wide else None,
             places(small) if small else None,
+            self._settings(slot).morphology.close_px,
         )
 
     def _neighbour_from_reference(self, index: int, other: int) -> np.ndarray:

@@ -138,6 +138,9 @@ class MorphologyKnobs(Group):
     close_px: int = knob(
         25, "px", 1, 101, meaning="ellipse that closes gaps between fragments of one target; 1 is none"
     )
+    close_m: float = knob(
+        0.0, "m", 0, 100, meaning="with telemetry: gaps up to this on the ground, close_px at the most; 0: close_px"
+    )
     hull: bool = knob(True, "-", meaning="take the convex hull of every blob")
 
 

@@ -40,6 +40,7 @@ class Window:
     neighbour_from_reference: (K, 3, 3). offsets: (K,) frames from the reference, negative = past.
     near: pairs of indices of neighbours whose evidence is combined; the last one is the widest and shows the motion.
     wide, small: a pair further apart that fills the inside of large targets, and one that shows small slow ones.
+    close_px: ellipse that closes gaps between fragments of a target; 0: as the settings have it.
     """
 
     reference: View
@@ -49,6 +50,7 @@ class Window:
     near: tuple[tuple[int, int], ...]
     wide: tuple[int, int] | None = None
     small: tuple[int, int] | None = None
+    close_px: int = 0
 
 
 @dataclass(frozen=True)

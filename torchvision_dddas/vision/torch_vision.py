@@ -55,7 +55,7 @@ class TorchVision:
 
         def structure(window: Window) -> tuple[Any, ...]:
             sizes = tuple(view.size for view in window.neighbours)
-            return window.reference.size, sizes, window.near, window.wide, window.small
+            return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px
 
         return _in_groups(windows, structure, self._foreground)
 
@@ -96,7 +96,7 @@ class TorchVision:
         near, wide = evidence(one, grey, warped, seen, texture, knobs)
         scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
         core = (near > int(knobs.threshold * scale)).to(torch.uint8) * 255
-        core = closed(morphology.erode(core, morph.erode_px, "ellipse"), morph.close_px)
+        core = closed(morphology.erode(core, morph.erode_px, "ellipse"), one.close_px or morph.close_px)
         small = small_movers(one, grey, warped, seen, self.knobs.small)
         a, b = one.near[-1]
         maps = core, near, wide, texture.to(torch.uint8), warped[a], warped[b]
