@@ -124,7 +124,11 @@ class Follow:
             if height > altitude:
                 return place, height, f"they and {needed} landmarks do not fit from {altitude:.0f} m"
             lower = max(height / _STEP, self.home_m)
-            if lower < height and _between(points, team_m, needed, lower, stand, _EASY) is not None:
+            if (
+                lower < 0.99 * height
+                and self.altitude_m is not None
+                and _between(points, team_m, needed, lower, stand, _EASY) is not None
+            ):
                 return place, lower, "fit easily from lower, too"
             return place, height, f"in the picture with {needed} landmarks" if needed else "in the picture"
         place = _between(points, team_m, needed, altitude, stand, -np.inf)

@@ -11,8 +11,8 @@ _SIGHTINGS, _LASTING_S = 3, 0.8
 # A place moves by this share of what it is off its prediction, and a velocity by this share of its change: the blob of
 # a crowd swings about as parts of it are seen or not. A place further off is taken as it is.
 _BELIEVED, _FAR_M = 0.4, 5.0
-# People do not run faster, nor cars go slower for long: what does is not wanted until it is found to be human.
-_RUNNING_M_S, _WALKING_M_S = 4.5, 3.5
+# People do not run faster, nor cars go slower for long: what does is not wanted unless it is surely human.
+_RUNNING_M_S, _WALKING_M_S, _SURE = 4.5, 3.5, 0.95
 # One that is not located any more is remembered so long; its velocity is believed for a shorter time.
 _KEPT_S, _HORIZON_S = 8.0, 3.0
 # What is lost where another was found within its reach goes on under that one's name.
@@ -92,7 +92,7 @@ class _Remembered:
     @property
     def wanted(self) -> bool:
         """Whether it is human, or may be."""
-        return self.human and (not self.fast or (not self.unseen and self.probability >= _TAKEN_UP))
+        return self.human and (not self.fast or (not self.unseen and self.probability >= _SURE))
 
 
 class Memory:

@@ -22,6 +22,10 @@ class Record:
             self._values[knob] = new
             self._made.append(Adjustment(self.frame, knob, float(now), float(new), cause))
 
+    def know(self, knob: str, value: float) -> None:
+        """A value that another line tells."""
+        self._values[knob] = value
+
     def add(self, adjustments: tuple[Adjustment, ...]) -> None:
         """Take over what another rule wrote."""
         self._made.extend(adjustments)

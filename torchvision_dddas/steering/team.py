@@ -202,36 +202,46 @@ class Team:
             f"{name}.speed_m_s",
             slow if vehicle.near else knobs.fast_m_s,
             f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s",
-            least=0.5,
+            least=1.0,
         )
+        row = self._watched(v, outlook, now_s, record)
+        speed = slow if vehicle.near else knobs.fast_m_s
+        picture = self._pictured(v, outlook, row, now_s, record)
+        return Order(name, goal, speed, outlook.east_north_m[row], picture)
+
+    def _watched(self, v: int, outlook: Outlook, now_s: float, record: Record) -> int:
+        """The row of the target that a vehicle looks at."""
+        vehicle, knobs, name = self._known[v], self.knobs, self.names[v]
         row = stations.most_needed(outlook, vehicle.place_m, knobs.look_m, vehicle.watches)
         here = np.flatnonzero(outlook.target == vehicle.watches)
         if len(here) and now_s - vehicle.watched_s < _LOOK_S:
             row = int(here[0])
         if vehicle.sent_to >= 0:
             row = int(np.flatnonzero(outlook.target == vehicle.sent_to)[0])
-        at = outlook.east_north_m[row]
         target = int(outlook.target[row])
         if target != vehicle.watches:
-            why = _known(outlook, row)
-            apart = float(np.linalg.norm(at - vehicle.place_m))
-            record.set(f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {why}")
-            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, False
-        return Order(
-            name,
-            goal,
-            slow if vehicle.near else knobs.fast_m_s,
-            at,
-            self._pictured(v, outlook, row, now_s, record),
-        )
+            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, self._sure(outlook, row, False)
+            apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m))
+            often = f"a picture every {self._period_s(vehicle):g} s"
+            record.set(
+                f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {_known(outlook, row)}; {often}"
+            )
+            record.know(f"{name}.picture_s", self._period_s(vehicle))
+        return row
+
+    def _sure(self, outlook: Outlook, row: int, now: bool) -> bool:
+        """Whether a target counts as surely human or surely not; now: whether it did."""
+        surely = abs(float(outlook.probability[row]) - 0.5) + 0.5
+        return not bool(outlook.unseen[row]) and surely > (_UNSURE if now else _SURE)
+
+    def _period_s(self, vehicle: _Vehicle) -> float:
+        return self.knobs.picture_s * (_SELDOM if vehicle.sure else 1)
 
     def _pictured(self, v: int, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
         """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
         vehicle, name = self._known[v], self.names[v]
-        probability = float(outlook.probability[row])
-        surely = max(probability, 1 - probability)
-        vehicle.sure = not outlook.unseen[row] and surely > (_UNSURE if vehicle.sure else _SURE)
-        period = self.knobs.picture_s * (_SELDOM if vehicle.sure else 1)
+        vehicle.sure = self._sure(outlook, row, vehicle.sure)
+        period = self._period_s(vehicle)
         why = f"target {outlook.target[row]}: {_known(outlook, row)}"
         record.set(f"{name}.picture_s", period, why, old=self.knobs.picture_s)
         apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
