@@ -21,8 +21,8 @@ def course(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=()):
     """A run in which knobs are moved at frames: (frame, knob, old, new)."""
     kept = Course(names)
     for number in frames:
-        at = [Adjustment(*move, "why") for move in moves if move[0] == number]
-        kept.add(frame(number), seconds(number), at)
+        moved = [Adjustment(number, knob, old, new, "why") for at, knob, old, new in moves if at == number]
+        kept.add(frame(number), seconds(number), moved)
     return kept
 
 

@@ -1,5 +1,7 @@
 """Which few pictures of a run are kept."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ def run(count, happened=None, size=(32, 24)):
     for number in range(1, count + 1):
         kinds = (happened or {}).get(number, {})
         kinds = kinds if isinstance(kinds, dict) else {kinds: 1.0}
-        kept.add(number, number / 10, kinds, "; ".join(kinds), lambda number=number: draw(number))
+        kept.add(number, number / 10, kinds, "; ".join(kinds), partial(draw, number))
     return kept, drawn
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.sinks.run_log import MARK, PROBLEM, WORLD, RunLog, lines, time_at
+from torchvision_dddas.sinks.run_log import MARK, PROBLEM, WORLD, Clock, RunLog, lines
 from torchvision_dddas.types import Adjustment
 
 FRAME = np.arange(1, 101)
@@ -12,7 +12,7 @@ TIME_S = (FRAME - 1) / 10
 
 def text(log, frame=FRAME, time_s=TIME_S):
     """The lines below the heading."""
-    return lines(log.ordered(), frame, time_s, ["clip"]).splitlines()[3:]
+    return lines(log.ordered(), Clock(frame, time_s), ["clip"]).splitlines()[3:]
 
 
 def test_an_adjustment_is_told_with_its_time_its_values_and_its_cause():
@@ -74,7 +74,7 @@ def test_words_over_several_lines_stay_on_one():
 
 @pytest.mark.parametrize(("frame", "time_s"), [(1, 0.0), (11, 1.0), (51, 5.0), (101, 10.0), (121, 12.0)])
 def test_the_time_of_a_frame_is_told_by_those_around_it_or_goes_on_beyond_them(frame, time_s):
-    assert time_at(frame, np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0])) == pytest.approx(time_s)
+    assert Clock(np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0])).at(frame) == pytest.approx(time_s)
 
 
 def test_without_any_clock_there_are_frames_but_no_times():

@@ -80,36 +80,45 @@ def number(value: float) -> str:
     return "none" if not math.isfinite(value) else f"{value:.5g}"
 
 
-def lines(entries: Iterable[Entry], frame: np.ndarray, time_s: np.ndarray, heading: Sequence[str]) -> str:
-    """The text of the log. frame, time_s: (N,) of the frames looked at, growing. heading: lines that go before."""
+class Clock:
+    """When frames were, from those looked at."""
+
+    def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
+        """frame, time_s: (N,) of the frames looked at, growing; NaN where a time is not known."""
+        self._looked_at = np.array(frame, float)
+        known = np.isfinite(time_s)
+        self._frame, self._time_s = self._looked_at[known], np.array(time_s, float)[known]
+
+    def at(self, number: int) -> float:
+        """The time of a frame; it goes on at the same rate beyond the first and the last; NaN where nothing tells."""
+        frame, time_s = self._frame, self._time_s
+        if not len(frame):
+            return math.nan
+        if len(frame) > 1 and not frame[0] <= number <= frame[-1]:
+            one, other = (0, 1) if number < frame[0] else (-2, -1)
+            rate = (time_s[other] - time_s[one]) / max(frame[other] - frame[one], 1)
+            return max(float(time_s[other] + (number - frame[other]) * rate), 0.0)
+        return float(np.interp(number, frame, time_s))
+
+    def of(self, entry: Entry) -> float:
+        """When something began."""
+        return self.at(entry.first) if entry.time_s is None else entry.time_s
+
+    def seldom(self, entry: Entry) -> str:
+        """In how many of the frames looked at while it lasted, in words, if not in all."""
+        if entry.last == entry.first:
+            return ""
+        since = np.searchsorted(self._looked_at, entry.first)
+        among = int(np.searchsorted(self._looked_at, entry.last, side="right") - since)
+        return f"in {entry.count} of {among} frames" if entry.count < among else ""
+
+
+def lines(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -> str:
+    """The text of the log. heading: lines that go before."""
     out = [*(f"# {line}" for line in heading), "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
     for entry in entries:
-        at = entry.time_s if entry.time_s is not None else time_at(entry.first, frame, time_s)
-        clock = f"{at:9.3f}" if math.isfinite(at) else f"{'':9}"
-        out.append(f"{clock}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted(entry, frame)}")
+        at, seldom = clock.of(entry), clock.seldom(entry)
+        when = f"{at:9.3f}" if math.isfinite(at) else f"{'':9}"
+        lasted = "" if entry.last == entry.first else f" (to frame {entry.last}{seldom and f', {seldom}'})"
+        out.append(f"{when}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted}")
     return "\n".join(out) + "\n"
-
-
-def lasted(entry: Entry, frame: np.ndarray) -> str:
-    """How long it lasted, in words, if longer than a frame."""
-    seldom = seldom_in(entry, frame)
-    return "" if entry.last == entry.first else f" (to frame {entry.last}{seldom and f', {seldom}'})"
-
-
-def seldom_in(entry: Entry, frame: np.ndarray) -> str:
-    """In how many of the frames looked at while it lasted, in words, if not in all. frame: (N,) those, growing."""
-    among = int(np.searchsorted(frame, entry.last, side="right") - np.searchsorted(frame, entry.first))
-    return f"in {entry.count} of {among} frames" if entry.count < among else ""
-
-
-def time_at(number: int, frame: np.ndarray, time_s: np.ndarray) -> float:
-    """When a frame was, from those looked at; NaN where nothing tells."""
-    known = np.isfinite(time_s)
-    if not known.any():
-        return math.nan
-    frame, time_s = frame[known], time_s[known]
-    if len(frame) > 1 and not frame[0] <= number <= frame[-1]:
-        near = (0, 1) if number < frame[0] else (-2, -1)
-        rate = (time_s[near[1]] - time_s[near[0]]) / max(frame[near[1]] - frame[near[0]], 1)
-        return max(float(time_s[near[1]] + (number - frame[near[1]]) * rate), 0.0)
-    return float(np.interp(number, frame, time_s))

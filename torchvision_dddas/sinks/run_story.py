@@ -14,7 +14,7 @@ from torchvision_dddas.sinks.journal import Record
 from torchvision_dddas.sinks.keyframes import KeyFrames
 from torchvision_dddas.sinks.map_signs import Signs
 from torchvision_dddas.sinks.orders import Orders
-from torchvision_dddas.sinks.report import Story, Table, report
+from torchvision_dddas.sinks.report import Story, Table, report, span
 from torchvision_dddas.sinks.run_log import (
     ADJUSTED,
     MARK,
@@ -24,11 +24,10 @@ from torchvision_dddas.sinks.run_log import (
     REPAIRED,
     TOLD,
     WORLD,
+    Clock,
     Entry,
     RunLog,
     lines,
-    seldom_in,
-    time_at,
 )
 from torchvision_dddas.sinks.survey_overlay import Once
 from torchvision_dddas.sinks.whole import remove, temporary, write_whole
@@ -89,12 +88,11 @@ class RunStory:
         """Write log.txt. Raises OSError if it cannot be written."""
         rows, state = self.course.rows, "complete" if complete else "interrupted: up to the last whole frame"
         heading = [f"{self._name or 'run'}: {state}, {len(rows)} frames looked at; settings and totals are in run.json"]
-        text = lines(self.entries(), rows["frame"], rows["time_s"], heading)
+        text = lines(self.entries(), self._clock(), heading)
         write_whole(self._folder / NAME, text.encode())
-        happened = [e for e in self.log.ordered() if e.kind == WORLD]
+        clock, happened = self._clock(), [e for e in self.log.ordered() if e.kind == WORLD]
         if happened:
-            events = [{"frame": e.first, "time_s": self._time(e), "what": e.text} for e in happened]
-            self._kept.counts["events"] = events
+            self._kept.counts["events"] = [{"frame": e.first, "time_s": clock.of(e), "what": e.text} for e in happened]
         if self._counts:
             self._kept.counts |= {"kinds": dict(self._counts), "rows_looked_at": self._looks}
         if self._score:
@@ -112,16 +110,8 @@ class RunStory:
     def told(self, story: Story) -> Story:
         """A report's story with what is known of the run beside."""
         self.course.entries = entries = self.entries()
-        rows = self.course.rows
-        happened = [
-            (
-                _clock(self._time(e)),
-                e.first if e.last == e.first else f"{e.first} to {e.last}",
-                e.kind,
-                _told_of(e, rows),
-            )
-            for e in entries
-        ]
+        clock = self._clock()
+        happened = [_row(entry, clock) for entry in entries]
         told: Table = (
             f"What happened and why ({NAME})",
             ("time, s", "frames", "what", "how and why"),
@@ -154,9 +144,8 @@ class RunStory:
         story = self.told(Story(f"Found and followed: {self._name}", state, figures, facts, [], notes))
         write_whole(self._folder / REPORT, report(replace(story, panels=()), self.course).encode())
 
-    def _time(self, entry: Entry) -> float:
-        rows = self.course.rows
-        return entry.time_s if entry.time_s is not None else time_at(entry.first, rows["frame"], rows["time_s"])
+    def _clock(self) -> Clock:
+        return Clock(self.course.rows["frame"], self.course.rows["time_s"])
 
     def _step(self, number: int) -> int:
         return number - self._before
@@ -225,10 +214,8 @@ def _sort(entry: Entry) -> str:
     return entry.short if entry.kind in (WORLD, TOLD) else f"{entry.kind} {_DIGITS.sub('', entry.short.split(' ')[0])}"
 
 
-def _clock(time_s: float) -> str:
-    return f"{time_s:.2f}" if np.isfinite(time_s) else ""
-
-
-def _told_of(entry: Entry, rows: np.ndarray) -> str:
-    seldom = seldom_in(entry, rows["frame"])
-    return f"{entry.text} ({seldom})" if seldom else entry.text
+def _row(entry: Entry, clock: Clock) -> tuple[str, str, str, str]:
+    """An entry as a row of a report's table."""
+    at, seldom = clock.of(entry), clock.seldom(entry)
+    text = f"{entry.text} ({seldom})" if seldom else entry.text
+    return f"{at:.2f}" if np.isfinite(at) else "", span(entry.first, entry.last), entry.kind, text
