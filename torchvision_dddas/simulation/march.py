@@ -7,8 +7,8 @@ import numpy as np
 
 from torchvision_dddas.simulation.world import World
 
-_CELL_M = 0.8  # of the maps of what is highest nearby
-_SLICES = 16  # heights at which a block of pixels is tested
+_CELL_M = 0.4  # of the maps of what is highest nearby
+_SLICES = 20  # heights at which a block of pixels is tested
 _LEAST_M = 0.05  # what is lower lies flat
 _STEPS = (3, 6, 12, 24)  # on the way down of a pixel's line of sight
 _STRIDE_PX = 1.5  # that a step should be long in the picture
@@ -70,7 +70,8 @@ class Standing:
                 np.asarray(cv2.resize(self._levels[-1], size, interpolation=cv2.INTER_AREA), np.float32)
             )
         cells = max(int(np.ceil(world.side_m / _CELL_M)), 1)
-        wide = 2 * int(np.ceil(_CELL_M / world.surface_texel_m)) + 1
+        # A reach of one cell from wherever in its own cell a place lies, and a texel for what is interpolated.
+        wide = 2 * int(np.ceil(1.5 * _CELL_M / world.surface_texel_m + 1)) + 1
         highest = cv2.dilate(self._levels[0], np.ones((wide, wide), np.uint8), borderType=cv2.BORDER_REFLECT)
         self._highest = [cv2.resize(highest, (cells, cells), interpolation=cv2.INTER_NEAREST)]
         self.tallest_m = float(highest.max())
@@ -163,8 +164,9 @@ class Standing:
         half = self._side_m / 2
         across, down = texture.shape[1] / self._side_m, texture.shape[0] / self._side_m
         uv = np.zeros((2, -(-count // _WIDE) * _WIDE), np.float32)
-        uv[0, :count] = (east_m.ravel() + np.float32(half)) * np.float32(across) - np.float32(0.5)
-        uv[1, :count] = (np.float32(half) - north_m.ravel()) * np.float32(down) - np.float32(0.5)
+        for row, place, scale, size in ((0, east_m, across, across), (1, north_m, -down, down)):
+            np.multiply(place.ravel(), np.float32(scale), out=uv[row, :count])
+            uv[row, :count] += np.float32(half * size - 0.5)
         u, v = uv.reshape(2, -1, _WIDE)
         return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT).ravel()[:count]).reshape(
             east_m.shape

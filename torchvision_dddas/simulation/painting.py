@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation import sunlight
+from torchvision_dddas.simulation.blur import LEAST_PX, streak
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.outlines import Outlines, Shapes
 from torchvision_dddas.simulation.shutter import Shutter
@@ -23,8 +24,8 @@ _SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
 class Painter:
     """Paints the bodies of a moment."""
 
-    def __init__(self, world: World, shutter: Shutter, seed: int) -> None:
-        self._world, self._shutter = world, shutter
+    def __init__(self, world: World, shutter: Shutter, exposure_s: float, seed: int) -> None:
+        self._world, self._shutter, self._exposure_s = world, shutter, exposure_s
         self._shapes = Shapes(world, shutter, seed)
         step = max(-(-max(world.surface.shape) // _SHADE_CELLS), 1)
         cells = tuple(-(-n // step) for n in world.surface.shape[::-1])
@@ -58,17 +59,29 @@ class Painter:
         in_sun[rows] = shaded < 0.5
         shadows = Outlines(*(column[in_sun[shadows.body]] for column in shadows))
         self._shade(picture, Sheets(shadows, float(scale.max()), targets.shape), rise_m)
+        ways = self._own_ways(moment, rows)
         sheets = Sheets(solids, float(scale.max()), targets.shape)
         for body, at, canvas in sheets.drawn():
             hide(canvas, sheets.step, rise_m, at)
             cover = _averaged(_covered(canvas), sheets.step)
             paint = _averaged(canvas, sheets.step)[..., :3]
-            below = picture[at]
-            clear = cv2.cvtColor(255 - cover, cv2.COLOR_GRAY2BGR)
-            picture[at] = cv2.add(cv2.multiply(below, clear, scale=1 / 255), paint)
             mine = cover >= 128
             targets[at][mine] = bodies.target[body]
             numbers[at][mine] = bodies.number[body]
+            if body in ways:
+                at, cover, paint = _drawn_out(at, cover, paint, ways[body], targets.shape)
+            clear = cv2.cvtColor(255 - cover, cv2.COLOR_GRAY2BGR)
+            picture[at] = cv2.add(cv2.multiply(picture[at], clear, scale=1 / 255), paint)
+
+    def _own_ways(self, moment: Moment, rows: np.ndarray) -> dict[int, np.ndarray]:
+        """Pixels that bodies move on their own during the exposure, of those that do so visibly."""
+        bodies = moment.bodies
+        step = np.c_[bodies.velocity_m_s[rows], np.zeros(len(rows))] * self._exposure_s / 2
+        ends, _ = self._shutter.project(
+            moment, np.concatenate([bodies.place_m[rows] - step, bodies.place_m[rows] + step])
+        )
+        way = ends[len(rows) :] - ends[: len(rows)]
+        return {int(row): one for row, one in zip(rows, way, strict=True) if np.hypot(*one) > LEAST_PX}
 
     def _in_view(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
         """The rows of the bodies that the picture may show, far ones first, and pixels for each metre there."""
@@ -156,6 +169,21 @@ def hide(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[sli
         code = np.clip(1 + (rise - _HIDDEN_M) * _CODES, 0, 256).astype(np.uint16)
         code = np.repeat(np.repeat(code, step, axis=0), step, axis=1)
         canvas[canvas[..., 3] < code] = 0
+
+
+def _drawn_out(
+    at: tuple[slice, slice], cover: np.ndarray, paint: np.ndarray, way_px: np.ndarray, shape: tuple[int, ...]
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+    """What covers a part of a picture, drawn out along a way; the part grows by what the way needs."""
+    kernel = streak(way_px)
+    reach = kernel.shape[0] // 2
+    part = [(min(reach, one.start), min(reach, size - one.stop)) for one, size in zip(at, shape[:2], strict=True)]
+    wide = cv2.copyMakeBorder(
+        np.dstack([paint, cover]), *part[0], *part[1], borderType=cv2.BORDER_CONSTANT, value=(0, 0, 0, 0)
+    )
+    wide = cv2.filter2D(wide, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+    grown = [slice(one.start - before, one.stop + after) for one, (before, after) in zip(at, part, strict=True)]
+    return (grown[0], grown[1]), np.ascontiguousarray(wide[..., 3]), np.ascontiguousarray(wide[..., :3])
 
 
 def _covered(canvas: np.ndarray) -> np.ndarray:

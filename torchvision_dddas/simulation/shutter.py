@@ -1,6 +1,7 @@
 """A rolling shutter over relief: each row of a picture has the camera's pose at the time at which it is read."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,6 +34,15 @@ class Shutter:
         lag = self.lag_s(image_px[:, 1])[:, None]
         way = turned(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
         return pose.place_m + lag * moment.velocity_m_s, way
+
+    def ways(self, moment: Moment, places_m: np.ndarray, exposure_s: float) -> np.ndarray:
+        """Pixels (N, 2) that points (N, 3) which stand still move in the picture during an exposure."""
+        ends = []
+        for lag in (-exposure_s / 2, exposure_s / 2):
+            axes = turned(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
+            pose = replace(moment.pose, place_m=moment.pose.place_m + lag * moment.velocity_m_s, axes=axes)
+            ends.append(self.project(replace(moment, pose=pose), places_m)[0])
+        return ends[1] - ends[0]
 
     def project(
         self, moment: Moment, points_m: np.ndarray, velocity_m_s: np.ndarray | float = 0.0

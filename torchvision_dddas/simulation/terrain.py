@@ -13,6 +13,9 @@ from torchvision_dddas.simulation.world import World
 
 _STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
 _LEVELS = 8
+_VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
+_HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
+_GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
 _LEAST_M, _MOST_LEAN = 1.0, 8.0  # below the camera; lines of sight further from upright are taken to lean so much
 
 
@@ -20,7 +23,7 @@ class Lie(NamedTuple):
     """Where pixels lie: east_m, north_m (H, W) float32; pixel_m (H,) size of a row's pixels on the ground.
 
     rise_m: (H, W) float32, above the ground where something stands that is seen there, None where all is bare.
-    met: the same as a list of flat indices.
+    met: the same as a list of flat indices. haze: (H, W) float32, share of the air's light; None where it is clear.
     """
 
     east_m: np.ndarray
@@ -28,6 +31,7 @@ class Lie(NamedTuple):
     pixel_m: np.ndarray
     rise_m: np.ndarray | None = None
     met: Met | None = None
+    haze: np.ndarray | None = None
 
 
 class Terrain:
@@ -41,6 +45,11 @@ class Terrain:
             above = self._levels[-1]
             size = (above.shape[1] + 1) // 2, (above.shape[0] + 1) // 2
             self._levels.append(cv2.resize(above, size, interpolation=cv2.INTER_AREA))
+        rough = np.random.default_rng(_GRAIN_PX).standard_normal((_GRAIN_PX, _GRAIN_PX), np.float32)
+        rough = np.tile(rough, (3, 3))
+        rough = (cv2.GaussianBlur(rough, (0, 0), 0.7) - cv2.GaussianBlur(rough, (0, 0), 3))[_GRAIN_PX : 2 * _GRAIN_PX]
+        rough = rough[:, _GRAIN_PX : 2 * _GRAIN_PX]
+        self._grain = np.round(128 * (1 + _GRAIN * rough / rough.std())).clip(0, 255).astype(np.uint8)
         width, height = shutter.camera.size_px
         self._cells = -(-width // _STEP_PX) + 2, -(-height // _STEP_PX) + 2
         # The middles of blocks of pixels: so that enlarging them by whole blocks puts each where it belongs.
@@ -63,7 +72,9 @@ class Terrain:
         pixel_m = np.sqrt(np.abs(along[..., 0] * aside[..., 1] - along[..., 1] * aside[..., 0]))
         height = self._shutter.camera.size_px[1]
         each_row = np.interp(np.arange(height), self._block_px[:, 0, 1], np.median(pixel_m, axis=1))
-        lie = Lie(east, north, each_row)
+        away = far * np.linalg.norm(way, axis=1)
+        haze = np.where(way[:, 2] > -_HORIZON, 1, 1 - np.exp(-away / _VISIBILITY_M)).reshape(rows, columns)
+        lie = Lie(east, north, each_row, haze=self._enlarged(haze) if haze.max() > _CLEAR else None)
         if self._standing.tallest_m <= 0:
             return lie
         sights = _sights(place.reshape(-1, 2), start, up, pixel_m.ravel())
@@ -75,7 +86,11 @@ class Terrain:
         self, lie: Lie, moment: Moment, blocks: Sights, up: np.ndarray, top: np.ndarray, bottom: np.ndarray
     ) -> Lie:
         """Where pixels lie once lines of sight have met what stands, between the heights that blocks say (N,)."""
-        which = np.flatnonzero((top > 0)[self._block])
+        columns, rows = self._cells
+        hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
+        some = cv2.resize(hopeful, None, fx=_STEP_PX, fy=_STEP_PX, interpolation=cv2.INTER_NEAREST)
+        height, width = lie.east_m.shape
+        which = np.flatnonzero(some[:height, :width])
         block = self._block[which]
         # Most pixels of such blocks pass it by: those with nothing near the middle of the stretch in question.
         middle, half = (top + bottom) / 2, (top - bottom) / 2
@@ -86,7 +101,6 @@ class Terrain:
         which, block, east, north = which[near], block[near], east[near], north[near]
         if not len(which):
             return lie
-        height, width = lie.east_m.shape
         lag = self._shutter.lag_s(np.arange(height))[:, None]
         eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32)[which // width]
         sights = _sights(np.stack([east, north], axis=1), eye, up.astype(np.float32)[block], blocks.pixel_m[block])
@@ -126,6 +140,14 @@ class Terrain:
             dim = lie.met.light != 1
             flat, which = picture.reshape(-1, 3), lie.met.which[dim]
             flat[which] = np.clip(flat[which] * lie.met.light[dim, None], 0, 255)
+        # Enlarged, a texture is smooth: it gets the grain that it is too coarse to show.
+        wanted = float(np.clip(np.log2(world.texel_m / np.median(lie.pixel_m)), 0, 1))
+        if wanted > 0.1:
+            scale = 1 / _GRAIN_M
+            u, v = (cv2.addWeighted(place, scale, place, 0, 0) for place in (lie.east_m, lie.north_m))
+            grain = cv2.remap(self._grain, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+            grain = cv2.LUT(grain, np.round(128 + (np.arange(256) - 128) * wanted).astype(np.uint8))
+            cv2.multiply(picture, cv2.cvtColor(grain, cv2.COLOR_GRAY2BGR), dst=picture, scale=1 / 128)
         return picture
 
     def _look(self, level: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
