@@ -8,11 +8,11 @@ import numpy as np
 
 _BLOCK = 64  # rows of noise that share a seed
 _FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
-_SPREAD = 1 / 0.74  # what cubic interpolation between independent numbers takes from their spread
+_SPREAD = 1.35  # makes up for what interpolation between independent numbers takes from their spread, and more
 
 
 def bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
-    """(H, W) float32 of mean 0 and standard deviation 1: smooth noise whose bumps are about width_px wide."""
+    """(H, W) float32 of mean 0 and standard deviation about 1: smooth noise whose bumps are about width_px wide."""
     if width_px <= 1:
         return rng.standard_normal(shape, np.float32)
     cells = [int(np.ceil(n / width_px)) + 3 for n in shape]
@@ -26,7 +26,7 @@ def bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> 
 def fractal(
     rng: np.random.Generator, shape: tuple[int, int], widest_px: float, narrowest_px: float, fall: float = 0.5
 ) -> np.ndarray:
-    """(H, W) float32 with standard deviation 1: bumps of halving widths, each octave `fall` times the one before."""
+    """(H, W) float32 of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
     total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, widest_px
     while width >= narrowest_px or power == 0:
         total += np.float32(height) * bumps(rng, shape, width)
@@ -35,7 +35,7 @@ def fractal(
 
 
 def band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
-    """Rows [first, last) of an endless (_, columns) noise with spread 1 whose bumps are width_px wide."""
+    """Rows [first, last) of an endless (_, columns) noise with spread about 1 whose bumps are width_px wide."""
     first, last = rows[0] // width_px - 2, -(-rows[1] // width_px) + 2
     cells = -(-columns // width_px) + 4
     small = _white(seed, first, last, cells)

@@ -1,5 +1,7 @@
 """The shape of the ground: smooth hills, or those of an elevation raster, on one grid that spans the world."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from torchvision_dddas.errors import InputError
@@ -10,7 +12,7 @@ _MOST = 1000  # steps along a side
 _HILLS_M = (60.0, 200.0)  # wavelengths of the synthetic relief
 
 
-def hills(side_m: float, relief_m: float, rng: np.random.Generator) -> Elevation:
+def hills(side_m: float, relief_m: float, above_sea_m: float, rng: np.random.Generator) -> Elevation:
     """Synthetic hills, relief_m from the lowest to the highest place, 0 at the origin.
 
     Waves of 60 to 200 m from all directions, none longer than the world; the longer, the higher.
@@ -23,7 +25,8 @@ def hills(side_m: float, relief_m: float, rng: np.random.Generator) -> Elevation
         turn, phase = rng.uniform(0, 2 * np.pi, 2)
         up += length**1.5 * np.sin(2 * np.pi / length * (east * np.cos(turn) + north * np.sin(turn)) + phase)
     spread = float(np.ptp(up))
-    return _about_origin(up * (relief_m / spread), side_m, step, 0.0)
+    made = _about_origin(up * (relief_m / spread), side_m, step, 0.0)
+    return replace(made, base_m=above_sea_m)
 
 
 def of_raster(given: Elevation, side_m: float) -> Elevation:

@@ -122,12 +122,17 @@ def soil(ground: Lie, rows: tuple[int, int], texel_m: float, seed: int, to_sun: 
     # Where the nearest trail changes, its side may too: no trail is there.
     trail = np.abs(enlarged(ground.trail_m, wide, COARSE, smooth=True))
     trail = np.maximum(trail, enlarged(np.abs(ground.trail_m), wide, COARSE) - 0.5 * ground.cell_m)
+    grain = fine(3, 0.1)
+    # A camera near the ground sees what is finer, too.
+    for key, width_m in ((5, 0.05), (6, 0.025)):
+        if texel_m <= 1.2 * width_m:
+            grain += 0.7 * fine(key, width_m)
     layers = {
         "broad": fine(4, 1.6),
         "large": fine(0, 0.8),
         "middle": fine(1, 0.4),
         "small": fine(2, 0.2),
-        "grain": fine(3, 0.1),
+        "grain": grain,
         "stones": sum(bright * strewn(k, each_m2, radius_m) for k, (each_m2, radius_m, bright) in enumerate(_STONES)),
         "tufts": sum(dense * strewn(10 + k, each_m2, radius) for k, (each_m2, radius, dense) in enumerate(_TUFTS)),
         "trail": trail,
@@ -194,6 +199,8 @@ def _coloured(
     light = np.clip(1 + light / np.float32(2 * step * texel_m), 0.45, 1.4)
     east, north = np.round(-0.2 * slant / np.maximum(np.hypot(*slant), 0.2) / texel_m).astype(int)
     light *= 1 - 0.55 * np.clip(np.roll(clumps, (-north, east), (0, 1)) - clumps, 0, 1)
+    # Leaves and stalks, bright and dark beside each other.
+    light *= 1 + clumps * (0.14 * small + 0.14 * grain)
     light *= dull * of["light"]
 
     green = np.clip(of["green"] + 0.25 * middle + 0.2 * large, 0, 1)

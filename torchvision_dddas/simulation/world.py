@@ -18,7 +18,7 @@ from torchvision_dddas.types import Elevation, Ortho
 MOST_TEXELS = 12_000
 """Pixels along a side of the largest texture."""
 
-_BAND = 256  # rows of the texture that are made at once
+_AT_ONCE = 1 << 20  # pixels of the texture that are made at once, in whole rows
 _ROWS_OF_SURFACE = 6000
 
 
@@ -69,7 +69,11 @@ def build(
     texel = side_m / side_px
     to_sun = sunlight.towards(knobs.sun_azimuth_deg, knobs.sun_height_deg)
     rng = np.random.default_rng([seed, 10])
-    relief = reliefs.hills(side_m, knobs.relief_m, rng) if elevation is None else reliefs.of_raster(elevation, side_m)
+    relief = (
+        reliefs.hills(side_m, knobs.relief_m, knobs.above_sea_m, rng)
+        if elevation is None
+        else reliefs.of_raster(elevation, side_m)
+    )
     light = _on_texels(sunlight.on_slopes(relief.up_m, relief.step_m, to_sun), cells)
     ground = lie(side_m, light, seed)
 
@@ -94,13 +98,16 @@ def build(
 
     bare = synthetic if photo is None else Photographed(photo, side_m, side_px, synthetic).rows
     albedo = np.empty((side_px, side_px, 3), np.uint8)
-    for first in range(0, side_px, _BAND):
-        rows = first, min(first + _BAND, side_px)
+    band = max(_AT_ONCE // side_px, 32)
+    for first in range(0, side_px, band):
+        rows = first, min(first + band, side_px)
         image = bare(rows)
         crowns.paint(image, first, texel, to_sun)
         shade = np.clip(enlarged(over, rows, factor) / 0.25 - 0.2, 0, 1)
+        # Ground that lies away from the sun has less to lose to a shadow.
+        slopes = enlarged(light, rows, COARSE) if photo is None else np.float32(1)
         for k in range(3):
-            lit = image[k] * (1 - shade * (1 - sunlight.SHADE_BGR[k]))
+            lit = image[k] * (1 - shade * np.clip(1 - sunlight.SHADE_BGR[k] / slopes, 0, 1))
             albedo[rows[0] : rows[1], :, k] = np.clip(np.round(lit), 0, 255)
     return World(side_m, texel, albedo, surface, texel * factor, relief, things, to_sun)
 
