@@ -15,6 +15,9 @@ from torchvision_dddas.sinks.timeline import OverTime, Panel, plots
 MOST_ROWS = 200
 """A table shows so many rows; run.json or log.txt has them all."""
 
+FOLDED = ("scenario", "settings")
+"""Facts that are too long to be seen at once."""
+
 Table = tuple[str, Sequence[str], Sequence[Sequence[Any]], str]
 """A title, the columns' names, rows of cells, and what to say where there are none."""
 
@@ -45,7 +48,7 @@ figcaption{font-size:13px;color:#444;margin-top:4px;overflow-wrap:anywhere}
 class Story:
     """What a report tells. All words are escaped when it is written.
 
-    figures: names and values. facts: what was run; `settings` among them is folded away. notes: in words.
+    figures: names and values. facts: what was run; those of FOLDED are folded away. notes: in words.
     map_png: or as JPEG. first: tables that stand before the map. panels: plots above those of the timeline.
     """
 
@@ -80,11 +83,11 @@ def report(story: Story, timeline: OverTime) -> str:
     if drawn := plots(timeline, story.panels):
         parts += ["<h2>Over time</h2>", drawn, '<p class="note">Shaded: frames in which nothing could be located.</p>']
     parts += _tables(story.tables)
-    facts = {name: value for name, value in story.facts.items() if name != "settings"}
+    facts = {name: value for name, value in story.facts.items() if name not in FOLDED}
     parts += ["<h2>What was run</h2>", table(("what", "value"), [(name, _words(v)) for name, v in facts.items()])]
-    if "settings" in story.facts:
-        text = json.dumps(finite(story.facts["settings"]), indent=2)
-        parts.append(f"<details><summary>settings</summary><pre>{escape(text)}</pre></details>")
+    for name in (name for name in FOLDED if name in story.facts):
+        text = json.dumps(finite(story.facts[name]), indent=2)
+        parts.append(f"<details><summary>{name}</summary><pre>{escape(text)}</pre></details>")
     body = "\n".join(parts)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
