@@ -11,7 +11,7 @@ from torchvision_dddas.types import Camera
 _LOWEST = 0.004  # rays sink at least so much for each metre along the axis: those above the horizon never land
 _FURTHEST_M = 20_000.0
 _LANDINGS = 8
-_CLOSE_M = 0.002
+_CLOSE_M = 0.004
 
 
 class Shutter:

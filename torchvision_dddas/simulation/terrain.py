@@ -16,6 +16,7 @@ _LEVELS = 8
 _VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
 _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
 _GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
+_GRAIN_TILES = 6
 _LEAST_M, _MOST_LEAN = 1.0, 8.0  # below the camera; lines of sight further from upright are taken to lean so much
 
 
@@ -49,7 +50,8 @@ class Terrain:
         rough = np.tile(rough, (3, 3))
         rough = (cv2.GaussianBlur(rough, (0, 0), 0.7) - cv2.GaussianBlur(rough, (0, 0), 3))[_GRAIN_PX : 2 * _GRAIN_PX]
         rough = rough[:, _GRAIN_PX : 2 * _GRAIN_PX]
-        self._grain = np.round(128 * (1 + _GRAIN * rough / rough.std())).clip(0, 255).astype(np.uint8)
+        rough = np.round(128 * (1 + _GRAIN * rough / rough.std())).clip(0, 255).astype(np.uint8)
+        self._grain = np.tile(rough, (_GRAIN_TILES, _GRAIN_TILES))
         width, height = shutter.camera.size_px
         self._cells = -(-width // _STEP_PX) + 2, -(-height // _STEP_PX) + 2
         # The middles of blocks of pixels: so that enlarging them by whole blocks puts each where it belongs.
@@ -142,12 +144,16 @@ class Terrain:
             flat[which] = np.clip(flat[which] * lie.met.light[dim, None], 0, 255)
         # Enlarged, a texture is smooth: it gets the grain that it is too coarse to show.
         wanted = float(np.clip(np.log2(world.texel_m / np.median(lie.pixel_m)), 0, 1))
-        if wanted > 0.1:
-            scale = 1 / _GRAIN_M
-            u, v = (cv2.addWeighted(place, scale, place, 0, 0) for place in (lie.east_m, lie.north_m))
+        if wanted > 0.25:
+            # OpenCV is slow beyond a texture's edge: the pattern is laid out often enough, and moved by whole patterns.
+            side = _GRAIN_PX * _GRAIN_M
+            corner = (float(np.floor(place[::16, ::16].min() / side)) for place in (lie.east_m, lie.north_m))
+            u, v = (
+                cv2.addWeighted(place, 1 / _GRAIN_M, place, 0, -start * _GRAIN_PX)
+                for place, start in zip((lie.east_m, lie.north_m), corner, strict=True)
+            )
             grain = cv2.remap(self._grain, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-            grain = cv2.LUT(grain, np.round(128 + (np.arange(256) - 128) * wanted).astype(np.uint8))
-            cv2.multiply(picture, cv2.cvtColor(grain, cv2.COLOR_GRAY2BGR), dst=picture, scale=1 / 128)
+            cv2.addWeighted(picture, 1, cv2.cvtColor(grain, cv2.COLOR_GRAY2BGR), wanted, -128 * wanted, dst=picture)
         return picture
 
     def _look(self, level: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
