@@ -17,7 +17,8 @@ _SHAPES = 6  # different bushes, and different trees
 _SIZE_PX = (160, 160)  # width, height of a drawn plant
 _DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
 _WHEEL_M = (0.7, 0.3, 0.33)  # from the middle to a wheel's, its width, its radius
-_SPOKES = 14
+_SPOKES = 12
+_BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 NEAR_M = 0.4  # what is nearer to the camera, in depth, is not drawn
 
 
@@ -120,7 +121,7 @@ def rover() -> Faces:
         corners.append(np.pad(skirt, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
         normals.append(np.array([0.0, hand, 0.0]))
         tones.append(14.0)
-    for low, high, half_long, half_wide in ((0.75, 1.15, 0.03, 0.03), (1.15, 1.27, 0.06, 0.14)):
+    for low, high, half_long, half_wide in ((0.75, 1.2, 0.015, 0.015), (1.2, 1.27, 0.05, 0.06)):
         block = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (half_long, half_wide) + (1.05, 0.0)
         for k in range(4):
             (x0, y0), (x1, y1) = block[k], block[(k + 1) % 4]
@@ -157,8 +158,16 @@ def draw_vehicle(
     order = np.flatnonzero(towards)
     if bodies.kind[k] == "ugv":  # a car's faces come in an order of their own: its doors lie on its flanks
         order = order[np.argsort(-np.linalg.norm(middle[order] - view.position_m, axis=1))]
+    value, matrix = int(bodies.number[k]), view.image_from_world
+    seen = corners @ matrix[:, :3].T + matrix[:, 3]
+    if seen[..., 2].min() < NEAR_M:
+        for n in order:
+            fill(corners[n], colour[n], value, view, canvas)
+        return
+    px = np.round(np.clip(seen[..., :2] / seen[..., 2:], -3e4, 3e4) * 2**_BITS).astype(np.int32)
     for n in order:
-        fill(corners[n], colour[n], int(bodies.number[k]), view, canvas)
+        cv2.fillConvexPoly(canvas.picture, px[n], colour[n].tolist(), cv2.LINE_AA, _BITS)
+        cv2.fillConvexPoly(canvas.mask, px[n], value, cv2.LINE_8, _BITS)
 
 
 def fill(points_m: np.ndarray, colour: np.ndarray, value: int, view: View, canvas: Canvas) -> None:
