@@ -131,6 +131,18 @@ def test_nobody_stands_in_a_tree() -> None:
         agents.step()
 
 
+def test_nobody_is_run_over() -> None:
+    across = (CrowdPlan(people=12, start_m=(0.0, -20.0), heading_deg=0.0), CrowdPlan(people=8, behaviour="stand"))
+    agents = Agents(busy(crowd=across, car=(CarPlan(start_m=(-60.0, 0.0), speed_m_s=8.0),)), world_of())
+    for _ in range(100):
+        agents.step(2)
+        bodies = agents.moment().bodies
+        car = np.flatnonzero(bodies.kind == "car")[0]
+        ahead = np.array([np.sin(bodies.facing_rad[car]), np.cos(bodies.facing_rad[car])])
+        to = bodies.place_m[bodies.kind == "person", :2] - bodies.place_m[car, :2]
+        assert ((np.abs(to @ ahead) > 2.2) | (np.abs(to @ (ahead[1], -ahead[0])) > 0.9)).all()
+
+
 def test_feet_are_on_the_ground() -> None:
     bodies = moments(busy(), 3)[-1].bodies
     assert np.allclose(bodies.place_m[:, 2], world_of().up_m(bodies.place_m[:, :2]))

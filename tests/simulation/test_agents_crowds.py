@@ -13,6 +13,7 @@ from torchvision_dddas.simulation.obstacles import Obstacles
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Happening
 
 NOBODY = np.zeros((0, 2))
+NOTHING = np.zeros((0, 5))
 
 
 def standing(*discs: tuple[float, float, float]) -> Any:
@@ -29,7 +30,7 @@ def go(crowds: Crowds, seconds: float, start_s: float = 0.0) -> tuple[np.ndarray
     """(T, N, 2) places, and what was said."""
     places, said = [crowds.place], []
     for step in range(round(seconds * 10)):
-        said += crowds.step(start_s + (step + 1) / 10, 0.1, NOBODY)
+        said += crowds.step(start_s + (step + 1) / 10, 0.1, NOTHING)
         places.append(crowds.place)
     return np.array(places), said
 
@@ -43,7 +44,7 @@ def test_a_crowd_at_random_goes_as_fast_as_the_source_says() -> None:
     crowds = people(*(CrowdPlan(people=1, start_m=(0.0, y), behaviour="random") for y in range(-80, 81, 10)))
     middles = [crowds._groups.middle.copy()]
     for step in range(400):
-        crowds.step((step + 1) / 10, 0.1, NOBODY)
+        crowds.step((step + 1) / 10, 0.1, NOTHING)
         if (step + 1) % round(UNIT_S * 10) == 0:
             middles.append(crowds._groups.middle.copy())
     steps = np.abs(np.diff(middles, axis=0))
@@ -157,7 +158,7 @@ def test_legs_go_with_the_way_and_velocities_are_those_of_the_places() -> None:
     crowds = people(CrowdPlan(people=5, behaviour="walk"), CrowdPlan(people=5, start_m=(0, 30.0), behaviour="stand"))
     go(crowds, 5)
     before, phase = crowds.place, crowds.phase
-    crowds.step(5.1, 0.1, NOBODY)
+    crowds.step(5.1, 0.1, NOTHING)
     assert crowds.velocity == pytest.approx((crowds.place - before) / 0.1)
     strides = (crowds.phase - phase) % 1.0
     assert strides[:5] == pytest.approx(0.1, rel=0.5)
@@ -167,8 +168,10 @@ def test_legs_go_with_the_way_and_velocities_are_those_of_the_places() -> None:
 def test_people_make_way_for_vehicles() -> None:
     crowds = people(CrowdPlan(people=10, behaviour="stand", radius_m=2.0))
     for step in range(60):
-        crowds.step(step / 10, 0.1, np.array([[0.0, 0.0]]))
-    assert np.linalg.norm(crowds.place, axis=1).min() > 0.9
+        crowds.step(step / 10, 0.1, np.array([[0.0, 0.0, np.pi / 4, 2.0, 1.0]]))
+    ahead = np.abs(crowds.place @ (np.sqrt(0.5), np.sqrt(0.5)))
+    aside = np.abs(crowds.place @ (np.sqrt(0.5), -np.sqrt(0.5)))
+    assert ((ahead > 2.0) | (aside > 1.0)).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 300])

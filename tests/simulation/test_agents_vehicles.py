@@ -131,11 +131,11 @@ def test_vehicles_go_round_one_another_and_round_what_stands() -> None:
     team = team_of(discs=((0.0, 0.0, 2.0), (4.0, 6.0, 1.5)), ugvs=4, patrol="stand")
     for k, place in enumerate(team.place.copy()):
         team.order(k, -place, 2.0, None)
-    places = drive(team, 60)["place"]
+    places = drive(team, 90)["place"]
     assert np.linalg.norm(places, axis=2).min() > 2.4
     apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=3) + 10 * np.eye(4)
-    assert apart.min() > 0.9
-    assert np.linalg.norm(places[-1] - team._ordered, axis=1).max() < 0.5
+    assert apart.min() > 1.7
+    assert np.linalg.norm(places[-1] - team._ordered, axis=1).max() < 0.5  # all have come through
 
 
 def test_a_vehicle_stops_before_people() -> None:
@@ -143,7 +143,7 @@ def test_a_vehicle_stops_before_people() -> None:
     wall = np.stack([np.linspace(-30, 30, 61), np.zeros(61)], axis=1)
     team.order(0, -team.place[0], 3.0, None)
     places = drive(team, 20, wall)["place"][:, 0]
-    assert np.linalg.norm(places[:, None] - wall, axis=2).min() > 1.0
+    assert np.linalg.norm(places[:, None] - wall, axis=2).min() > 1.2
 
 
 @pytest.mark.parametrize("patrol", ["stand", "random", "gather", "along"])

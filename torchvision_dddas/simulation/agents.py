@@ -10,14 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from torchvision_dddas.simulation.aircraft import Aircraft, Telemetry, rotation
-from torchvision_dddas.simulation.cars import Cars
+from torchvision_dddas.simulation.cars import CAR_HALF_M, Cars
 from torchvision_dddas.simulation.crowds import Crowds
 from torchvision_dddas.simulation.faults import Faults, Wrong
 from torchvision_dddas.simulation.moment import Moment, Report
 from torchvision_dddas.simulation.obstacles import Obstacles, Things
 from torchvision_dddas.simulation.receiver import Receivers
 from torchvision_dddas.simulation.scenario import Scenario
-from torchvision_dddas.simulation.team import Team, plates
+from torchvision_dddas.simulation.team import UGV_HALF_M, Team, plates
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
 
@@ -126,8 +126,7 @@ class Agents:
     def _tick(self, begin: float, seconds: float) -> None:
         end, wrong = begin + seconds, self._faults.at(begin)
         team, before = self._team, self._team.place
-        vehicles = np.concatenate([self._cars.place, before])
-        self._events += self._crowds.step(end, seconds, vehicles)
+        self._events += self._crowds.step(end, seconds, self._shapes())
         people = self._crowds.place
         self._cars.step(end, seconds, np.concatenate([people, before]))
         team.step(end, seconds, sorted(wrong.lost), people)
@@ -135,6 +134,16 @@ class Agents:
         self._report(before, team.place, begin, end)
         if np.floor(end + 1e-6) > np.floor(begin + 1e-6):
             self._plan(end)
+
+    def _shapes(self) -> np.ndarray:
+        """(V, 5) vehicles as Crowds.step wants them."""
+        cars, team = self._cars, self._team
+        return np.concatenate(
+            [
+                np.c_[cars.place, cars.course, np.tile(CAR_HALF_M, (len(cars), 1))],
+                np.c_[team.place, team.course, np.tile(UGV_HALF_M, (len(team), 1))],
+            ]
+        )
 
     def _blow(self, time_s: float) -> tuple[np.ndarray | None, float]:
         """The push (3,) of the gusts, m/s2, and how much rougher the air is."""

@@ -5,6 +5,8 @@ import numpy as np
 from torchvision_dddas.simulation.obstacles import Obstacles, round_discs
 from torchvision_dddas.simulation.scenario import CarPlan
 
+CAR_HALF_M = (2.2, 0.9)
+"""Half the length and half the width."""
 RADIUS_M = 6.0
 """The narrowest that they turn."""
 _ACCELERATION_M_S2, _BRAKE_M_S2 = 1.5, 4.0

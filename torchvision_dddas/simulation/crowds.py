@@ -22,6 +22,8 @@ _ROUNDS = 8
 """So often places are moved apart in a step, at most."""
 _MARGIN_M = 10.0
 _PERSONAL_M = 0.8
+_WARY_M, _TOUCH_M = 2.0, 0.3
+"""People turn away from vehicles that are so near, and are never nearer than the second."""
 _LOOSE_S = 2.5
 """Time in which somebody comes back to the own place in the crowd."""
 _STRAY_M_S, _STRAY_S = (0.2, 0.03), 3.0
@@ -139,7 +141,10 @@ class Crowds:
         return place
 
     def step(self, time_s: float, seconds: float, vehicles: np.ndarray) -> list[str]:
-        """On by so long, to time_s, past vehicles (V, 2); what happened, in words."""
+        """On by so long, to time_s; what happened, in words.
+
+        vehicles: (V, 5) of those that people walk round: east, north, course, half their length and half their width.
+        """
         said = self._happen(time_s)
         if not len(self):
             return said
@@ -160,7 +165,7 @@ class Crowds:
         wanted = wanted + self._give_way(near) + self._past(vehicles)
         velocity = wanted + (self.velocity - wanted) * np.exp(-seconds / 0.35)
         place = _apart(self.place + seconds * velocity, near, BODY_M)
-        place = self._obstacles.outside(place).clip(-self._half + 1, self._half - 1)
+        place = self._obstacles.outside(self._beside(place, vehicles)).clip(-self._half + 1, self._half - 1)
         self.velocity = (place - self.place) / seconds
         self.place = place
         self._walk(seconds)
@@ -188,10 +193,18 @@ class Crowds:
         """(N, 2) velocities away from vehicles that are near."""
         found = np.zeros_like(self.place)
         for vehicle in vehicles:
-            away = self.place - vehicle
-            distance = np.maximum(np.hypot(*away.T), 1e-6)
-            found += away * (1.5 * np.clip(1 - distance / 2.5, 0, 1) / distance)[:, None]
+            away, distance, near = _from_box(self.place, vehicle, _WARY_M)
+            found[near] += away * (1.5 * (1 - np.clip(distance, 0, None) / _WARY_M))[:, None]
         return found
+
+    def _beside(self, place: np.ndarray, vehicles: np.ndarray) -> np.ndarray:
+        """(N, 2) the places, moved out of vehicles."""
+        for vehicle in vehicles:
+            away, distance, near = _from_box(place, vehicle, _TOUCH_M)
+            if len(near):
+                place = place.copy()
+                place[near] += away * (_TOUCH_M - distance)[:, None]
+        return place
 
     def _lead(self, time_s: float, seconds: float) -> None:
         """The middles of the crowds go on."""
@@ -395,6 +408,27 @@ def _apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: floa
         push = away * (0.5 * short / distance)[:, None]
         place = place + _summed(push, first, len(place)) - _summed(push, second, len(place))
     return place
+
+
+def _from_box(place: np.ndarray, vehicle: np.ndarray, within_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, 2) ways off from a vehicle's sides, (n,) metres to them, below 0 inside, and (n,) rows of who is so near."""
+    east, north, course, length, width = vehicle
+    near = np.flatnonzero(np.abs(place - (east, north)).max(axis=1) < np.hypot(length, width) + within_m)
+    ahead = np.array([np.sin(course), np.cos(course)])
+    right = np.array([ahead[1], -ahead[0]])
+    to = place[near] - (east, north)
+    own = np.stack([to @ ahead, to @ right], axis=1)
+    beyond = np.abs(own) - (length, width)
+    outside = np.maximum(beyond, 0.0)
+    # Inside, out by the nearest side.
+    inside = (beyond < 0).all(axis=1)
+    outside[inside] = np.where(beyond[inside] == beyond[inside].max(axis=1, keepdims=True), 1e-9, 0.0)
+    size = np.maximum(np.hypot(*outside.T), 1e-12)
+    distance = np.where(inside, beyond.max(axis=1), size)
+    way = outside / size[:, None] * np.where(own < 0, -1.0, 1.0)
+    kept = distance < within_m
+    away = way[:, :1] * ahead + way[:, 1:] * right
+    return away[kept], distance[kept], near[kept]
 
 
 def _summed(values: np.ndarray, row: np.ndarray, count: int) -> np.ndarray:

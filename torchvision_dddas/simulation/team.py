@@ -8,15 +8,20 @@ import numpy as np
 
 from torchvision_dddas.simulation.obstacles import Obstacles, round_discs
 from torchvision_dddas.simulation.scenario import AircraftKnobs, TeamKnobs
+from torchvision_dddas.simulation.vehicles import UGV_LENGTH_M, UGV_WIDTH_M
 from torchvision_dddas.simulation.ways import Way
 from torchvision_dddas.types import Colours
 
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
-_ROOM_M = 2.0
-"""How far from another's middle they pass it."""
+UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)
+"""Half the length and half the width."""
+_APART_M, _ROOM_M = 2.1, 3.0
+"""How near another's middle they can be, and how far from it they mean to pass."""
 _LOOK_S = 0.25
 """Steps in which they think ahead."""
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
+_STOP_M = UGV_HALF_M[0] + 1.0
+"""They stop so far from those before them, middle to middle."""
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
 """gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring."""
 _HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
@@ -83,11 +88,11 @@ class Team:
         goal, most = self._goals(time_s)
         to = goal - self.place
         distance = np.hypot(*to.T)
-        arrived = distance < 0.3
+        arrived = self._there(goal, 0.3)
         # As fast as it can still brake.
         wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
         direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
-        direction = self._obstacles.steer(self.place, direction, 1.2)
+        direction = self._obstacles.steer(self.place, direction, 1.7)
         direction = self._round_one_another(direction)
         error = _wrapped(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
         turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
@@ -101,7 +106,8 @@ class Team:
         # A vehicle that is lost stands at once: its place is what the team knew last.
         self.speed = np.where(stopped, 0.0, self.speed)
         place = self.place + (seconds * self.speed)[:, None] * _ahead(self.course + turn * seconds / 2)
-        self.place = np.where(stopped[:, None], self.place, self._inside(self._obstacles.outside(place, 0.6)))
+        place = self._obstacles.outside(_kept_apart(place), 1.0)
+        self.place = np.where(stopped[:, None], self.place, self._inside(place))
         self.course = (self.course + turn * seconds) % (2 * np.pi)
         self._pan(seconds, stopped)
 
@@ -120,10 +126,10 @@ class Team:
         speed = np.full(len(self), knobs.patrol_m_s)
         if patrol == "random":
             goal = np.array([self._random(k, int(n)) for k, n in enumerate(self._passed)]).reshape(-1, 2)
-            there = np.hypot(*(goal - self.place).T) < 1.0
-            self._passed = self._passed + there
+            self._passed = self._passed + self._there(goal, 1.0)
         elif patrol == "gather":
-            goal = self._middle + min(_GATHERED_M, knobs.ring_m) * self._spoke
+            reach = max(_GATHERED_M, len(self) * _ROOM_M / 6)
+            goal = self._middle + min(reach, knobs.ring_m) * self._spoke
             far = np.hypot(*(goal - self.place).T) > _NEAR_M
             speed = np.where(far, _FAST * speed, speed)
         elif patrol == "along":
@@ -136,6 +142,13 @@ class Team:
         sent = np.isfinite(self._ordered[:, 0])
         goal = np.where(sent[:, None], self._ordered, goal)
         return self._inside(goal), np.where(sent, self._ordered_speed, speed)
+
+    def _there(self, goal: np.ndarray, within_m: float) -> np.ndarray:
+        """(K,) who is at the goal; as near as another lets come who stands there is near enough."""
+        distance = np.hypot(*(goal - self.place).T)
+        taken = np.linalg.norm(goal[:, None] - self.place, axis=2) < _ROOM_M
+        np.fill_diagonal(taken, False)
+        return (distance < within_m) | (taken.any(axis=1) & (distance < 1.5 * _ROOM_M))
 
     def _random(self, k: int, n: int) -> np.ndarray:
         """(2,) the n-th place of a vehicle within the ring."""
@@ -160,10 +173,10 @@ class Team:
         to = others[None] - self.place[:, None]
         along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
         aside = np.abs(ahead[:, None, 1] * to[..., 0] - ahead[:, None, 0] * to[..., 1])
-        blocks = (along > 0) & (aside < 1.0)
+        blocks = (along > 0) & (aside < UGV_HALF_M[1] + 0.3)
         blocks[:, len(people) :] &= np.tri(count, k=-1, dtype=bool)
         room = np.where(blocks, along, np.inf).min(axis=1)
-        return np.sqrt(2 * ACCELERATION_M_S2 * np.maximum(room - 1.8, 0))
+        return np.sqrt(2 * ACCELERATION_M_S2 * np.maximum(room - _STOP_M, 0))
 
     def _pan(self, seconds: float, stopped: np.ndarray) -> None:
         to = self._look_at - self.place
@@ -175,6 +188,14 @@ class Team:
     def _inside(self, place: np.ndarray) -> np.ndarray:
         edge = self._half - min(3.0, self._half / 4)
         return place.clip(-edge, edge)
+
+
+def _kept_apart(place: np.ndarray) -> np.ndarray:
+    """(K, 2) places, those that are nearer than two vehicles can be moved half the way apart each."""
+    away = place[:, None] - place
+    distance = np.hypot(away[..., 0], away[..., 1]) + 1e9 * np.eye(len(place))
+    short = 0.5 * np.maximum(_APART_M - distance, 0) / np.maximum(distance, 1e-6)
+    return place + (short[..., None] * away).sum(axis=1) if short.any() else place
 
 
 def _ahead(course: np.ndarray) -> np.ndarray:
