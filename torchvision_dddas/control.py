@@ -16,6 +16,9 @@ _ALTITUDE_STEP = 0.2
 # Between two looks a target moves by this share of its size at most.
 _MOVED_SHARE = 0.5
 
+# How fast people walk.
+_WALKER_M_S = 1.4
+
 # Landmarks count as well detected again once they are slower than this share of the speed at which they are not.
 _CALM = 0.8
 # Others are taken for the landmarks in use once they are spread better by this factor.
@@ -82,6 +85,11 @@ def every_wanted(
     return max(float(np.floor(frames[tightest])), 1.0), f"; a target of {size:.1f} m goes at {speed:.1f} m/s"
 
 
+def every_least(pixels_per_metre: float, rate_hz: float, knobs: SteeringKnobs) -> float:
+    """Of how many frames one is worth a look at the least: between two looks a walker must move far enough to show."""
+    return knobs.least_move_px * rate_hz / (_WALKER_M_S * pixels_per_metre)
+
+
 def sampled(frame: int, now: int, wanted: float, why: str, knobs: SteeringKnobs) -> tuple[int, tuple[Adjustment, ...]]:
     """Of how many frames one is looked at from here on, and the record of its change, if any; steady as `adjusted`."""
     new = int(np.clip(round(min(wanted, 1e6)), 1, knobs.maximum_every))
@@ -117,7 +125,7 @@ class Regime:
 def regime_at(altitude_m: float, rate_hz: float, base: Settings) -> Regime:
     """The regime for an altitude above ground: e = expected_size_m x focal / altitude pixels is what a target measures.
 
-    Gaps of close_m, where it is set, are closed, as far as close_px goes: a kernel in pixels joins ever more from above.
+    Gaps of close_m, where it is set, are closed, as far as close_px goes: in pixels it would join ever more from above.
     The smallest area is expected_share x e^2, between the small path's and the one in the settings. The small path is
     on while e^2 is within its largest box: larger targets show without it.
     """

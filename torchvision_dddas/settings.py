@@ -598,6 +598,9 @@ class SteeringKnobs(Group):
     sampling_share: float = knob(
         0.5, "-", 0.01, 10, meaning="k as a share of the interval that the rule gives before its bounds"
     )
+    least_move_px: float = knob(
+        1.5, "px", 0, 100, meaning="k is large enough for a walker to move by this from look to look: less hardly shows"
+    )
     maximum_every: int = knob(5, "frames", 1, 60, meaning="largest k, however slow the scene")
     follow: bool = knob(True, "-", meaning="the aerial vehicle keeps the crowds in view; false: it flies as planned")
     look: bool = knob(True, "-", meaning="ground vehicles go where targets need a closer look; false: as planned")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.control import every_wanted, interval_from_flow, interval_from_telemetry, sampled
+from torchvision_dddas.control import every_least, every_wanted, interval_from_flow, interval_from_telemetry, sampled
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.steering.follow import Follow
 from torchvision_dddas.steering.footprint import Stand, inside, looked_at, stand_of
@@ -119,6 +119,8 @@ class Steering:
                 wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], knobs
             )
             why += limit
+        if flight is not None and flight.altitude_m > 0:
+            wanted = max(wanted, every_least(self.camera.focal_px[0] / flight.altitude_m, self.rate_hz, knobs))
         every, made = sampled(frame, self._every, wanted, why, knobs)
         if every > self._every and now_s - self._sampled_s < _CALM_S:
             return
