@@ -40,7 +40,8 @@ def open_source(
         return VideoSource(text, text, rate_hz)
     if not text:
         raise InputError(
-            "the input's name is empty; wanted a video file, a folder or glob of images, camera:0, rtsp://..."
+            "the input's name is empty; wanted a video file, a folder or glob of images, camera:0, rtsp://..., "
+            "sim:SCENARIO"
         )
     path = Path(text)
     if path.is_dir():
@@ -55,4 +56,6 @@ def open_source(
         return VideoSource(text, text, rate_hz)
     if any(sign in text for sign in "*?["):
         return ImageSource(images_of_glob(text), text, rate_hz or 10.0, full_scale)
-    raise InputError(f"{path} does not exist; wanted a video file, a folder or glob of images, camera:0 or rtsp://...")
+    raise InputError(
+        f"{path} does not exist; wanted a video file, a folder or glob of images, camera:0, rtsp://... or sim:NAME"
+    )
