@@ -38,8 +38,8 @@ def check_way(knobs: AircraftKnobs, world: World) -> None:
         part, aim = divmod(int(over.argmin()), over.shape[1])
         raise InputError(
             f"uav.altitude_m = {knobs.altitude_m:g} is below the terrain that it looks over: at "
-            f"{_at(rays[part, aim])} the ground is {-over[part, aim]:.1f} m above its line of sight; fly higher, or look down "
-            f"more steeply than uav.pitch_deg = {knobs.pitch_deg:g}"
+            f"{_at(rays[part, aim])} the ground is {-over[part, aim]:.1f} m above its line of sight; fly "
+            f"higher, or look down more steeply than uav.pitch_deg = {knobs.pitch_deg:g}"
         )
 
 
