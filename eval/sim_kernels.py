@@ -25,6 +25,9 @@ from torchvision_dddas.types import Followed, Surveyed, Tracks
 from torchvision_dddas.vision import load
 
 KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}
+FIXED: dict[str, Case] = {"morphology.erode_px": {}, "morphology.close_px": {"morphology.close_m": 0.0}}
+"""What is set beside a kernel: a closing in metres would hide that in pixels."""
+
 SKIPPED = 10
 """Frames at the beginning that do not count: there is no past yet."""
 
@@ -41,7 +44,7 @@ def work(case: Case) -> Case:
     found = {}
     for knob, sizes in KERNELS.items():
         for size in sizes:
-            settings = usual(source, {"crowds.join_m": 0.0, **case["set"], knob: size})
+            settings = usual(source, {"crowds.join_m": 0.0, **FIXED[knob], **case["set"], knob: size})
             pixels, scorer = segmentation.Pixels(), CrowdScorer()
             for scene in run(clip, load("onboard", settings), settings, clip.log):
                 number = scene.frame.number

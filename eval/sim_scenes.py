@@ -1,22 +1,25 @@
 """One simulated clip, drawn and searched for what moves once, and located in several ways: what the studies share."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, site_of
 from torchvision_dddas.metrics.crowd_frames import shown
-from torchvision_dddas.metrics.crowds import CrowdScore, CrowdScorer
+from torchvision_dddas.metrics.crowds import CrowdScorer
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.settings import load as load_settings
+from torchvision_dddas.simulation.camera import view_of
 from torchvision_dddas.simulation.receiver import Receivers
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
 from torchvision_dddas.sources.simulator import SimulatorSource
 from torchvision_dddas.targets import geodesy
-from torchvision_dddas.types import Colours, Elevation, Followed, Frame, Landmarks, Scene, Surveyed, Tracks, Truth
+from torchvision_dddas.types import Colours, Elevation, Fix, Followed, Frame, Landmarks, Scene, Surveyed, Tracks, Truth
 from torchvision_dddas.vision import load, load_colours, load_solver
 
 CONFIG = "patrol"
@@ -72,8 +75,12 @@ class Eye:
         origin = source.scenario.world.origin_deg
         self._local = partial(geodesy.east_north, origin_deg=origin)
 
-    def step(self, scene: Scene, scorer: CrowdScorer) -> None:
-        """Locate the targets of the next scene; the truth of its frame has been fed to the scorer."""
+    def step(self, scene: Scene, scorer: CrowdScorer, truth: Truth | None = None) -> float:
+        """Locate the targets of the next scene; the truth of its frame has been fed to the scorer.
+
+        Returns how far off the picture itself lies on the ground, where crowds truly are: the mean over them of the
+        distance to where the pixel of their middle is laid, m; NaN where that is not known.
+        """
         site = self._site()
         if self._watch is None:
             self._watch = self._made(site)
@@ -90,6 +97,21 @@ class Eye:
         grounded = locator.ground(watched.look, targets)
         tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
         scorer.feed(Surveyed(Followed(scene.frame.number, scene.frame, found, tracks), grounded, watched.sighted_by))
+        return math.nan if truth is None else self._astray(truth, locator, watched.look.fix)
+
+    def _astray(self, truth: Truth, locator: Locator, fix: Fix) -> float:
+        bodies = truth.bodies
+        crowds = [bodies.target == number for number in np.unique(bodies.target[bodies.kind == "person"])]
+        middle = np.array([bodies.place_m[rows].mean(axis=0) for rows in crowds])
+        pixel = view_of(truth.pose, self._source.camera).project(middle)
+        width, height = self._source.size
+        inside = ((pixel >= 0) & (pixel <= (width - 1, height - 1))).all(axis=1)
+        if not fix.by or not inside.any():
+            return math.nan
+        origin = locator.site.origin_deg
+        assert origin is not None
+        laid = self._local(geodesy.lonlat(locator.places(fix, pixel[inside]), origin))
+        return float(np.linalg.norm(laid - middle[inside, :2], axis=1).mean())
 
     def scorer(self) -> CrowdScorer:
         """A new one in the truth's metres."""
@@ -150,19 +172,35 @@ def _errors(scenario: Scenario, gps95_m: float, count: int, frames: int) -> np.n
     return np.array(errors).reshape(frames, count, 2)
 
 
-def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = ()) -> dict[str, list[CrowdScore]]:
-    """The scores of each way, by its name: one for each part of the clip. parts_s: where later parts begin."""
+def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = ()) -> dict[str, list[dict[str, Any]]]:
+    """The scores of each way, by its name: one for each part of the clip. parts_s: where later parts begin.
+
+    A score is CrowdScore's figures by name, and picture_m: how far off the picture lies on the ground, see Eye.step.
+    """
     source = SimulatorSource(scenario)
     finder = OnceAFrame(source.colours)
     eyes = {way.name: Eye(source, way, finder) for way in ways}
     edges = [*parts_s, np.inf]
     scorers = {name: [eye.scorer() for _ in edges] for name, eye in eyes.items()}
-    vision = load("onboard", usual(source))
-    for scene in with_truth(source, run(source, vision, usual(source)), scorers):
-        part = int(np.searchsorted(edges, scene.frame.time_s, side="right"))
+    astray: dict[str, list[list[float]]] = {name: [[] for _ in edges] for name in eyes}
+    truths: dict[int, Truth] = {}
+    settings = usual(source)
+    for scene in run(source, load("onboard", settings), settings):
+        truths |= {truth.frame: truth for truth in source.truths()}
+        truth = truths.pop(scene.frame.number, None)
+        if truth is None:
+            continue
+        true, part = shown(truth), int(np.searchsorted(edges, scene.frame.time_s, side="right"))
         for name, eye in eyes.items():
-            eye.step(scene, scorers[name][part])
-    return {name: [scorer.score() for scorer in parts] for name, parts in scorers.items()}
+            scorers[name][part].feed(true)
+            astray[name][part].append(eye.step(scene, scorers[name][part], truth))
+    return {
+        name: [
+            {**scorer.score().by_name(), "picture_m": float(np.nanmean(off)) if np.isfinite(off).any() else None}
+            for scorer, off in zip(parts, astray[name], strict=True)
+        ]
+        for name, parts in scorers.items()
+    }
 
 
 def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
@@ -193,19 +231,6 @@ def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str
     for name, knobs in tables.items():
         usual_tables[name] = {**usual_tables.get(name, {}), **knobs}
     return Scenario.model_validate({"seed": seed, "crowd": tuple(crowds), "car": (car,), **usual_tables})
-
-
-def with_truth(
-    source: SimulatorSource, scenes: Iterator[Scene], scorers: dict[str, list[CrowdScorer]]
-) -> Iterator[Scene]:
-    """The scenes, after the truth of their frames was fed to all scorers."""
-    for scene in scenes:
-        for truth in source.truths():
-            true = shown(truth)
-            for parts in scorers.values():
-                for scorer in parts:
-                    scorer.feed(true)
-        yield scene
 
 
 class Kept:
