@@ -15,6 +15,7 @@ from torchvision_dddas.simulation.world import World
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _REACH_M = 5.0  # a body with its shadow reaches about so far
 _TALLEST_M = 2.5
+_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # canvases are enlarged so many times for bodies of these sizes
 _CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
 _HIDDEN_M = 0.35  # what stands must be higher than a limb by so much to hide it
 _SIGHTS = 12  # places on the line of sight at which a hill may hide a body
@@ -58,13 +59,13 @@ class Painter:
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
         shadows = Outlines(*(column[in_sun[shadows.body]] for column in shadows))
-        self._shade(picture, Sheets(shadows, float(scale.max()), targets.shape), rise_m)
+        self._shade(picture, Sheets(shadows, targets.shape), rise_m)
         ways = self._own_ways(moment, rows)
-        sheets = Sheets(solids, float(scale.max()), targets.shape)
-        for body, at, canvas in sheets.drawn():
-            hide(canvas, sheets.step, rise_m, at)
-            cover = _averaged(_covered(canvas), sheets.step)
-            paint = _averaged(canvas, sheets.step)[..., :3]
+        sheets = Sheets(solids, targets.shape)
+        for body, at, canvas, step in sheets.drawn():
+            hide(canvas, step, rise_m, at)
+            cover = _averaged(_covered(canvas), step)
+            paint = _averaged(canvas, step)[..., :3]
             mine = cover >= 128
             targets[at][mine] = bodies.target[body]
             numbers[at][mine] = bodies.number[body]
@@ -115,9 +116,9 @@ class Painter:
         """Darken a picture where shadows lie; where two lie on each other it is as dark as under one."""
         layer = np.zeros(picture.shape[:2], np.uint8)
         places = []
-        for _, at, canvas in sheets.drawn():
-            hide(canvas, sheets.step, rise_m, at)
-            cover = _averaged(_covered(canvas), sheets.step)
+        for _, at, canvas, step in sheets.drawn():
+            hide(canvas, step, rise_m, at)
+            cover = _averaged(_covered(canvas), step)
             layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
             places.append(at)
         share = 1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)
@@ -130,16 +131,15 @@ class Painter:
 
 
 class Sheets:
-    """Draws the outlines of each body on a canvas of its own, enlarged step times."""
+    """Draws the outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
 
-    def __init__(self, outlines: Outlines, scale_px_m: float, shape: tuple[int, ...]) -> None:
+    def __init__(self, outlines: Outlines, shape: tuple[int, ...]) -> None:
         self._outlines = outlines
-        self.step = 8 if scale_px_m < 8 else 4 if scale_px_m < 40 else 2
         self._limit = np.array(shape[1::-1])
 
-    def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray]]:
-        """Each body, where it is in the picture, and its canvas (h * step, w * step, 4): colour and height."""
-        outlines, step = self._outlines, self.step
+    def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray, int]]:
+        """Each body, where it is in the picture, its canvas (h * step, w * step, 4), colour and height, and the step."""
+        outlines = self._outlines
         if not len(outlines.body):
             return
         runs = outlines.runs
@@ -147,17 +147,19 @@ class Sheets:
         low = np.floor(np.minimum.reduceat(outlines.points_px.min(axis=1), first)).astype(int) - 1
         high = np.ceil(np.maximum.reduceat(outlines.points_px.max(axis=1), first)).astype(int) + 2
         low, high = np.maximum(low, 0), np.minimum(high, self._limit)
-        start = low.repeat(np.diff([*first, len(outlines.body)]), axis=0)[:, None]
-        fixed = np.round(((outlines.points_px - start + 0.5) * step - 0.5) * 2**_BITS)
+        steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
+        each = np.diff([*first, len(outlines.body)])
+        start, step_of = low.repeat(each, axis=0)[:, None], steps.repeat(each)[:, None, None]
+        fixed = np.round(((outlines.points_px - start + 0.5) * step_of - 0.5) * 2**_BITS)
         fixed = np.clip(fixed, -(2**26), 2**26).astype(np.int32)
         code = np.clip(1 + outlines.up_m * _CODES, 1, 255)
         colours = np.c_[np.clip(outlines.colour, 0, 255), code].tolist()
         for k in np.flatnonzero((high > low).all(axis=1)):
-            (x, y), (right, foot) = low[k].tolist(), high[k].tolist()
+            (x, y), (right, foot), step = low[k].tolist(), high[k].tolist(), int(steps[k])
             canvas = np.zeros(((foot - y) * step, (right - x) * step, 4), np.uint8)
             for row in range(*runs[k]):
                 cv2.fillConvexPoly(canvas, fixed[row], colours[row], cv2.LINE_8, _BITS)
-            yield int(outlines.body[runs[k][0]]), (slice(y, foot), slice(x, right)), canvas
+            yield int(outlines.body[runs[k][0]]), (slice(y, foot), slice(x, right)), canvas, step
 
 
 def hide(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[slice, slice]) -> None:

@@ -17,6 +17,7 @@ _VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast
 _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
 _GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
 _GRAIN_TILES = 6
+_FLAT_PX, _LOW_M = 0.8, 1.4
 _LEAST_M, _MOST_LEAN = 1.0, 8.0  # below the camera; lines of sight further from upright are taken to lean so much
 
 
@@ -82,6 +83,8 @@ class Terrain:
         sights = _sights(place.reshape(-1, 2), start, up, pixel_m.ravel())
         longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
         top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
+        # Low things that lean by less than a pixel may lie flat.
+        top[(top * sights.lean < _FLAT_PX * sights.pixel_m) & (top < _LOW_M)] = 0
         return self._risen(lie, moment, sights, up, top, bottom) if top.any() else lie
 
     def _risen(
