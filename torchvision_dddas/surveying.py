@@ -4,9 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from torchvision_dddas.following import follow_scenes
+from torchvision_dddas import following, run
 from torchvision_dddas.geolocating import Locator, Targets, Watch, Watched, gathered
-from torchvision_dddas.run import run as scenes_of
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.sources.source import Source
 from torchvision_dddas.targets import geodesy
@@ -34,7 +33,7 @@ def survey(
     waiting: dict[int, Watched] = {}
 
     def scenes() -> Iterator[Scene]:
-        for scene in scenes_of(source, vision, settings, telemetry):
+        for scene in run.run(source, vision, settings, telemetry):
             if watch is None:
                 yield scene
                 continue
@@ -44,7 +43,7 @@ def survey(
             waiting[scene.frame.number] = watched
             yield watched.scene
 
-    for followed in follow_scenes(scenes(), settings, interval, source.size):
+    for followed in following.follow_scenes(scenes(), settings, interval, source.size):
         if watch is None:
             yield Surveyed(followed)
             continue

@@ -79,7 +79,9 @@ def fly_into(
         from torchvision_dddas.vision import load as load_vision
 
         simulated: SimulatorSource = open_scenario(scenario, scene, seed)
-        settings = load(config or CONFIG, overrides, settings_of(simulated.scenario))
+        own = settings_of(simulated.scenario)
+        own.setdefault("landmarks.common_sigma_m", simulated.scenario.gps.common_m)
+        settings = load(config or CONFIG, overrides, own)
         source: Any = Begun(simulated)
         mission = mission_of(source, settings, backend)
         vision = load_vision(backend, mission.settings)
@@ -91,6 +93,8 @@ def fly_into(
                 for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
                     for truth in simulated.truths():
                         scorer.feed(truth)
+                        for event in truth.events:
+                            output.event(truth.frame, event, truth.time_s)
                     scorer.feed(surveyed)
                     output.survey(surveyed)
                     for _ in range(surveyed.followed.number - done):
@@ -98,8 +102,10 @@ def fly_into(
                     done = surveyed.followed.number
         finally:
             journal.problems += [str(problem) for problem in simulated.problems]
+            for problem in simulated.problems:
+                output.event(problem.frame, str(problem), kind="problem")
         score = scorer.score()
-        journal.counts["against_truth"] = score.by_name()
+        output.scored(score.by_name(), score.lines())
     return journal, score
 
 
