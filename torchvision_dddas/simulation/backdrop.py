@@ -118,11 +118,12 @@ class Backdrop:
             for grain in _GRAIN_M:
                 strength = np.clip(1.3 - along[part] / (6 * grain), 0, 1).astype(np.float32)
                 if strength.max() > 0:
+                    near = slice(int(np.argmax(strength > 0)), None)  # farther rows are above
                     # Beyond 16 bits OpenCV would lose count of the tiles.
-                    u, v = (np.mod(c[part] / np.float32(grain), np.float32(_TILE)) for c in (x, y))
+                    u, v = (np.mod(c[part][near] / np.float32(grain), np.float32(_TILE)) for c in (x, y))
                     pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-                    pebbles = 1 + strength[:, None] * pebbles
-                    fine = cv2.multiply(fine, cv2.merge([pebbles] * 3))
+                    pebbles = 1 + strength[near, None] * pebbles
+                    fine[near] = cv2.multiply(fine[near], cv2.merge([pebbles] * 3))
             share = clear[part, None, None]
             image[part] = np.clip(fine * share + HAZE * (1 - share), 0, 255)
         return image
