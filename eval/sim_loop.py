@@ -180,9 +180,7 @@ def draw(found: dict[str, list[Case]], path: Path) -> None:
     """Merit against time, all settings in one plot: all time, and the aerial camera's."""
     plt = pyplot()
     figure, axes = plt.subplots(1, 2, figsize=(11.5, 5.2), constrained_layout=True, sharey=True)
-    for axis, key, title in zip(
-        axes, ("time", "aerial"), ("all stages", "the aerial camera's stages alone"), strict=True
-    ):
+    for axis, key, title in zip(axes, ("time", "aerial"), ("all", "without people seen from the ground"), strict=True):
         front = []
         for name, results in found.items():
             of = figures(results)
@@ -205,7 +203,9 @@ def draw(found: dict[str, list[Case]], path: Path) -> None:
         if line:
             right = axis.get_xlim()[1]
             axis.plot(*np.array([*line, (right, best)]).T, color="#d9730d", lw=1, alpha=0.6, label="best open loop")
-        axis.set(xlabel=f"processing time, s for each second of the clip: {title}", xlim=(0, None), ylim=(0, None))
+        axis.set(xlabel=f"processing time, s for each second of the clip: {title}", xlim=(0, None))
+    top = max(figures(results)["knowledge"].mean for results in found.values())
+    axes[0].set_ylim(0, 1.12 * top if top > 0 else None)
     axes[0].set_ylabel("what is known of all crowds at all times: m off")
     axes[0].plot([], [], "*", color="#0b6e99", ms=12, label="closed loop")
     axes[0].plot([], [], "o", color="#d9730d", label="open loops")
