@@ -138,7 +138,7 @@ class Sheets:
         self._limit = np.array(shape[1::-1])
 
     def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray, int]]:
-        """Each body, where it is in the picture, its canvas (h * step, w * step, 4), colour and height, and the step."""
+        """Each body, where it is in the picture, its canvas (h * step, w * step, 4), and the step."""
         outlines = self._outlines
         if not len(outlines.body):
             return
