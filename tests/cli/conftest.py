@@ -38,9 +38,13 @@ def stub_engine(found=True, after=None):
 
 @pytest.fixture
 def engine(monkeypatch):
+    from torchvision_dddas import surveying
+
     def install(**how):
-        for name, module in stub_engine(**how).items():
+        stubs = stub_engine(**how)
+        for name, module in stubs.items():
             monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setattr(surveying, "run", stubs["torchvision_dddas.run"])
 
     install()
     return install
