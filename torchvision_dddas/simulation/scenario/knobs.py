@@ -132,7 +132,7 @@ class CameraKnobs(Group):
     shot_noise: float = knob(0.015, "-", 0, 10, meaning="variance of the noise, in grey levels, for each grey level")
     read_noise: float = knob(0.6, "grey levels", 0, 50, meaning="standard deviation of the noise in the dark")
     drift: float = knob(0.03, "-", 0, 0.5, meaning="amplitude of slow changes of exposure, as a share")
-    quality: int = knob(92, "-", 10, 100, meaning="of the JPEG compression; 100: none")
+    quality: int = knob(75, "-", 10, 100, meaning="of the JPEG compression; 100: none")
 
 
 class Fault(Group):
