@@ -36,7 +36,8 @@ class Shown:
     """What a frame truly shows, without its picture.
 
     u, v: (P,) the pixels of all that can move; body: (P,) whose they are, a row of the bodies, -1 for none.
-    number, target: (N,) int64; kind: (N,); place_m, velocity_m_s: (N, 2), as in Bodies. pixels: (N,) that show each.
+    number, target: (N,) int64; kind: (N,); place_m, velocity_m_s: (N, 2), as in Bodies. pixels: (N,) that show each;
+    low_px, high_px: (N, 2) the first and the last column and row of them.
     """
 
     frame: int
@@ -50,6 +51,8 @@ class Shown:
     place_m: np.ndarray
     velocity_m_s: np.ndarray
     pixels: np.ndarray
+    low_px: np.ndarray
+    high_px: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -95,13 +98,17 @@ class Crowd:
 def shown(truth: Truth) -> Shown:
     """What of a frame's truth is needed here: some kilobytes."""
     bodies = truth.bodies
-    v, u = np.nonzero((truth.mask > 0) | (truth.people > 0))
+    v, u = np.divmod(np.flatnonzero((truth.mask | truth.people).ravel()), truth.mask.shape[1])
     order = np.argsort(bodies.number)
     wanted = truth.people[v, u].astype(np.int64)
     at = np.searchsorted(bodies.number[order], wanted).clip(max=max(len(bodies) - 1, 0))
     body = order[at] if len(bodies) else np.zeros(len(u), np.int64)
     body = np.where(bodies.number[body] == wanted, body, -1) if len(bodies) else np.full(len(u), -1)
     pixels = np.bincount(body[body >= 0], minlength=len(bodies))
+    low, high = np.full((len(bodies), 2), np.inf), np.full((len(bodies), 2), -np.inf)
+    known, at_px = body[body >= 0], np.stack([u, v], axis=1)[body >= 0].astype(float)
+    np.minimum.at(low, known, at_px)
+    np.maximum.at(high, known, at_px)
     return Shown(
         truth.frame,
         truth.time_s,
@@ -114,6 +121,8 @@ def shown(truth: Truth) -> Shown:
         np.asarray(bodies.place_m, float)[:, :2],
         np.asarray(bodies.velocity_m_s, float)[:, :2],
         pixels,
+        low,
+        high,
     )
 
 
@@ -134,12 +143,11 @@ def crowds(frame: Shown, least_visible: float = LEAST_VISIBLE) -> list[Crowd]:
 
 
 def box_about(frame: Shown, bodies: np.ndarray) -> np.ndarray:
-    """(4,) the box about the pixels of some bodies; NaN where none shows."""
-    mine = np.isin(frame.body, bodies)
-    if not mine.any():
+    """(4,) the box about the pixels of some bodies, rows of them; NaN where none shows."""
+    visible = bodies[frame.pixels[bodies] > 0]
+    if not len(visible):
         return np.full(4, np.nan)
-    low = np.array([frame.u[mine].min(), frame.v[mine].min()], float)
-    high = np.array([frame.u[mine].max(), frame.v[mine].max()], float)
+    low, high = frame.low_px[visible].min(axis=0), frame.high_px[visible].max(axis=0)
     return np.concatenate([low, high - low + 1])
 
 
