@@ -5,6 +5,7 @@ Boxes are x, y of the top left pixel, width, height; a pixel is in a box that ho
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.types import Truth
@@ -98,7 +99,8 @@ class Crowd:
 def shown(truth: Truth) -> Shown:
     """What of a frame's truth is needed here: some kilobytes."""
     bodies = truth.bodies
-    v, u = np.divmod(np.flatnonzero((truth.mask | truth.people).ravel()), truth.mask.shape[1])
+    there = cv2.findNonZero(truth.mask | truth.people)  # a third of np.nonzero's time
+    u, v = np.zeros((2, 0), np.int32) if there is None else there[:, 0].T
     order = np.argsort(bodies.number)
     wanted = truth.people[v, u].astype(np.int64)
     at = np.searchsorted(bodies.number[order], wanted).clip(max=max(len(bodies) - 1, 0))
