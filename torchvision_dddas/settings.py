@@ -558,6 +558,13 @@ class AerialKnobs(Group):
         meaning="which point of a box is on the ground: its centre; the foot of a body whose middle is the centre; "
         "auto: the feet that the table names, the foot for tables of dddas, else the centre",
     )
+    shadows: bool = knob(
+        False, "-", meaning="what moves is a body and its shadow: the foot is sought by where the sun stands"
+    )
+    sun_azimuth_deg: float = knob(0.0, "deg", 0, 360, meaning="where the sun stands, clockwise from north")
+    sun_height_deg: float = knob(
+        0.0, "deg", 0, 90, meaning="how high above the horizon; 0: by the telemetry's clock, no shadows without one"
+    )
     target_height_m: float = knob(1.7, "m", 0, 100, meaning="height of the body whose foot is sought")
     gate_probability: float = knob(
         0.999, "-", 0.5, 0.999999, meaning="share of right landmarks that pass the test against what is expected"

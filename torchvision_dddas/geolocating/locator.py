@@ -18,6 +18,7 @@ from torchvision_dddas.targets.elevation import surface, up
 from torchvision_dddas.targets.metres import Movers
 from torchvision_dddas.targets.plane import absolute, ground_points
 from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.targets.sun import feet_below, shadow_m, sun_at
 from torchvision_dddas.types import Adjustment, Camera, Fix, Flight, Grounded, Marks, Positions
 from torchvision_dddas.vision.protocol import PlaneSolver
 
@@ -154,11 +155,33 @@ class Locator:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
         knobs = self.settings.aerial
         pixels, lift = points_of(targets, knobs, fix.pose is not None)
+        sun = self._sun(self.time_s(fix.frame)) if knobs.shadows and targets.bodies and lift.any() else None
+        if sun is not None and fix.pose is not None:
+            pixels, lift = self._feet(pixels, fix, sun), np.zeros(len(pixels))
         place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
         _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
         variance = sigma_of(targets, knobs) ** 2
         own = (by_pixel - shared) * variance[:, None, None]
         return place, shared + own, own
+
+    def _sun(self, time_s: float) -> tuple[float, float] | None:
+        """Where the sun stands, azimuth and height, rad; None where nothing tells, and at night."""
+        knobs, site = self.settings.aerial, self.site
+        if knobs.sun_height_deg > 0:
+            return math.radians(knobs.sun_azimuth_deg), math.radians(knobs.sun_height_deg)
+        sun = site.sun_rad
+        if sun is None and site.origin_deg is not None and site.telemetry is not None:
+            start = site.telemetry.start_utc_s
+            sun = sun_at(*site.origin_deg, start + time_s) if math.isfinite(start) else None
+        return sun if sun is not None and sun[1] > 0 else None
+
+    def _feet(self, pixels: np.ndarray, fix: Fix, sun: tuple[float, float]) -> np.ndarray:
+        """Pixels (N, 2) of the feet of bodies that are seen together with their shadows."""
+        assert fix.pose is not None
+        near = self.places(fix, pixels)
+        up_m = np.zeros(len(near)) if self._ground is None else self._ground(near)
+        height = self.settings.aerial.target_height_m
+        return feet_below(pixels, np.c_[near, up_m], fix.pose, self.camera, height, shadow_m(sun, height))
 
     def _standing(self, marks: Marks) -> Marks:
         if self._ground is None or not len(marks):

@@ -26,13 +26,15 @@ FARTHEST_M = 100_000.0
 class Site:
     """Landmarks and telemetry in the same local metres, east and north of origin_deg.
 
-    origin_deg: (longitude, latitude); None where all is in local metres from the start.
+    origin_deg: (longitude, latitude); None where all is in local metres from the start. sun_rad: azimuth and height of
+    the sun where that is known beside the telemetry's clock.
     """
 
     landmarks: Landmarks
     telemetry: Telemetry | None
     origin_deg: tuple[float, float] | None
     elevation: Elevation | None = None
+    sun_rad: tuple[float, float] | None = None
 
     @property
     def places(self) -> np.ndarray:

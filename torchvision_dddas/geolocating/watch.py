@@ -7,12 +7,19 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geolocating.locator import Locator, Look
-from torchvision_dddas.targets.landmarks import LandmarkFollower
+from torchvision_dddas.targets.cutting import cut_out
+from torchvision_dddas.targets.landmarks import LandmarkFollower, Sighted
 from torchvision_dddas.targets.plane import LEAST
 from torchvision_dddas.targets.projection import bent, project
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
 from torchvision_dddas.vision.protocol import ColourFinder
+
+REACH = 0.6
+"""How far from its colour a vehicle reaches, in its lengths: its corners, and some of its shadow."""
+
+LEAST_M2 = 0.4
+"""What is left of a blob beside a vehicle is a target from so much ground on: a person with a shadow."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +77,22 @@ class Watch:
         frame = scene.frame.number
         marks = self.locator.marks(frame)
         if self._follower is not None:
-            marks, rows, by = self._found(scene, marks)
+            marks, scene, by = self._found(scene, marks)
         else:
-            rows, by = _holding(scene.detections.box_px, marks.image_px), ("table",) * len(marks)
+            by = ("table",) * len(marks)
+            scene = _without(scene, _holding(scene.detections.box_px, marks.image_px))
         spent = time.perf_counter() - start
         look = self.locator.look(frame, marks)
         self._fix = look.fix
         used = dict(zip(marks.landmark.tolist(), by, strict=True))
         return Watched(
-            _without(scene, rows),
+            scene,
             replace(look, seconds={"landmarks": spent, **look.seconds}),
             tuple(used[which] for which in look.marks.landmark.tolist()),
         )
 
-    def _found(self, scene: Scene, marks: Marks) -> tuple[Marks, np.ndarray, tuple[str, ...]]:
-        """The landmarks with their places in the picture, which detections are landmarks, and by what each was seen."""
+    def _found(self, scene: Scene, marks: Marks) -> tuple[Marks, Scene, tuple[str, ...]]:
+        """The landmarks with their places in the picture, the scene without them, and by what each was seen."""
         assert self._follower is not None
         assert self._finder is not None
         assert self._colours is not None
@@ -109,7 +117,17 @@ class Watch:
                 pixels[row], by[row] = seen.image_px[k], seen.by[k]
                 if by[row] == "motion" and _astray(pixels[row], seen.colour_px[k], expected[k], marks.pixel_sigma[row]):
                     pixels[row], by[row] = seen.colour_px[k], "colour"
-        return replace(marks, image_px=pixels), seen.rows, tuple(by)
+        return replace(marks, image_px=pixels), self._cut(scene, seen, length), tuple(by)
+
+    def _cut(self, scene: Scene, seen: Sighted, length_px: np.ndarray) -> Scene:
+        """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
+        knobs = self.locator.settings.landmarks
+        if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
+            return _without(scene, seen.rows)
+        metre = np.nanmedian(length_px) / knobs.length_m if np.isfinite(length_px).any() else np.nan
+        least = max(self.locator.settings.small.min_area_px, LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
+        found, mask = cut_out(scene.detections, scene.mask, seen.rows, seen.colour_px, REACH * length_px, least)
+        return replace(scene, detections=found, mask=mask)
 
     def _expected(self, marks: Marks, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(n, 2) where the landmarks should be, by how the frame before lay on the ground, and (n,) pixels a metre.

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 from torchvision_dddas.confirming import confirmed_by
+from torchvision_dddas.mission.expected import expected_regions
 from torchvision_dddas.recognizing import people_in
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.targets import geodesy
@@ -46,10 +47,20 @@ class CloserLook:
 
     def _look(self, picture: GroundPicture, grounded: Grounded, extent_m: np.ndarray) -> Look:
         settings, camera, positions = self._settings, picture.camera, grounded.positions
-        (people,) = people_in([picture.image], self._recognizer, settings.people)
         place = np.array([camera.place], float)
         if positions.origin_deg is not None:
             place = geodesy.east_north(place, positions.origin_deg)
+        # What is known from the air tells where to look, and how large people are there.
+        regions = expected_regions(
+            positions.east_north_m,
+            positions.covariance_m2,
+            extent_m,
+            camera,
+            place[0],
+            camera.heading_rad,
+            settings.ground,
+        )
+        (people,) = people_in([picture.image], self._recognizer, settings.people, [regions])
         rows = np.zeros(len(people), np.int64)
         poses = Poses(
             np.array([camera.place], float)[rows],

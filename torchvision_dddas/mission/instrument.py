@@ -27,7 +27,7 @@ class Instrument(Protocol):
     """A source of frames that flies where it is told to, and tells meanwhile what its vehicles report.
 
     camera: the aerial one. colours: of the landmarks. elevation: of the ground, in metres about origin_deg, longitude
-    and latitude.
+    and latitude. sun_rad: azimuth and height of the sun, None where nobody knows.
     """
 
     name: str
@@ -40,6 +40,7 @@ class Instrument(Protocol):
     colours: Colours
     elevation: Elevation
     origin_deg: tuple[float, float]
+    sun_rad: tuple[float, float] | None
 
     def __iter__(self) -> Iterator[Frame]: ...
 

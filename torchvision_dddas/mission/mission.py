@@ -29,7 +29,7 @@ def mission_of(source: Instrument, settings: Settings, backend: str) -> "Mission
         # So that sizes in metres hold, as for a clip whose camera is known.
         settings = with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0])})
     site = site_of(source.landmarks(), source.telemetry())
-    site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site))
+    site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site), sun_rad=source.sun_rad)
     locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
     colours = source.colours
     watch = Watch(locator, colours, load_colours(backend)) if len(colours) else Watch(locator, None, None)

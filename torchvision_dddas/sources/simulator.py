@@ -1,5 +1,6 @@
 """A simulated run as a clip that can be steered, with all that its vehicles say and the truth beside it."""
 
+import math
 from collections import deque
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
@@ -49,6 +50,11 @@ class SimulatorSource:
         self.colours: Colours = simulator.colours
         self.elevation: Elevation = simulator.world.relief
         self.origin_deg = scenario.world.origin_deg
+        world = scenario.world
+        self.sun_rad: tuple[float, float] | None = (
+            math.radians(world.sun_azimuth_deg),
+            math.radians(world.sun_height_deg),
+        )
         self.names: tuple[str, ...] = simulator.names
         self.count: int | None = simulator.frames
         self.rate_hz = scenario.clip.rate_hz

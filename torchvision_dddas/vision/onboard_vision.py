@@ -74,7 +74,8 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
     wide = near if window.wide is None else evidence(window.wide)
     neighbours.keep_for(window.small)
     core = cv2.threshold(near, int(knobs.threshold * scale), 255, cv2.THRESH_BINARY)[1]
-    core = closed(cv2.erode(core, ellipse(settings.morphology.erode_px)), window.close_px or settings.morphology.close_px)
+    close_px = window.close_px or settings.morphology.close_px
+    core = closed(cv2.erode(core, ellipse(settings.morphology.erode_px)), close_px)
     small = None
     if window.small is not None:
         small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
