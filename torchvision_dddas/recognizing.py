@@ -12,7 +12,7 @@ from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.sources.detections import DetectionTable
 from torchvision_dddas.targets import scan
 from torchvision_dddas.targets.persons import people_of
-from torchvision_dddas.targets.regions import Look, Search
+from torchvision_dddas.targets.regions import Look, Regions, Search
 from torchvision_dddas.types import Frame, LinearSvm, Part, People, Recognized
 from torchvision_dddas.vision import Recognizer, load_recognizer
 
@@ -67,10 +67,15 @@ def recognize(
     yield from (_unread(missing, rate_hz, shape) for missing in range(number, getattr(source, "last", 0) + 1))
 
 
-def people_in(images: Sequence[np.ndarray], recognizer: Recognizer, knobs: PeopleKnobs) -> list[People]:
-    """The people of pictures at hand, searched everywhere. Raises InputError as `recognize`."""
+def people_in(
+    images: Sequence[np.ndarray], recognizer: Recognizer, knobs: PeopleKnobs, regions: Sequence[Regions] | None = None
+) -> list[People]:
+    """The people of pictures at hand, searched everywhere or in regions of each. Raises InputError as `recognize`."""
     images = [checked(image, f"picture {i}") for i, image in enumerate(images, start=1)]
     parts = [_everywhere(image, f"picture {i}", knobs) for i, image in enumerate(images, start=1)]
+    if regions is not None:
+        sizes = [(image.shape[1], image.shape[0]) for image in images]
+        parts = [scan.within(*some, size, knobs) for some, size in zip(regions, sizes, strict=True)]
     return [
         _people(maps, wanted, image, knobs)
         for maps, wanted, image in zip(recognizer.scores(images, parts), parts, images, strict=True)

@@ -7,16 +7,15 @@ import numpy as np
 from torchvision_dddas.settings import GroundKnobs
 from torchvision_dddas.types import Camera
 
-# Targets, the camera and its heading are taken to be within so many standard deviations of where they are said to be.
+# People are as tall as within so many standard deviations, and the camera looks where it says within as many.
 _SIGMAS = 2.0
-# People's middles stand within the outline that the air sees of their target; it shows not all of them.
-_MARGIN_M = 1.0
+# Targets are within one of where they are said to be: most of it is that of the middle within the outline, and the
+# whole outline is searched, with so much about it.
+_MARGIN_M = 0.5
 # The ground between rises or falls as steeply, and the camera nods as far.
 _SLOPE_RAD = math.radians(5)
 # Half the width of a body's box over its height: a region holds whole boxes.
 _HALF_WIDE = 0.17
-# Nearer than this nobody is whole in a picture.
-_NEAREST_M = 1.5
 
 
 def expected_regions(
@@ -39,8 +38,11 @@ def expected_regions(
     unsure = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2)[:, -1], 0) + camera.position_sigma_m**2)
     tall = knobs.body_height_m + _SIGMAS * knobs.body_height_sigma_m * np.array([-1.0, 1.0])
     eye = camera.height_m if math.isfinite(camera.height_m) else float(tall[1])
-    for apart, reach in zip(place_m - camera_m, radius_m + _SIGMAS * unsure + _MARGIN_M, strict=True):
+    nearest_m = focal_v * tall[0] / camera.size_px[1]  # nobody is whole in the picture from nearer
+    for apart, reach in zip(place_m - camera_m, radius_m + unsure + _MARGIN_M, strict=True):
         away = float(np.hypot(*apart))
+        if away < nearest_m:
+            continue
         off = (math.atan2(apart[0], apart[1]) - heading_rad + math.pi) % (2 * math.pi) - math.pi
         half = math.asin(min(reach / max(away, 1e-9), 1.0)) + _SIGMAS * camera.heading_sigma_rad
         low, high = (min(max(off + side * half, -1.4), 1.4) for side in (-1, 1))
@@ -49,7 +51,7 @@ def expected_regions(
             continue
         # Along the axis, over the part of the target that is in view.
         far = (away + reach) * math.cos(min(max(0.0, low), high))
-        near = max((away - reach) * math.cos(max(abs(low), abs(high))), _NEAREST_M)
+        near = max((away - reach) * math.cos(max(abs(low), abs(high))), nearest_m)
         if far <= near:
             continue
         horizon = middle_v - focal_v * math.tan(camera.pitch_rad)
