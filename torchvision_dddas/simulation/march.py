@@ -1,5 +1,6 @@
 """Relief marching: what stands on the ground leans in the picture, and hides what is behind it."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import cv2
@@ -18,7 +19,7 @@ _STEEP = 3.0  # what rises so many metres for each metre is a wall,
 _BELOW_M = 0.3  # where it is met so far below its edge
 _INSIDE_M = 0.4  # walls have the colour of the roof so far from its edge
 _SKYLIGHT = 0.42
-_WIDE = 512  # OpenCV remaps no picture wider than 32767: long lists are folded
+_WIDE = 30_000  # OpenCV remaps no picture wider than 32767
 
 
 class Sights(NamedTuple):
@@ -83,10 +84,10 @@ class Standing:
         level = np.clip(np.log2(sights.pixel_m / self._texel_m), 0, len(self._levels) - 1).astype(int)
         kinds = level * len(_STEPS) + steps
         found = []
-        for kind in np.flatnonzero(np.bincount(kinds)):
-            part = np.flatnonzero(kinds == kind)
+        for part in _parts(kinds):
+            kind = int(kinds[part[0]])
             hit, up = self._march(
-                int(kind) // len(_STEPS), _STEPS[kind % len(_STEPS)], sights.of(part), top_m[part], bottom_m[part]
+                kind // len(_STEPS), _STEPS[kind % len(_STEPS)], sights.of(part), top_m[part], bottom_m[part]
             )
             found.append((part[hit], up))
         which, up = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -112,65 +113,71 @@ class Standing:
 
         Where nothing is in reach, both are 0.
         """
-        edges = np.linspace(self.tallest_m + _LEAST_M, 0, _SLICES + 1, dtype=np.float32)
-        half = (edges[0] - edges[1]) / 2
-        reach = reach_m + sights.lean * half
-        ring = rings(reach)
-        top, bottom = (np.zeros(len(reach), np.float32) for _ in range(2))
-        for k in np.flatnonzero(np.bincount(ring)):
-            part = np.flatnonzero(ring == k)
-            east, north = sights.of(part).at(edges[1:, None] + half)
-            may = self._look(self._nearby(int(k)), east, north, cv2.INTER_NEAREST)
-            may = may > np.maximum(edges[1:, None], _LEAST_M)
-            some = may.any(axis=0)
-            top[part] = np.where(some, edges[may.argmax(axis=0)], 0)
-            bottom[part] = np.where(some, edges[_SLICES - may[::-1].argmax(axis=0)], 0)
+        top, bottom = (np.zeros(len(reach_m), np.float32) for _ in range(2))
+        whole = np.full(len(reach_m), self.tallest_m + _LEAST_M, np.float32)
+        # Most of them have nothing near at all, which one look tells.
+        some, _ = self.narrowed(sights, reach_m, whole, top, 1)
+        part = np.flatnonzero(some)
+        if len(part):
+            top[part], bottom[part] = self.narrowed(sights.of(part), reach_m[part], whole[part], top[part], _SLICES)
         return top, bottom
 
-    def near(self, east_m: np.ndarray, north_m: np.ndarray, ring: np.ndarray, up_m: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether anything higher than up_m is within so many rings of places, all (N,)."""
-        near = np.zeros(len(ring), bool)
-        for k in np.flatnonzero(np.bincount(ring)):
-            part = np.flatnonzero(ring == k)
-            highest = self._look(self._nearby(int(k)), east_m[part], north_m[part], cv2.INTER_NEAREST)
-            near[part] = highest > up_m[part]
-        return near
+    def narrowed(
+        self, sights: Sights, reach_m: np.ndarray, top_m: np.ndarray, bottom_m: np.ndarray, slices: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Between which heights (N,) of those given (N,) something is at most reach_m (N,) beside lines of sight.
+
+        They are told to a slice of so many. Where nothing is in reach, both are 0.
+        """
+        slice_m = (top_m - bottom_m) / np.float32(slices)
+        ring = rings(reach_m + sights.lean * slice_m / 2)
+        top, bottom = (np.zeros(len(ring), np.float32) for _ in range(2))
+        below = np.arange(1, slices + 1, dtype=np.float32)[:, None]
+        for part in _parts(ring):
+            highest = self._nearby(int(ring[part[0]]))
+            first, each = top_m[part], slice_m[part]
+            edge = first - below * each
+            may = self._looked(highest, sights.of(part), edge + each / 2, cv2.INTER_NEAREST)
+            may = may > np.maximum(edge, _LEAST_M)
+            some = may.any(axis=0)
+            top[part] = np.where(some, first - may.argmax(axis=0) * each, 0)
+            bottom[part] = np.where(some, first - (slices - may[::-1].argmax(axis=0)) * each, 0)
+        return top, np.maximum(bottom, 0)
 
     def _march(
         self, level: int, steps: int, sights: Sights, top_m: np.ndarray, bottom_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which of N lines of sight meet something, (M,) indices, and how high; they are followed downwards."""
+        texture = self._levels[level]
         step = (top_m - bottom_m) / np.float32(steps)
         up = top_m - np.arange(1, steps + 1, dtype=np.float32)[:, None] * step
         # The last step ends a little above the ground, which everything flat is not.
         up[-1] = np.maximum(up[-1], np.minimum(_LEAST_M, step / 2))
-        inside = self._up(*sights.at(up), level) > np.maximum(up, _LEAST_M)
+        inside = self._looked(texture, sights, up, cv2.INTER_LINEAR) > np.maximum(up, _LEAST_M)
         first = inside.argmax(axis=0)
         hit = np.flatnonzero(inside[first, np.arange(len(first))])
         low = up[first[hit], hit]
         high, met = low + step[hit], sights.of(hit)
         for _ in range(_HALVINGS if len(hit) else 0):
             middle = (low + high) / 2
-            within = self._up(*met.at(middle), level) > middle
+            within = self._looked(texture, met, middle[None], cv2.INTER_LINEAR)[0] > middle
             low, high = np.where(within, middle, low), np.where(within, high, middle)
         return hit, low
 
-    def _up(self, east_m: np.ndarray, north_m: np.ndarray, level: int = 0) -> np.ndarray:
-        return self._look(self._levels[level], east_m, north_m, cv2.INTER_LINEAR)
+    def _up(self, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
+        """Heights (N,) of what stands at places."""
+        none = np.zeros_like(east_m)
+        return self._looked(self._levels[0], Sights(east_m, north_m, none, none, none), none[None], cv2.INTER_LINEAR)[0]
 
-    def _look(self, texture: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, how: int) -> np.ndarray:
-        """What a texture (H, W) of the whole world says of places, (N,) or (K, N) float32."""
-        count = east_m.size
+    def _looked(self, texture: np.ndarray, sights: Sights, up_m: np.ndarray, how: int) -> np.ndarray:
+        """(K, N) what a texture (H, W) of the whole world says of where N lines of sight pass so high (K, N)."""
         half = self._side_m / 2
-        across, down = texture.shape[1] / self._side_m, texture.shape[0] / self._side_m
-        uv = np.zeros((2, -(-count // _WIDE) * _WIDE), np.float32)
-        for row, place, scale, size in ((0, east_m, across, across), (1, north_m, -down, down)):
-            np.multiply(place.ravel(), np.float32(scale), out=uv[row, :count])
-            uv[row, :count] += np.float32(half * size - 0.5)
-        u, v = uv.reshape(2, -1, _WIDE)
-        return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT).ravel()[:count]).reshape(
-            east_m.shape
-        )
+        across, down = (np.float32(n / self._side_m) for n in texture.shape[1::-1])
+        u = up_m * (sights.lean_east * across)
+        u += (sights.east_m + np.float32(half)) * across - np.float32(0.5)
+        v = up_m * (sights.lean_north * -down)
+        v += (np.float32(half) - sights.north_m) * down - np.float32(0.5)
+        return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT))
 
     def _nearby(self, ring: int) -> np.ndarray:
         """(R, C) the greatest height within 2**ring cells of each cell."""
@@ -184,3 +191,11 @@ class Standing:
 def rings(reach_m: np.ndarray) -> np.ndarray:
     """How many rings cover a reach (N,): each is twice as wide as the one before."""
     return np.ceil(np.log2(np.maximum(reach_m, _CELL_M) / _CELL_M)).astype(np.int8)
+
+
+def _parts(kind: np.ndarray) -> Iterator[np.ndarray]:
+    """The rows of each kind (N,), 0 or more, in lists that are not too long."""
+    for k in np.flatnonzero(np.bincount(kind)):
+        rows = np.flatnonzero(kind == k)
+        for first in range(0, len(rows), _WIDE):
+            yield rows[first : first + _WIDE]

@@ -58,14 +58,20 @@ def of_raster(given: Elevation, side_m: float) -> Elevation:
 def up(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
     """(N,) metres of height at places (N, 2), bilinear; beyond the grid as if mirrored at its edges."""
     places = np.asarray(east_north_m, float).reshape(-1, 2)
-    steps = relief.up_m.shape[0] - 1
-    at = mirrored((places - relief.corner_m) / relief.step_m, steps)
-    cell = np.minimum(at.astype(np.int64), steps - 1)
-    x, y = (at - cell).T
-    column, row = cell.T
-    low = relief.up_m[row, column] * (1 - x) + relief.up_m[row, column + 1] * x
-    high = relief.up_m[row + 1, column] * (1 - x) + relief.up_m[row + 1, column + 1] * x
-    return np.asarray(low * (1 - y) + high * y)
+    width = relief.up_m.shape[1]
+    flat = relief.up_m.ravel()
+    cells, shares = [], []
+    for k in range(2):
+        at = (places[:, k] - relief.corner_m[k]) / relief.step_m
+        steps = relief.up_m.shape[1 - k] - 1
+        if len(at) and not (at.min() >= 0 and at.max() <= steps):
+            at = mirrored(at, steps)
+        cells.append(np.minimum(at.astype(np.int64), steps - 1))
+        shares.append(at - cells[-1])
+    x, y = shares
+    first = cells[1] * width + cells[0]
+    low, high = (flat.take(node) + x * (flat.take(node + 1) - flat.take(node)) for node in (first, first + width))
+    return np.asarray(low + y * (high - low))
 
 
 def mirrored(at: np.ndarray, length: float) -> np.ndarray:

@@ -50,25 +50,39 @@ class Shutter:
         """Pixels (N, 2) of points (N, 3) that move so, and how far along the axis they are (N,)."""
         camera, pose = self.camera, moment.pose
         focal, centre = np.array(camera.focal_px) * pose.focal, np.array(camera.centre_px)
-        lag = np.zeros((len(points_m), 1))
+        # Where it is for the camera at a lag is a polynomial of the lag: its terms are found once.
+        once = across(-moment.turn_rad_s)
+        away, slide = points_m - pose.place_m, np.asarray(velocity_m_s - moment.velocity_m_s)
+        terms = [away @ pose.axes]
+        if self.readout_s > 0:
+            terms += [away @ (once @ pose.axes) + slide @ pose.axes]
+            terms += [away @ (once @ once @ pose.axes / 2) + slide @ (once @ pose.axes)]
+        seen = terms[0]
         # The row tells the time and the time the row; the shutter is far faster than what moves.
-        for _ in range(3 if self.readout_s > 0 else 1):
-            away = points_m + lag * (velocity_m_s - moment.velocity_m_s) - pose.place_m
-            seen = turned(away, moment.turn_rad_s, -lag) @ pose.axes
+        for again in range(3 if self.readout_s > 0 else 1):
+            if again:
+                lag = self.lag_s(row)[:, None]
+                seen = terms[0] + lag * (terms[1] + lag * terms[2])
             depth = seen[:, 2]
-            image_px = seen[:, :2] / np.where(np.abs(depth) < 1e-6, 1e-6, depth)[:, None] * focal + centre
-            lag = self.lag_s(image_px[:, 1])[:, None]
-        return image_px, depth
+            over = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
+            row = seen[:, 1] * over * focal[1] + centre[1]
+        column = seen[:, 0] * over * focal[0] + centre[0]
+        return np.stack([column, row], axis=1), depth
 
 
 def turned(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
     """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
     if not np.any(lag_s) or not np.any(turn_rad_s):
         return vectors
+    matrix = across(turn_rad_s)
+    once = lag_s * (vectors @ matrix)
+    return vectors + once + lag_s / 2 * (once @ matrix)
+
+
+def across(turn_rad_s: np.ndarray) -> np.ndarray:
+    """(3, 3) by which row vectors are multiplied for their cross product with a turn."""
     x, y, z = turn_rad_s
-    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]).T
-    once = lag_s * (vectors @ across)
-    return vectors + once + lag_s / 2 * (once @ across)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]).T
 
 
 def landing(

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.march import Met, Sights, Standing, rings
+from torchvision_dddas.simulation.march import Met, Sights, Standing
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.shutter import Shutter, landing
 from torchvision_dddas.simulation.world import World
 
 _STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
 _LEVELS = 8
+_SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
 _VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
 _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
 _GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
@@ -85,31 +86,43 @@ class Terrain:
         top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
         # Low things that lean by less than a pixel may lie flat.
         top[(top * sights.lean < _FLAT_PX * sights.pixel_m) & (top < _LOW_M)] = 0
-        return self._risen(lie, moment, sights, up, top, bottom) if top.any() else lie
+        return self._risen(lie, moment, sights, up, top, bottom, longest) if top.any() else lie
 
     def _risen(
-        self, lie: Lie, moment: Moment, blocks: Sights, up: np.ndarray, top: np.ndarray, bottom: np.ndarray
-    ) -> Lie:
-        """Where pixels lie once lines of sight have met what stands, between the heights that blocks say (N,)."""
+        self, lie: Lie, moment: Moment, blocks: Sights, up: np.ndarray, top: np.ndarray, bottom: np.ndarray,
+        longest: np.ndarray,
+    ) -> Lie:  # fmt: skip
+        """Where pixels lie once lines of sight have met what stands, between the heights that blocks say (N,).
+
+        longest: (N,) metres that a pixel is long on the ground.
+        """
         columns, rows = self._cells
-        hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
-        some = cv2.resize(hopeful, None, fx=_STEP_PX, fy=_STEP_PX, interpolation=cv2.INTER_NEAREST)
         height, width = lie.east_m.shape
-        which = np.flatnonzero(some[:height, :width])
-        block = self._block[which]
-        # Most pixels of such blocks pass it by: those with nothing near the middle of the stretch in question.
-        middle, half = (top + bottom) / 2, (top - bottom) / 2
-        east, north = lie.east_m.ravel()[which], lie.north_m.ravel()[which]
-        aside_east, aside_north = blocks.lean_east * middle, blocks.lean_north * middle
-        ring = rings(blocks.lean * half + 2 * blocks.pixel_m)
-        near = self._standing.near(east + aside_east[block], north + aside_north[block], ring[block], bottom[block])
-        which, block, east, north = which[near], block[near], east[near], north[near]
-        if not len(which):
+        hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
+        some = cv2.resize(hopeful, None, fx=_STEP_PX // 2, fy=_STEP_PX // 2, interpolation=cv2.INTER_NEAREST)
+        # Most pixels of such blocks pass it by. Pixels are told apart by fours: their first, and so far about it.
+        row, column = np.nonzero(some[: (height + 1) // 2, : (width + 1) // 2])
+        first, block = 2 * (row * width + column), self._block[2 * (row * width + column)]
+        four = Sights(
+            lie.east_m.ravel()[first], lie.north_m.ravel()[first], blocks.lean_east[block], blocks.lean_north[block],
+            blocks.pixel_m[block],
+        )  # fmt: skip
+        top, bottom = self._standing.narrowed(four, 1.5 * longest[block], top[block], bottom[block], _SLICES)
+        near = np.flatnonzero(top)
+        if not len(near):
             return lie
+        which = (first[near] + np.array([[0], [1], [width], [width + 1]])).ravel()
+        inside = np.ones((4, len(near)), bool)
+        inside[1::2] = 2 * column[near] + 1 < width
+        inside[2:] &= 2 * row[near] + 1 < height
+        kept = np.flatnonzero(inside.ravel())
+        which, near = which[kept], np.tile(near, 4)[kept]
+        top, bottom, block = top[near], bottom[near], block[near]
+        place = np.stack([lie.east_m.ravel()[which], lie.north_m.ravel()[which]], axis=1)
         lag = self._shutter.lag_s(np.arange(height))[:, None]
         eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32)[which // width]
-        sights = _sights(np.stack([east, north], axis=1), eye, up.astype(np.float32)[block], blocks.pixel_m[block])
-        met = self._standing.met(sights, top[block], bottom[block])
+        sights = _sights(place, eye, up.astype(np.float32)[block], blocks.pixel_m[block])
+        met = self._standing.met(sights, top, bottom)
         if met is None:
             return lie
         rise = np.zeros((height, width), np.float32)
