@@ -95,18 +95,28 @@ def fly_into(
                         scorer.feed(truth)
                         for event in truth.events:
                             output.event(truth.frame, event, truth.time_s)
+                    _noticed(output, mission)
                     scorer.feed(surveyed)
                     output.survey(surveyed)
                     for _ in range(surveyed.followed.number - done):
                         tick()
                     done = surveyed.followed.number
         finally:
+            _noticed(output, mission)
             journal.problems += [str(problem) for problem in simulated.problems]
             for problem in simulated.problems:
                 output.event(problem.frame, str(problem), kind="problem")
         score = scorer.score()
         output.scored(score.by_name(), score.lines())
     return journal, score
+
+
+def _noticed(output: Any, mission: "Mission") -> None:
+    """Tell what the run itself saw to go wrong."""
+    from torchvision_dddas.sinks.run_log import NOTICED
+
+    for notice in mission.notices():
+        output.event(notice.frame, notice.text, notice.time_s, NOTICED)
 
 
 def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: str) -> "Record":

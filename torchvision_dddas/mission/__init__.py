@@ -3,5 +3,6 @@
 from torchvision_dddas.mission.closer import CloserLook
 from torchvision_dddas.mission.instrument import Begun, Instrument
 from torchvision_dddas.mission.mission import Mission, mission_of
+from torchvision_dddas.mission.vigilance import Notice, Vigilance
 
-__all__ = ["Begun", "CloserLook", "Instrument", "Mission", "mission_of"]
+__all__ = ["Begun", "CloserLook", "Instrument", "Mission", "Notice", "Vigilance", "mission_of"]

@@ -8,6 +8,7 @@ import numpy as np
 from torchvision_dddas.geolocating import Locator, Site, Watch, site_of
 from torchvision_dddas.mission.closer import CloserLook
 from torchvision_dddas.mission.instrument import Instrument
+from torchvision_dddas.mission.vigilance import Notice, Vigilance
 from torchvision_dddas.recognizing import recognizer_of
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.steering import Steering
@@ -52,13 +53,24 @@ class Mission:
         self.source, self.watch, self.settings = source, watch, settings
         self._closer, self._steering = closer, steering
         self._origin = watch.locator.site.origin_deg
+        self._vigilance = Vigilance(watch.locator.site.landmarks.names, source.rate_hz)
 
     def refresh(self, scene: Scene) -> None:
         """Before a scene is laid on the ground: take what was reported meanwhile."""
-        first = scene.frame.number - MEMORY_S * self.source.rate_hz
-        self.watch.locator.learn(self._site(_recent(self.source.landmarks(), first), self.source.telemetry()))
+        locator, frame = self.watch.locator, scene.frame
+        first = frame.number - MEMORY_S * self.source.rate_hz
+        site = self._site(_recent(self.source.landmarks(), first), self.source.telemetry())
+        locator.learn(site)
+        assert site.telemetry is not None
+        self._vigilance.reports(self.source.last, site.landmarks, site.telemetry)
+        if frame.image.any():  # no picture is all black, but what stands for a missing one
+            self._vigilance.picture(frame, scene.step, self._metres_per_px(frame.time_s))
         if self._closer is not None:
             self._closer.take(self.source.pictures())
+
+    def notices(self) -> list[Notice]:
+        """What was seen to go wrong, or to be well again, since this was last asked."""
+        return self._vigilance.notices()
 
     def after(self, surveyed: Surveyed, step: Registration | None) -> Surveyed:
         """Judge the targets of a frame by what the ground vehicles saw, and say where all go next.
@@ -97,6 +109,14 @@ class Mission:
             landmarks = replace(landmarks, place=geodesy.east_north(landmarks.place, self._origin), geographic=False)
             telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, self._origin), geographic=False)
         return replace(site, landmarks=landmarks, telemetry=telemetry)
+
+    def _metres_per_px(self, time_s: float) -> float:
+        """On level ground in the picture's middle; NaN where the UAV does not say how it flies."""
+        flight = self.watch.locator.flight(time_s)
+        if flight is None:
+            return float("nan")
+        down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
+        return float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
 
     def _extent_m(self, surveyed: Surveyed) -> np.ndarray:
         """(P,) radius of each located target on the ground; 0 where unknown."""

@@ -7,7 +7,7 @@ from itertools import cycle
 
 import numpy as np
 
-from torchvision_dddas.sinks.run_log import ADJUSTED, ORDERED, PROBLEM, TOLD, WORLD, Entry
+from torchvision_dddas.sinks.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, TOLD, WORLD, Entry
 from torchvision_dddas.sinks.timeline import Curve, Panel, Ticks, axis
 from torchvision_dddas.types import Adjustment, Confirmed, Surveyed
 
@@ -18,7 +18,14 @@ _ROW = np.dtype([(name, "f8") for name in ("frame", "time_s", "found", "tracked"
 _MOST_KNOBS, _MOST_STAGES = 12, 7
 _KIND_COLOURS = ("#2b7d4f", "#b5541c", "#b8b8b8")
 _STAGE_COLOURS = ("#1f5fa8", "#b5541c", "#2b7d4f", "#5b3f94", "#c9a227", "#3f8f94", "#a8446f", "#b8b8b8")
-_EVENTS = {WORLD: "#5b3f94", ADJUSTED: "#1f5fa8", TOLD: "#2b7d4f", ORDERED: "#c9a227", PROBLEM: "#c0392b"}
+_EVENTS = {
+    WORLD: "#5b3f94",
+    ADJUSTED: "#1f5fa8",
+    TOLD: "#2b7d4f",
+    ORDERED: "#c9a227",
+    NOTICED: "#c2701c",
+    PROBLEM: "#c0392b",
+}
 
 
 class Course:

@@ -11,8 +11,9 @@ from torchvision_dddas.types import Adjustment
 
 NAME = "log.txt"
 
-ADJUSTED, WORLD, PROBLEM = "adjusted", "world", "problem"
-"""Kinds of lines: a knob that the feedback moved; what happened in a simulated world; what went wrong."""
+ADJUSTED, WORLD, PROBLEM, NOTICED = "adjusted", "world", "problem", "noticed"
+"""Kinds of lines: a knob that the feedback moved; what happened in a simulated world, as only that knows; what went
+wrong; what the run itself noticed of its instruments, silent or frozen."""
 TOLD, ORDERED, REPAIRED, MARK = "told", "ordered", "repaired", "landmark"
 """More of them: what ground vehicles say of a target; what vehicles were asked; what was repaired; landmarks unseen."""
 

@@ -19,6 +19,7 @@ from torchvision_dddas.sinks.run_log import (
     ADJUSTED,
     MARK,
     NAME,
+    NOTICED,
     ORDERED,
     PROBLEM,
     REPAIRED,
@@ -34,7 +35,7 @@ from torchvision_dddas.sinks.whole import remove, temporary, write_whole
 from torchvision_dddas.types import Surveyed
 
 REPORT = "report.html"
-WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
+WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
 """How much what happened matters for the choice of key frames."""
 _BRIEF = 3
 """A landmark that is not seen in fewer frames is not worth a line."""

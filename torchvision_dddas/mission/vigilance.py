@@ -1,0 +1,133 @@
+"""What the system itself notices to go wrong: vehicles that fall silent or leap, pictures that repeat or jerk."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
+
+SILENT_S = 2.0
+"""Who has said nothing for so long is silent, if reports came faster before."""
+_SLOWER = 3.0
+"""So many times the usual time between its reports is silence where they come seldom."""
+_LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
+"""No vehicle's report is so much further from its last one than it could have driven."""
+_JERK_M_S = 4.0
+"""The ground below the picture's middle does not move so much faster than it did, but for a gust."""
+_USUAL_S = 2.0
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that was noticed, at a frame."""
+
+    frame: int
+    time_s: float
+    text: str
+
+
+class Vigilance:
+    """Holds what comes in against what came before. Ask it once a scene."""
+
+    def __init__(self, names: tuple[str, ...], rate_hz: float) -> None:
+        """names: of the ground vehicles. rate_hz: frames a second."""
+        self._names, self._rate_hz = names, rate_hz
+        self._picture: np.ndarray | None = None
+        self._repeated = 0
+        self._usual: list[tuple[float, np.ndarray]] = []
+        self._jerked_s = -math.inf
+        self._silent: dict[str, float] = {}
+        self._last: dict[int, tuple[float, np.ndarray]] = {}
+        self._looked: tuple[float, bool] | None = None
+        self._notices: list[Notice] = []
+
+    def notices(self) -> list[Notice]:
+        """What was noticed since this was last asked, in the order of frames."""
+        new, self._notices = sorted(self._notices, key=lambda notice: notice.frame), []
+        return new
+
+    def reports(self, now: int, landmarks: Landmarks, telemetry: Telemetry) -> None:
+        """What all vehicles said until frame `now`; places in local metres."""
+        for which, name in enumerate(self._names):
+            rows = np.flatnonzero((landmarks.landmark == which) & ~landmarks.planned & (landmarks.frame <= now))
+            rows = rows[np.isfinite(landmarks.place[rows]).all(axis=1)]
+            when_s = (landmarks.frame[rows] - 1) / self._rate_hz
+            ahead = bool(((landmarks.landmark == which) & landmarks.planned & (landmarks.frame > now)).any())
+            what = "its plan stands in for it" if ahead else "nothing stands in for it"
+            self._heard(now, name, when_s, f"{name} reports no place", what, f"{name} reports its place again")
+            self._leaps(which, now, when_s, landmarks.place[rows], landmarks.sigma_m[rows])
+        said = telemetry.time_s[np.isfinite(telemetry.place).all(axis=1)]
+        self._heard(
+            now,
+            "uav",
+            said,
+            "the UAV says nothing of itself",
+            "landmarks alone tell its place",
+            "the UAV reports again",
+        )
+
+    def picture(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
+        """The next picture that was read. step: how the ground moved in it since the one before.
+
+        metres_per_px: on the ground below its middle; NaN where unknown.
+        """
+        same = self._picture is not None and np.array_equal(self._picture, frame.image)
+        self._picture = frame.image
+        if same:
+            self._repeated += 1
+            if self._repeated == 1:
+                self._say(frame.number, "the picture repeats the one before: the camera is frozen")
+            return
+        if self._repeated:
+            count = f"{self._repeated} picture{'s' if self._repeated > 1 else ''}"
+            self._say(frame.number, f"the camera sees again: {count} repeated the one before")
+            self._repeated = 0
+            return  # what moved meanwhile came at once
+        self._moved(frame, step, metres_per_px)
+
+    def _heard(self, now: int, who: str, when_s: np.ndarray, silent: str, bridge: str, back: str) -> None:
+        """Who was silent for long, or is heard again. when_s: times of all its reports."""
+        now_s = (now - 1) / self._rate_hz
+        last_s = float(when_s[-1]) if len(when_s) else 0.0
+        usual_s = float(np.median(np.diff(when_s))) if len(when_s) > 2 else 0.0
+        if who in self._silent:
+            if last_s > self._silent[who]:
+                self._say(now, f"{back}, after {last_s - self._silent.pop(who):.1f} s")
+        elif now_s - last_s > max(SILENT_S, _SLOWER * usual_s):
+            self._silent[who] = last_s
+            self._say(now, f"{silent} for {now_s - last_s:.1f} s: {bridge}")
+
+    def _leaps(self, which: int, now: int, when_s: np.ndarray, place_m: np.ndarray, sigma_m: np.ndarray) -> None:
+        """Reports that are further from the one before than the vehicle can have driven."""
+        before = self._last.get(which)
+        for time_s, place, sigma in zip(when_s.tolist(), place_m, np.nan_to_num(sigma_m).tolist(), strict=True):
+            if before is not None:
+                if time_s <= before[0]:
+                    continue
+                away = float(np.linalg.norm(place - before[1]))
+                if away > _LEAP_M + _LEAP_SIGMAS * sigma + _FASTEST_M_S * (time_s - before[0]):
+                    self._say(
+                        now, f"{self._names[which]}'s reports leap by {away:.1f} m within {time_s - before[0]:.1f} s"
+                    )
+            before = (time_s, place)
+        if before is not None:
+            self._last[which] = before
+
+    def _moved(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
+        """Jerks: the picture's middle moves in another way than it did for a while."""
+        if step is None or not step.reliable or not math.isfinite(metres_per_px):
+            return
+        middle = np.array([(frame.image.shape[1] - 1) / 2, (frame.image.shape[0] - 1) / 2, 1.0])
+        moved = step.later_from_earlier @ middle
+        speed = (moved[:2] / moved[2] - middle[:2]) * metres_per_px * self._rate_hz / (frame.skipped + 1)
+        self._usual = [(t, v) for t, v in self._usual if t > frame.time_s - _USUAL_S]
+        if len(self._usual) >= 3 and frame.time_s - self._jerked_s > _USUAL_S:
+            usual = np.median([v for _, v in self._usual], axis=0)
+            if (change := float(np.linalg.norm(speed - usual))) > _JERK_M_S:
+                self._jerked_s = frame.time_s
+                self._say(frame.number, f"the picture jerks, as in a gust: by {change:.1f} m/s over the ground")
+        self._usual.append((frame.time_s, speed))
+
+    def _say(self, frame: int, text: str) -> None:
+        self._notices.append(Notice(frame, (frame - 1) / self._rate_hz, text))
