@@ -10,6 +10,10 @@ FEWEST = 4
 """Landmarks that lay a picture on the ground."""
 
 
+HIGHEST_DEG = 85.0
+"""Near the poles longitudes run together."""
+
+
 MARGIN_M = 2.0
 """What moves begins and goes so far inside the world."""
 
@@ -20,12 +24,18 @@ OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")
 
 def check(scenario: Scenario) -> None:
     """Raises InputError with one line for what cannot be: something outside the world, happening to no crowd, ..."""
+    _check_origin(scenario)
     _check_places(scenario)
     _check_times(scenario)
     if scenario.clip.located_by == "landmarks" and scenario.team.ugvs < FEWEST:
         raise InputError(
             f"team.ugvs = {scenario.team.ugvs} will not do: a clip located by landmarks needs {FEWEST}; add vehicles, "
             'or set clip.located_by = "telemetry"'
+        )
+    if scenario.camera.exposure_s * scenario.clip.rate_hz > 1:
+        raise InputError(
+            f"camera.exposure_s = {scenario.camera.exposure_s:g} is longer than from picture to picture; wanted "
+            f"{1 / scenario.clip.rate_hz:g} s or less at clip.rate_hz = {scenario.clip.rate_hz:g}"
         )
     for key in ("elevation", "photo"):
         if (file := getattr(scenario.world, key)) and not Path(file).is_file():
@@ -36,6 +46,16 @@ def check(scenario: Scenario) -> None:
 def settings_of(scenario: Scenario) -> dict[str, object]:
     """The knobs of the system that a scenario sets: `{"group.knob": value}`."""
     return {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
+
+
+def _check_origin(scenario: Scenario) -> None:
+    """The world lies where longitudes and latitudes tell places."""
+    longitude, latitude = scenario.world.origin_deg
+    if abs(longitude) > 180 or abs(latitude) > HIGHEST_DEG:
+        raise InputError(
+            f"world.origin_deg = [{longitude:g}, {latitude:g}] will not do; wanted a longitude of -180 to 180 and a "
+            f"latitude of -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} degrees"
+        )
 
 
 def _check_places(scenario: Scenario) -> None:

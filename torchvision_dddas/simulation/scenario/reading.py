@@ -28,6 +28,8 @@ def load(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | No
     path = _file(name_or_path)
     content = read_toml(path)
     origin = str(path) if path == Path(name_or_path) else f"scenario {path.stem}"
+    if not content:
+        raise InputError(f"{origin} is empty; wanted tables such as [clip] and [[crowd]], as in the shipped scenarios")
     for text in overrides:
         _change(content, *parse_override(text))
     if seed is not None:
