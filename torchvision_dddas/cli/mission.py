@@ -79,11 +79,16 @@ def fly_into(
         from torchvision_dddas.vision import load as load_vision
 
         simulated: SimulatorSource = open_scenario(scenario, scene, seed)
+        if simulated.scenario.clip.located_by == "nothing":
+            raise InputError(
+                f"scenario {scenario} is located by nothing, and where nothing is located nothing can be steered; add "
+                "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
+            )
         own = settings_of(simulated.scenario)
         own.setdefault("landmarks.common_sigma_m", simulated.scenario.gps.common_m)
         settings = load(config or CONFIG, overrides, own)
         source: Any = Begun(simulated)
-        mission = mission_of(source, settings, backend)
+        mission = mission_of(source, settings, backend, simulated.scenario.clip.located_by == "landmarks")
         vision = load_vision(backend, mission.settings)
         journal = _begin(output, mission, simulated, vision.name)
         scorer = CrowdScorer(partial(geodesy.east_north, origin_deg=simulated.origin_deg))

@@ -21,19 +21,21 @@ MEMORY_S = 15.0
 """Reports this old no longer tell where anything is: the rest of a long run would only cost time."""
 
 
-def mission_of(source: Instrument, settings: Settings, backend: str) -> "Mission":
+def mission_of(source: Instrument, settings: Settings, backend: str, by_landmarks: bool = True) -> "Mission":
     """Everything about a source that can be steered, whose first frame has been read: it has reports by then.
 
-    Raises InputError where these do not do.
+    by_landmarks: whether the ground vehicles' markers are looked for; else telemetry alone lays pictures on the ground.
+    Raises InputError where the reports do not do.
     """
     if settings.gates.focal_px == Settings().gates.focal_px:
         # So that sizes in metres hold, as for a clip whose camera is known.
         settings = with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0])})
-    site = site_of(source.landmarks(), source.telemetry())
+    site = _site_of(source)
     site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site), sun_rad=source.sun_rad)
     locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
     colours = source.colours
-    watch = Watch(locator, colours, load_colours(backend)) if len(colours) else Watch(locator, None, None)
+    by_landmarks = by_landmarks and len(colours) > 0
+    watch = Watch(locator, colours, load_colours(backend)) if by_landmarks else Watch(locator, None, None)
     closer = CloserLook(settings, recognizer_of(settings.people, backend)) if len(colours) else None
     steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
     return Mission(source, watch, settings, closer, steering)
@@ -141,6 +143,17 @@ class Mission:
             for o in command.orders
         )
         return replace(command, fly_to=there(command.fly_to), look_at=there(command.look_at), orders=orders)
+
+
+def _site_of(source: Instrument) -> Site:
+    """The reports so far, about the first of them; about the source's own origin while no ground vehicle has any."""
+    landmarks, telemetry = source.landmarks(), source.telemetry()
+    if np.isfinite(landmarks.place).all(axis=1).any():
+        return site_of(landmarks, telemetry)
+    origin = source.origin_deg
+    here = geodesy.east_north(landmarks.place, origin), geodesy.east_north(telemetry.place, origin)
+    landmarks = replace(landmarks, place=here[0], geographic=False)
+    return Site(landmarks, replace(telemetry, place=here[1], geographic=False), origin)
 
 
 def _moved(elevation: Elevation, origin_deg: tuple[float, float], site: Site) -> Elevation:

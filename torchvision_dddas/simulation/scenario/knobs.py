@@ -159,7 +159,9 @@ class ClipKnobs(Group):
     seconds: float = knob(30.0, "s", 0.3, 86400, meaning="length of the run")
     rate_hz: float = knob(10.0, "1/s", 1, 120, meaning="pictures a second")
     located_by: Literal["landmarks", "telemetry", "nothing"] = knob(
-        "landmarks", "-", meaning="what lays the UAV's pictures on the ground"
+        "landmarks",
+        "-",
+        meaning="what lays the UAV's pictures on the ground in `dddas run sim:`; telemetry: markers are not looked for",
     )
 
 
