@@ -42,7 +42,7 @@ def fly(
     """
     from torchvision_dddas.cli.run import summary
     from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.survey_output import SAVED
+    from torchvision_dddas.sinks.flown import SAVED
 
     if useless := [name for name, given in files.items() if given is not None]:
         raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
@@ -52,6 +52,8 @@ def fly(
         first, *others = summary(journal, folder, True, names)
         for line in (first, *score.lines(), *others):
             typer.echo(line)
+        if "truth" in names:
+            typer.echo(f"{folder / 'truth'}: what is true; dddas evaluate {folder / 'truth' / 'gt.txt'} {folder}")
 
 
 def fly_into(
@@ -66,9 +68,9 @@ def fly_into(
     quiet: bool = False,
 ) -> "tuple[Record, CrowdScore]":
     """As `fly`, but returns the record of the run and its score, and says nothing at its end."""
-    from torchvision_dddas.sinks.survey_output import SurveyOutput
+    from torchvision_dddas.sinks.flown import FlownOutput
 
-    with SurveyOutput(folder, save) as output:
+    with FlownOutput(folder, save) as output:
         from torchvision_dddas.metrics.crowds import CrowdScorer
         from torchvision_dddas.mission import Begun, mission_of
         from torchvision_dddas.settings import load
@@ -91,6 +93,7 @@ def fly_into(
         mission = mission_of(source, settings, backend, simulated.scenario.clip.located_by == "landmarks")
         vision = load_vision(backend, mission.settings)
         journal = _begin(output, mission, simulated, vision.name)
+        output.knows(partial(geodesy.lonlat, origin_deg=simulated.origin_deg))
         scorer = CrowdScorer(partial(geodesy.east_north, origin_deg=simulated.origin_deg))
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
@@ -98,6 +101,7 @@ def fly_into(
                 for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
                     for truth in simulated.truths():
                         scorer.feed(truth)
+                        output.true(truth)
                         for event in truth.events:
                             output.event(truth.frame, event, truth.time_s)
                     _noticed(output, mission)

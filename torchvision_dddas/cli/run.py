@@ -56,7 +56,10 @@ def run(
     backend: Engine = Backend.auto,
     save: Annotated[
         str | None,
-        typer.Option(metavar="NAMES", help="overlay,cot,map,report, all or none; tables are always written."),
+        typer.Option(
+            metavar="NAMES",
+            help="overlay,cot,map,report, all or none; of sim:NAME truth too; tables are always written.",
+        ),
     ] = None,
     rate: Rate = None,
     scene: Annotated[
@@ -79,6 +82,7 @@ def run(
     if clip.startswith(SIMULATED):
         files = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--dem": dem}
         files |= {"--colours": colours, "--camera": camera, "--background": background}
+        files["--interval"] = interval if interval != 1 else None
         fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, files, quiet)
         return
     if scene or seed is not None:
