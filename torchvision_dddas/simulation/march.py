@@ -45,7 +45,7 @@ class Sights(NamedTuple):
 
     def of(self, which: np.ndarray) -> "Sights":
         """Some of them."""
-        return Sights(*(column[which] for column in self))
+        return Sights(*(column.take(which) for column in self))
 
 
 class Met(NamedTuple):
@@ -74,8 +74,11 @@ class Standing:
         # A reach of one cell from wherever in its own cell a place lies, and a texel for what is interpolated.
         wide = 2 * int(np.ceil(1.5 * _CELL_M / world.surface_texel_m + 1)) + 1
         highest = cv2.dilate(self._levels[0], np.ones((wide, wide), np.uint8), borderType=cv2.BORDER_REFLECT)
-        self._highest = [cv2.resize(highest, (cells, cells), interpolation=cv2.INTER_NEAREST)]
+        highest = cv2.resize(highest, (cells, cells), interpolation=cv2.INTER_NEAREST)
         self.tallest_m = float(highest.max())
+        # In bytes, which the processor's cache can hold; rounded up.
+        self._code_m = max(self.tallest_m, _LEAST_M) / 255
+        self._highest = [np.ceil(highest / np.float32(self._code_m)).clip(0, 255).astype(np.uint8)]
 
     def met(self, sights: Sights, top_m: np.ndarray, bottom_m: np.ndarray) -> Met | None:
         """What is met by lines of sight between two heights (N,); None: nothing is."""
@@ -138,10 +141,12 @@ class Standing:
             first, each = top_m[part], slice_m[part]
             edge = first - below * each
             may = self._looked(highest, sights.of(part), edge + each / 2, cv2.INTER_NEAREST)
-            may = may > np.maximum(edge, _LEAST_M)
-            some = may.any(axis=0)
-            top[part] = np.where(some, first - may.argmax(axis=0) * each, 0)
-            bottom[part] = np.where(some, first - (slices - may[::-1].argmax(axis=0)) * each, 0)
+            may = may > np.maximum(edge, _LEAST_M) / np.float32(self._code_m)
+            high, low = (np.zeros(len(part), np.float32) for _ in range(2))
+            for k in range(slices):
+                np.copyto(low, edge[k], where=may[k])
+                np.copyto(high, edge[slices - 1 - k] + each, where=may[slices - 1 - k])
+            top[part], bottom[part] = high, low
         return top, np.maximum(bottom, 0)
 
     def _march(
@@ -154,9 +159,11 @@ class Standing:
         # The last step ends a little above the ground, which everything flat is not.
         up[-1] = np.maximum(up[-1], np.minimum(_LEAST_M, step / 2))
         inside = self._looked(texture, sights, up, cv2.INTER_LINEAR) > np.maximum(up, _LEAST_M)
-        first = inside.argmax(axis=0)
-        hit = np.flatnonzero(inside[first, np.arange(len(first))])
-        low = up[first[hit], hit]
+        highest = np.full(len(step), -1, np.float32)
+        for k in range(steps - 1, -1, -1):
+            np.copyto(highest, up[k], where=inside[k])
+        hit = np.flatnonzero(highest >= 0)
+        low = highest[hit]
         high, met = low + step[hit], sights.of(hit)
         for _ in range(_HALVINGS if len(hit) else 0):
             middle = (low + high) / 2
@@ -180,7 +187,7 @@ class Standing:
         return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT))
 
     def _nearby(self, ring: int) -> np.ndarray:
-        """(R, C) the greatest height within 2**ring cells of each cell."""
+        """(R, C) uint8, the greatest height within 2**ring cells of each cell, in steps of code_m."""
         while len(self._highest) <= ring:
             wide = 2 ** len(self._highest) // 2 * 2 + 1
             last = self._highest[-1]

@@ -5,6 +5,7 @@ import numpy as np
 
 from torchvision_dddas.simulation.scenario import CameraKnobs
 
+_BAND = 32
 _SPARE_PX = 192  # a tile of noise is so much larger than the picture, so that its start can vary
 
 
@@ -31,25 +32,33 @@ class Sensor:
     def expose(self, picture: np.ndarray, number: int, time_s: float) -> np.ndarray:
         """The file's picture, (H, W, 3) uint8, of what the lens looks at, the same; number: of the picture."""
         knobs = self.knobs
-        if knobs.sharpness_px > 0:
-            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), knobs.sharpness_px))
         levels = np.asarray(np.arange(256) * self.gain(time_s), np.float32)
-        if self._tile is None:
-            whole = np.asarray(np.clip(np.round(levels), 0, 255), np.uint8)
-            picture = np.asarray(cv2.LUT(picture, whole))
-        else:
-            sigma = np.asarray(np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2), np.float32)
+        sigma = np.asarray(np.sqrt(knobs.shot_noise * levels + knobs.read_noise**2), np.float32)
+        grain, turned = None, False
+        if self._tile is not None:
             rng = np.random.default_rng([*self._key, number])
             y, x = rng.integers(0, _SPARE_PX, 2)
             grain = self._tile[y : y + picture.shape[0], x : x + picture.shape[1]]
             # Turned over and the sign changed, so that no two pictures show the same pattern moved aside.
             flip = int(rng.integers(0, 4))
-            if flip < 3:
-                grain = np.asarray(cv2.flip(grain, flip - 1), np.float32)
+            grain = grain[::-1] if flip in (0, 1) else grain
+            turned = flip in (0, 2)
             if rng.integers(0, 2):
                 sigma = -sigma
-            noise = cv2.multiply(cv2.LUT(picture, sigma), grain)
-            picture = np.asarray(cv2.add(cv2.LUT(picture, levels), noise, dtype=cv2.CV_8U))
+        if knobs.sharpness_px > 0:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), knobs.sharpness_px))
+        if grain is None:
+            picture = np.asarray(cv2.LUT(picture, np.asarray(np.clip(np.round(levels), 0, 255), np.uint8)))
+        else:
+            noisy = np.empty_like(picture)
+            # Bands of rows that the processor's cache holds.
+            for first in range(0, len(picture), _BAND):
+                rows = slice(first, first + _BAND)
+                noise = cv2.LUT(picture[rows], sigma)
+                pattern = np.asarray(cv2.flip(grain[rows], 1)) if turned else grain[rows]
+                np.multiply(noise, pattern, out=noise)
+                cv2.add(cv2.LUT(picture[rows], levels), noise, dst=noisy[rows], dtype=cv2.CV_8U)
+            picture = noisy
         if knobs.quality < 100:
             _, file = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, knobs.quality])
             picture = np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))

@@ -1,5 +1,6 @@
 """The ground of a world as a camera above it sees it: where each pixel lies, and its colour."""
 
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from torchvision_dddas.simulation.world import World
 
 _STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
 _LEVELS = 8
+_BETWEEN = 16  # shares in which two levels are mixed
 _SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
 _VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
 _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
@@ -81,7 +83,7 @@ class Terrain:
         lie = Lie(east, north, each_row, haze=self._enlarged(haze) if haze.max() > _CLEAR else None)
         if self._standing.tallest_m <= 0:
             return lie
-        sights = _sights(place.reshape(-1, 2), start, up, pixel_m.ravel())
+        sights = _sights(place.reshape(-1, 2).T, start.T, up, pixel_m.ravel())
         longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
         top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
         # Low things that lean by less than a pixel may lie flat.
@@ -101,27 +103,32 @@ class Terrain:
         hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
         some = cv2.resize(hopeful, None, fx=_STEP_PX // 2, fy=_STEP_PX // 2, interpolation=cv2.INTER_NEAREST)
         # Most pixels of such blocks pass it by. Pixels are told apart by fours: their first, and so far about it.
-        row, column = np.nonzero(some[: (height + 1) // 2, : (width + 1) // 2])
-        first, block = 2 * (row * width + column), self._block[2 * (row * width + column)]
-        four = Sights(
-            lie.east_m.ravel()[first], lie.north_m.ravel()[first], blocks.lean_east[block], blocks.lean_north[block],
-            blocks.pixel_m[block],
+        across = (width + 1) // 2
+        four = np.flatnonzero(some[: (height + 1) // 2, :across].ravel()).astype(np.int32)
+        row, column = 2 * (four // across), 2 * (four % across)
+        first = row * width + column
+        block = self._block.take(first)
+        lines = Sights(
+            lie.east_m.take(first), lie.north_m.take(first), blocks.lean_east.take(block),
+            blocks.lean_north.take(block), blocks.pixel_m.take(block),
         )  # fmt: skip
-        top, bottom = self._standing.narrowed(four, 1.5 * longest[block], top[block], bottom[block], _SLICES)
+        reach = (1.5 * longest).astype(np.float32).take(block)
+        top, bottom = self._standing.narrowed(lines, reach, top.take(block), bottom.take(block), _SLICES)
         near = np.flatnonzero(top)
         if not len(near):
             return lie
-        which = (first[near] + np.array([[0], [1], [width], [width + 1]])).ravel()
-        inside = np.ones((4, len(near)), bool)
-        inside[1::2] = 2 * column[near] + 1 < width
-        inside[2:] &= 2 * row[near] + 1 < height
-        kept = np.flatnonzero(inside.ravel())
-        which, near = which[kept], np.tile(near, 4)[kept]
-        top, bottom, block = top[near], bottom[near], block[near]
-        place = np.stack([lie.east_m.ravel()[which], lie.north_m.ravel()[which]], axis=1)
+        # All four of them; at an odd edge some count twice.
+        row, column = row.take(near), column.take(near)
+        row = np.concatenate([row, row, np.minimum(row + 1, height - 1), np.minimum(row + 1, height - 1)])
+        column = np.concatenate([column, np.minimum(column + 1, width - 1)] * 2)
+        which, near = row * width + column, np.tile(near, 4)
+        top, bottom, block = top.take(near), bottom.take(near), block.take(near)
         lag = self._shutter.lag_s(np.arange(height))[:, None]
-        eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32)[which // width]
-        sights = _sights(place, eye, up.astype(np.float32)[block], blocks.pixel_m[block])
+        eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32).T
+        sights = _sights(
+            (lie.east_m.take(which), lie.north_m.take(which)), [axis.take(row) for axis in eye],
+            up.astype(np.float32).take(block), blocks.pixel_m.take(block),
+        )  # fmt: skip
         met = self._standing.met(sights, top, bottom)
         if met is None:
             return lie
@@ -141,18 +148,18 @@ class Terrain:
     def texture(self, lie: Lie) -> np.ndarray:
         """(H, W, 3) uint8: the colours where the pixels lie, averaged over as much ground as a pixel covers."""
         world = self._world
-        level = np.clip(np.log2(lie.pixel_m / world.texel_m), 0, len(self._levels) - 1.001)
-        whole = np.floor(level).astype(int)
+        level = np.clip(np.log2(lie.pixel_m / world.texel_m), 0, len(self._levels) - 1)
+        level = np.round(level * _BETWEEN).astype(int)
         picture = np.empty((*lie.east_m.shape, 3), np.uint8)
-        edges = [0, *(np.flatnonzero(np.diff(whole)) + 1).tolist(), len(whole)]
-        for first, last in pairwise(edges):
-            rows, at = slice(first, last), int(whole[first])
-            share = (level[rows] - at).astype(np.float32)
+        for first, last in _runs(level // _BETWEEN):
+            rows, at = slice(first, last), int(level[first]) // _BETWEEN
+            share = level[rows] % _BETWEEN
             fine = self._look(at, lie.east_m[rows], lie.north_m[rows])
-            if share.max() > 0.02:
+            if share.any():
                 coarse = self._look(at + 1, lie.east_m[rows], lie.north_m[rows])
-                weight = np.repeat(share[:, None], fine.shape[1], axis=1)
-                fine = cv2.blendLinear(fine, coarse, 1 - weight, weight)
+                for begin, end in _runs(share):
+                    part, weight = slice(begin, end), float(share[begin]) / _BETWEEN
+                    cv2.addWeighted(fine[part], 1 - weight, coarse[part], weight, 0, dst=fine[part])
             picture[rows] = fine
         if lie.met is not None:
             dim = lie.met.light != 1
@@ -181,10 +188,16 @@ class Terrain:
         return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
 
-def _sights(place_m: np.ndarray, eye_m: np.ndarray, up_m: np.ndarray, pixel_m: np.ndarray) -> Sights:
-    """The lines of sight from eyes (N, 3) to places (N, 2) that are so high (N,)."""
-    down = np.maximum(eye_m[:, 2] - up_m, _LEAST_M)
-    east, north = (eye_m[:, k] - place_m[:, k] for k in range(2))
-    down = np.maximum(down, np.hypot(east, north) / _MOST_LEAN)
-    columns = place_m[:, 0], place_m[:, 1], east / down, north / down, pixel_m
+def _runs(values: np.ndarray) -> Iterable[tuple[int, int]]:
+    """The first row of each run of equal values (N,), and the one after its last."""
+    return pairwise([0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)])
+
+
+def _sights(
+    place_m: Sequence[np.ndarray], eye_m: Sequence[np.ndarray | float], up_m: np.ndarray, pixel_m: np.ndarray
+) -> Sights:
+    """The lines of sight to places (east, north; N each) so high (N,), from eyes (east, north, up; N each, or one)."""
+    east, north = (eye - place for eye, place in zip(eye_m, place_m, strict=False))
+    down = np.maximum(eye_m[2] - up_m, np.maximum(np.hypot(east, north) / _MOST_LEAN, _LEAST_M))
+    columns = *place_m, east / down, north / down, pixel_m
     return Sights(*(np.ascontiguousarray(column, np.float32) for column in columns))
