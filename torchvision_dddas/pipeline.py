@@ -22,12 +22,16 @@ from torchvision_dddas.vision.protocol import EVIDENCE_SCALE, Foreground, Window
 
 @dataclass(frozen=True)
 class Found:
-    """One target of a frame. box: x, y, width, height. mask: (height, width) bool inside the box."""
+    """One target of a frame. box: x, y, width, height. mask: (height, width) bool inside the box.
+
+    core: the same of those pixels that differ by themselves, before gaps are closed and hulls are filled; None: all.
+    """
 
     box: tuple[int, int, int, int]
     mask: np.ndarray
     velocity_px: np.ndarray
     score: float
+    core: np.ndarray | None = None
 
 
 @dataclass
@@ -104,7 +108,9 @@ def draw_targets(
         velocity = motion.velocity_px if motion is not None else np.full(2, np.nan)
         score = score_of(blob.peak, settings)
         for box, part in parts_of(mask, blob.box, settings.gates.min_area_px // 2):
-            found.append(Found(box, part, velocity, score))
+            x, y = box[0] - blob.box[0], box[1] - blob.box[1]
+            core = blob.core[y : y + box[3], x : x + box[2]] & part
+            found.append(Found(box, part, velocity, score, core))
     return join(found)
 
 
@@ -151,12 +157,15 @@ def join(found: Sequence[Found]) -> list[Found]:
         parts = [found[i] for i in members]
         left, top = min(p.box[0] for p in parts), min(p.box[1] for p in parts)
         right, bottom = max(p.box[0] + p.box[2] for p in parts), max(p.box[1] + p.box[3] for p in parts)
-        mask = np.zeros((bottom - top, right - left), bool)
-        for x, y, width, height, part in ((*p.box, p.mask) for p in parts):
-            mask[y - top : y - top + height, x - left : x - left + width] |= part
+        mask, core = np.zeros((2, bottom - top, right - left), bool)
+        for p in parts:
+            x, y, width, height = p.box
+            window = np.s_[y - top : y - top + height, x - left : x - left + width]
+            mask[window] |= p.mask
+            core[window] |= p.mask if p.core is None else p.core
         largest = max(parts, key=lambda p: int(p.mask.sum()))
         box = (left, top, right - left, bottom - top)
-        joined.append(Found(box, mask, largest.velocity_px, max(p.score for p in parts)))
+        joined.append(Found(box, mask, largest.velocity_px, max(p.score for p in parts), core))
     return joined
 
 
@@ -180,3 +189,12 @@ def table(found: Sequence[Found], size: tuple[int, int]) -> tuple[Detections, np
         heading_rad=np.where(speed > 0, np.arctan2(velocity[:, 1], velocity[:, 0]), np.nan),
         speed_px=speed,
     ), mask
+
+
+def cores(found: Sequence[Found], size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool, the pixels of the targets that differ by themselves. size: (width, height)."""
+    core = np.zeros((size[1], size[0]), bool)
+    for target in found:
+        x, y, width, height = target.box
+        core[y : y + height, x : x + width] |= target.mask if target.core is None else target.core
+    return core

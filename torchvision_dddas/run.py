@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas import control, windows
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.pipeline import Found, Observation, admitted, draw_targets, observe, table
+from torchvision_dddas.pipeline import Found, Observation, admitted, cores, draw_targets, observe, table
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.sources.telemetry import at, check_overlap
 from torchvision_dddas.targets.history import MotionHistory
@@ -401,6 +401,7 @@ class Loop:
             adjustments=slot.adjustments,
             seconds=slot.seconds,
             step=self._at(index - 1).step if index > self.first else None,
+            core=cores(found, slot.view.size),
         )
 
     def _small_targets(self, index: int, found: list[Found]) -> list[Found]:

@@ -538,6 +538,8 @@ class Scene:
     reliable: False when registration could not be trusted: then the mask is empty and `cause` says why.
     interval_frames: the detection interval in force. seconds: time spent per stage on this frame.
     step: how the background moved since the frame before; None where there is none.
+    core: (H, W) bool, what of the mask differs from the background by itself, before gaps and hulls are filled; None:
+    all of it.
     """
 
     frame: Frame
@@ -549,6 +551,7 @@ class Scene:
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     step: Registration | None = None
+    core: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ def gathered(watched: Watched, locator: Locator, rate_hz: float) -> Watched:
     knobs, scene = locator.settings.crowds, watched.scene
     if not knobs.join_m or not len(scene.detections):
         return watched
-    found = replace(scene.detections, middle_px=with_middles(scene.detections, scene.mask))
+    found = replace(scene.detections, middle_px=with_middles(scene.detections, scene.mask, scene.core))
     place, radius, velocity = _on_ground(found, watched.look.fix, locator, rate_hz)
     crowd = together(place, radius, velocity, knobs.join_m, knobs.speed_m_s)
     detections, mask = joined(found, scene.mask, crowd)

@@ -15,8 +15,8 @@ from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
 from torchvision_dddas.vision.protocol import ColourFinder
 
-REACH = 0.6
-"""How far from its colour a vehicle reaches, in its lengths: its corners, and some of its shadow."""
+REACH = 0.75
+"""How far from its colour a vehicle reaches, in its lengths: its corners, and its shadow."""
 
 LEAST_M2 = 0.4
 """What is left of a blob beside a vehicle is a target from so much ground on: a person with a shadow."""

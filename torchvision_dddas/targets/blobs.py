@@ -84,7 +84,7 @@ def weak_blobs(
 
 
 def parts_of(
-    mask: np.ndarray, box: tuple[int, int, int, int], min_area_px: int
+    mask: np.ndarray, box: tuple[int, int, int, int], min_area_px: float
 ) -> list[tuple[tuple[int, int, int, int], np.ndarray]]:
     """The connected parts (8 neighbours) of a (height, width) mask in a box that are large enough: (box, mask) each."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)

@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float
 from torchvision_dddas.targets.blobs import parts_of
 from torchvision_dddas.types import Detections
 
+_OF_VEHICLE = 4
+
 
 def cut_out(
     found: Detections,
@@ -19,8 +21,8 @@ def cut_out(
     """The detections without the discs about vehicles' middles, and the (H, W) mask of them.
 
     vehicles: which of them are landmarks: of these stays what is left outside the discs, if it is large enough; where a
-    middle or radius is unknown (NaN), nothing. Parts smaller than least_px go. A target that no disc touches stays
-    as it is.
+    middle or radius is unknown (NaN), nothing. Parts smaller than least_px go, of landmarks those four times as large.
+    A target that no disc touches stays as it is.
     """
     known = np.isfinite(middle_px).all(axis=1) & np.isfinite(radius_px)
     outside = mask.copy()
@@ -36,7 +38,9 @@ def cut_out(
         touched = left.sum() < whole.sum()
         if vehicles[row] and not touched:
             continue
-        parts = parts_of(left, (max(x, 0), max(y, 0), width, height), max(int(least_px), 1)) if touched else []
+        # What a vehicle's own blob leaves outside is as a rule its shadow.
+        least = max(least_px * (_OF_VEHICLE if vehicles[row] else 1), 1)
+        parts = parts_of(left, (max(x, 0), max(y, 0), width, height), least) if touched else []
         if not touched:
             parts = [((x, y, width, height), whole)]
         for box, part in parts:

@@ -1,0 +1,43 @@
+"""The targets of followed frames under the names that they have on the ground."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from torchvision_dddas.geolocating.locator import Locator
+from torchvision_dddas.targets.rollcall import RollCall
+from torchvision_dddas.types import Fix, Followed
+
+
+def named(followed: Followed, fix: Fix, locator: Locator, roll: RollCall) -> Followed:
+    """The frame with its targets under the names that roll gives them; boxes that bridge a gap keep theirs.
+
+    fix: how its picture lies on the ground. Feed it frames in order.
+    """
+    tracks = followed.tracks
+    seen = np.flatnonzero(tracks.row >= 0)
+    box = tracks.box_px[seen]
+    middle = followed.detections.middle_px[tracks.row[seen]]
+    low, high = box[:, :2] - 0.5, box[:, :2] + box[:, 2:] - 0.5
+    middle = np.where(np.isfinite(middle), middle, (low + high) / 2)
+    unknown = np.full((len(seen), 2), np.nan)
+    place, radius = unknown, unknown[:, 0]
+    if fix.by and len(seen):
+        corners = low, high, np.c_[low[:, 0], high[:, 1]], np.c_[high[:, 0], low[:, 1]]
+        place, *ends = np.split(locator.places(fix, np.concatenate([middle, *corners])), 5)
+        across, along = (np.linalg.norm(a - b, axis=1) for a, b in ((ends[0], ends[3]), (ends[0], ends[2])))
+        radius = np.sqrt(across * along) / 2
+    identity = np.zeros(len(tracks), np.int64)
+    identity[seen] = roll.step(locator.time_s(followed.number), tracks.identity[seen], place, radius)
+    taken = set(identity[seen].tolist())
+    for row in np.flatnonzero(tracks.row < 0).tolist():
+        name = roll.name(int(tracks.identity[row]))
+        if name not in taken:
+            identity[row] = name
+            taken.add(name)
+    rows = np.flatnonzero(identity > 0)
+    rows = rows[np.argsort(identity[rows], kind="stable")]
+    kept = replace(
+        tracks, identity=identity[rows], box_px=tracks.box_px[rows], score=tracks.score[rows], row=tracks.row[rows]
+    )
+    return replace(followed, tracks=kept)
