@@ -1,5 +1,7 @@
 """What the UAV's camera films of a simulated world, and the truth of every pixel."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 
@@ -31,10 +33,15 @@ class AerialCamera:
 
     def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The picture (H, W, 3) uint8 BGR, its targets (H, W) uint16 and its bodies (H, W) uint16; 0: neither."""
-        lie = self._terrain.lie(moment)
-        picture = self._terrain.texture(lie)
+        # Both take about as long, and neither needs the other. A thread for each picture costs little, and none is left
+        # behind in a process that forks.
+        with ThreadPoolExecutor(1) as other:
+            drawing = other.submit(self._painter.drawn, moment)
+            lie = self._terrain.lie(moment)
+            picture = self._terrain.texture(lie)
+            drawn = drawing.result()
         targets, bodies = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
-        self._painter.paint(moment, picture, targets, bodies, lie.rise_m)
+        self._painter.paint(moment, drawn, picture, targets, bodies, lie.rise_m)
         if lie.haze is not None:
             air = np.empty_like(picture)
             air[:] = HAZE.astype(np.uint8)

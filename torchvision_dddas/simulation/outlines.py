@@ -13,7 +13,8 @@ from torchvision_dddas.simulation.sunlight import SHADE_BGR
 from torchvision_dddas.simulation.world import World
 
 _SKYLIGHT = 0.45  # how bright a face is that the sun does not reach
-_PLAIN_PX_M = 8.0  # where a metre is smaller, a limb has one tone
+_PLAIN_PX_M = 12.0  # where a metre is smaller, a limb has one tone
+_THICK_M = 0.055  # and than this out of shadows there
 _THIN_M = 0.04  # limbs thinner than this are left out there, and out of all shadows
 
 
@@ -86,7 +87,7 @@ class Shapes:
             both = np.stack([whole, part], axis=1).reshape(2 * len(whole), *whole.shape[1:])
             tones = np.stack([limb_colour * dark, limb_colour * bright], axis=1).reshape(-1, 3)
             people_seen = Outlines(limb_body.repeat(2), both, tones, up.repeat(2))
-        thick = radius.max(axis=1) > _THIN_M
+        thick = radius.max(axis=1) > (_THIN_M if scale_px_m >= _PLAIN_PX_M else _THICK_M)
         people_shade = Outlines(
             limb_body[thick], _capsules(ends_px[1][thick], radius_px[1][thick], points),
             np.zeros((thick.sum(), 3)), np.zeros(thick.sum()),

@@ -1,6 +1,7 @@
 """Paints people and vehicles into a picture from the air, with their shadows, and tells which pixels are theirs."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,10 +17,28 @@ _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _REACH_M = 5.0  # a body with its shadow reaches about so far
 _TALLEST_M = 2.5
 _STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # canvases are enlarged so many times for bodies of these sizes
+_WIDEST_PX = 400  # canvases of targets whose people are further apart would be large
 _CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
 _HIDDEN_M = 0.35  # what stands must be higher than a limb by so much to hide it
 _SIGHTS = 12  # places on the line of sight at which a hill may hide a body
 _SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
+
+
+class Sheet(NamedTuple):
+    """A canvas that is enlarged so many times, (h * step, w * step, ...), and which part of the picture it covers."""
+
+    body: int
+    at: tuple[slice, slice]
+    canvas: np.ndarray
+    step: int
+
+
+class Drawn(NamedTuple):
+    """Bodies (h, w, 4: BGR and height) and shadows (h, w), and the ways of bodies that move while they are exposed."""
+
+    sheets: list[Sheet]
+    shades: list[Sheet]
+    ways_px: dict[int, np.ndarray]
 
 
 class Painter:
@@ -38,39 +57,43 @@ class Painter:
         # How high the shadow of what stands about reaches above each cell.
         self._shade_m = sunlight.above_ground(np.asarray(surface + ground, np.float32), self._cell_m, world.to_sun)
 
-    def paint(
-        self,
-        moment: Moment,
-        picture: np.ndarray,
-        targets: np.ndarray,
-        numbers: np.ndarray,
-        rise_m: np.ndarray | None = None,
-    ) -> None:
-        """Paint all bodies into a picture (H, W, 3) uint8, and their numbers into masks (H, W).
-
-        rise_m: (H, W) height above ground of what stands and is seen; it hides what is behind it.
-        """
-        bodies = moment.bodies
+    def drawn(self, moment: Moment) -> Drawn:
+        """All bodies that a moment's picture may show, and their shadows, each on a canvas of its own."""
+        bodies, shape = moment.bodies, self._shutter.camera.size_px[::-1]
         rows, scale = self._in_view(moment)
         if not len(rows):
-            return
+            return Drawn([], [], {})
         shaded = self._shaded(moment, rows)
         solids, shadows = self._shapes.outlines(moment, rows, float(scale.max()), shaded)
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
         shadows = Outlines(*(column[in_sun[shadows.body]] for column in shadows))
-        self._shade(picture, Sheets(shadows, targets.shape), rise_m)
-        ways = self._own_ways(moment, rows)
-        sheets = Sheets(solids, targets.shape)
-        for body, at, canvas, step in sheets.drawn():
+        return Drawn(sheets(solids, shape), shades(shadows, bodies.target, shape), self._own_ways(moment, rows))
+
+    def paint(
+        self,
+        moment: Moment,
+        drawn: Drawn,
+        picture: np.ndarray,
+        targets: np.ndarray,
+        numbers: np.ndarray,
+        rise_m: np.ndarray | None = None,
+    ) -> None:
+        """Paint the drawn bodies into a picture (H, W, 3) uint8, and their numbers into masks (H, W).
+
+        rise_m: (H, W) height above ground of what stands and is seen; it hides what is behind it.
+        """
+        bodies = moment.bodies
+        _shade(picture, drawn.shades, rise_m)
+        for body, at, canvas, step in drawn.sheets:
             hide(canvas, step, rise_m, at)
-            cover = _averaged(_covered(canvas), step)
-            paint = _averaged(canvas, step)[..., :3]
+            cover = _averaged(_covered(cv2.extractChannel(canvas, 3)), step)
+            paint = np.ascontiguousarray(_averaged(canvas, step)[..., :3])
             mine = cover >= 128
-            targets[at][mine] = bodies.target[body]
-            numbers[at][mine] = bodies.number[body]
-            if body in ways:
-                at, cover, paint = _drawn_out(at, cover, paint, ways[body], targets.shape)
+            np.copyto(targets[at], bodies.target[body], where=mine, casting="unsafe")
+            np.copyto(numbers[at], bodies.number[body], where=mine, casting="unsafe")
+            if body in drawn.ways_px:
+                at, cover, paint = _drawn_out(at, cover, paint, drawn.ways_px[body], targets.shape)
             clear = cv2.cvtColor(255 - cover, cv2.COLOR_GRAY2BGR)
             picture[at] = cv2.add(cv2.multiply(picture[at], clear, scale=1 / 255), paint)
 
@@ -82,7 +105,8 @@ class Painter:
             moment, np.concatenate([bodies.place_m[rows] - step, bodies.place_m[rows] + step])
         )
         way = ends[len(rows) :] - ends[: len(rows)]
-        return {int(row): one for row, one in zip(rows, way, strict=True) if np.hypot(*one) > LEAST_PX}
+        visible = np.hypot(way[:, 0], way[:, 1]) > LEAST_PX
+        return dict(zip(rows[visible].tolist(), way[visible], strict=True))
 
     def _in_view(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
         """The rows of the bodies that the picture may show, far ones first, and pixels for each metre there."""
@@ -112,54 +136,76 @@ class Painter:
             above[at] = cv2.remap(self._shade_m, u[at], v[at], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[:, 0]
         return np.clip(above / 1.6, 0, 1)
 
-    def _shade(self, picture: np.ndarray, sheets: "Sheets", rise_m: np.ndarray | None) -> None:
-        """Darken a picture where shadows lie; where two lie on each other it is as dark as under one."""
-        layer = np.zeros(picture.shape[:2], np.uint8)
-        places = []
-        for _, at, canvas, step in sheets.drawn():
-            hide(canvas, step, rise_m, at)
-            cover = _averaged(_covered(canvas), step)
-            layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
-            places.append(at)
-        share = 1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)
-        keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
-        for at in places:
-            # Taken off the layer when done: where boxes overlap nothing is darkened twice.
-            dark = cv2.LUT(cv2.cvtColor(layer[at], cv2.COLOR_GRAY2BGR), keep)
-            picture[at] = cv2.multiply(picture[at], dark, scale=1 / 255)
-            layer[at] = 0
+
+def sheets(outlines: Outlines, shape: tuple[int, ...]) -> list[Sheet]:
+    """The outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
+    if not len(outlines.body):
+        return []
+    low, high = _boxes(outlines, shape)
+    steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
+    code = np.clip(1 + outlines.up_m * _CODES, 1, 255)
+    colours = np.c_[np.clip(outlines.colour, 0, 255), code].tolist()
+    return _sheets(outlines, low, high, steps, colours)
 
 
-class Sheets:
-    """Draws the outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
+def shades(outlines: Outlines, target: np.ndarray, shape: tuple[int, ...]) -> list[Sheet]:
+    """The shadows of all of a target on one canvas; target: (N,) of each body."""
+    if not len(outlines.body):
+        return []
+    each = _boxes(outlines, shape)
+    typical = float(np.median((each[1] - each[0]).max(axis=1)))
+    step = _STEPS[int(np.searchsorted(_SIZES_PX, typical))]
+    order = np.argsort(target[outlines.body], kind="stable")
+    joined = outlines._replace(body=target[outlines.body][order], points_px=outlines.points_px[order])
+    low, high = _boxes(joined, shape)
+    if (high - low).max() > _WIDEST_PX:
+        joined, (low, high) = outlines, each
+    return _sheets(joined, low, high, np.full(len(low), step), [255] * len(joined.body))
 
-    def __init__(self, outlines: Outlines, shape: tuple[int, ...]) -> None:
-        self._outlines = outlines
-        self._limit = np.array(shape[1::-1])
 
-    def drawn(self) -> Iterator[tuple[int, tuple[slice, slice], np.ndarray, int]]:
-        """Each body, where it is in the picture, its canvas (h * step, w * step, 4), and the step."""
-        outlines = self._outlines
-        if not len(outlines.body):
-            return
-        runs = outlines.runs
-        first = np.array([run[0] for run in runs])
-        low = np.floor(np.minimum.reduceat(outlines.points_px.min(axis=1), first)).astype(int) - 1
-        high = np.ceil(np.maximum.reduceat(outlines.points_px.max(axis=1), first)).astype(int) + 2
-        low, high = np.maximum(low, 0), np.minimum(high, self._limit)
-        steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
-        each = np.diff([*first, len(outlines.body)])
-        start, step_of = low.repeat(each, axis=0)[:, None], steps.repeat(each)[:, None, None]
-        fixed = np.round(((outlines.points_px - start + 0.5) * step_of - 0.5) * 2**_BITS)
-        fixed = np.clip(fixed, -(2**26), 2**26).astype(np.int32)
-        code = np.clip(1 + outlines.up_m * _CODES, 1, 255)
-        colours = np.c_[np.clip(outlines.colour, 0, 255), code].tolist()
-        for k in np.flatnonzero((high > low).all(axis=1)):
-            (x, y), (right, foot), step = low[k].tolist(), high[k].tolist(), int(steps[k])
-            canvas = np.zeros(((foot - y) * step, (right - x) * step, 4), np.uint8)
-            for row in range(*runs[k]):
-                cv2.fillConvexPoly(canvas, fixed[row], colours[row], cv2.LINE_8, _BITS)
-            yield int(outlines.body[runs[k][0]]), (slice(y, foot), slice(x, right)), canvas, step
+def _boxes(outlines: Outlines, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """(B, 2) column and row of the first pixel of each body, and of the one after its last."""
+    first, limit = np.array([run[0] for run in outlines.runs]), np.array(shape[1::-1])
+    low = np.floor(np.minimum.reduceat(outlines.points_px.min(axis=1), first)).astype(int) - 1
+    high = np.ceil(np.maximum.reduceat(outlines.points_px.max(axis=1), first)).astype(int) + 2
+    return np.maximum(low, 0), np.minimum(high, limit)
+
+
+def _sheets(
+    outlines: Outlines, low: np.ndarray, high: np.ndarray, steps: np.ndarray, colours: Sequence[float | list[float]]
+) -> list[Sheet]:
+    runs = outlines.runs
+    each = np.diff([*(run[0] for run in runs), len(outlines.body)])
+    start, step_of = low.repeat(each, axis=0)[:, None], steps.repeat(each)[:, None, None]
+    fixed = np.round(((outlines.points_px - start + 0.5) * step_of - 0.5) * 2**_BITS)
+    corners = list(np.clip(fixed, -(2**26), 2**26).astype(np.int32))
+    found = []
+    for k in np.flatnonzero((high > low).all(axis=1)).tolist():
+        (x, y), (right, foot), step = low[k].tolist(), high[k].tolist(), int(steps[k])
+        first, last = runs[k]
+        layers = () if isinstance(colours[first], int) else (4,)
+        canvas = np.zeros(((foot - y) * step, (right - x) * step, *layers), np.uint8)
+        for row in range(first, last):
+            cv2.fillConvexPoly(canvas, corners[row], colours[row], cv2.LINE_8, _BITS)
+        found.append(Sheet(int(outlines.body[first]), (slice(y, foot), slice(x, right)), canvas, step))
+    return found
+
+
+def _shade(picture: np.ndarray, shades: list[Sheet], rise_m: np.ndarray | None) -> None:
+    """Darken a picture where shadows lie; where two lie on each other it is as dark as under one."""
+    layer = np.zeros(picture.shape[:2], np.uint8)
+    for _, at, canvas, step in shades:
+        cover = _averaged(canvas, step)
+        if rise_m is not None:
+            cover[rise_m[at] > _HIDDEN_M] = 0
+        layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
+    share = 1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)
+    keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
+    for _, at, _, _ in shades:
+        # Taken off the layer when done: where boxes overlap nothing is darkened twice.
+        dark = cv2.LUT(cv2.cvtColor(layer[at], cv2.COLOR_GRAY2BGR), keep)
+        picture[at] = cv2.multiply(picture[at], dark, scale=1 / 255)
+        layer[at] = 0
 
 
 def hide(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[slice, slice]) -> None:
@@ -189,8 +235,8 @@ def _drawn_out(
 
 
 def _covered(canvas: np.ndarray) -> np.ndarray:
-    """255 where anything is drawn on a canvas."""
-    return cv2.threshold(cv2.extractChannel(canvas, 3), 0, 255, cv2.THRESH_BINARY)[1]
+    """255 where anything is drawn on a canvas (h, w)."""
+    return cv2.threshold(canvas, 0, 255, cv2.THRESH_BINARY)[1]
 
 
 def _averaged(canvas: np.ndarray, step: int) -> np.ndarray:

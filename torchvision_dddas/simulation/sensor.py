@@ -1,11 +1,13 @@
 """From light to a file: the lens blurs, exposure drifts, the sensor adds noise, the compression its blocks."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.scenario import CameraKnobs
 
-_BAND = 32
+_BAND, _BLOCK = 32, 16  # rows
 _SPARE_PX = 192  # a tile of noise is so much larger than the picture, so that its start can vary
 
 
@@ -47,19 +49,28 @@ class Sensor:
                 sigma = -sigma
         if knobs.sharpness_px > 0:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), knobs.sharpness_px))
-        if grain is None:
-            picture = np.asarray(cv2.LUT(picture, np.asarray(np.clip(np.round(levels), 0, 255), np.uint8)))
-        else:
-            noisy = np.empty_like(picture)
-            # Bands of rows that the processor's cache holds.
-            for first in range(0, len(picture), _BAND):
-                rows = slice(first, first + _BAND)
-                noise = cv2.LUT(picture[rows], sigma)
-                pattern = np.asarray(cv2.flip(grain[rows], 1)) if turned else grain[rows]
-                np.multiply(noise, pattern, out=noise)
-                cv2.add(cv2.LUT(picture[rows], levels), noise, dst=noisy[rows], dtype=cv2.CV_8U)
-            picture = noisy
-        if knobs.quality < 100:
-            _, file = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, knobs.quality])
-            picture = np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))
-        return picture
+        developed = np.empty_like(picture)
+
+        def develop(part: slice) -> None:
+            if grain is None:
+                cv2.LUT(picture[part], np.asarray(np.clip(np.round(levels), 0, 255), np.uint8), dst=developed[part])
+            else:
+                # Bands of rows that the processor's cache holds.
+                for first in range(part.start, part.stop, _BAND):
+                    rows = slice(first, min(first + _BAND, part.stop))
+                    noise = cv2.LUT(picture[rows], sigma)
+                    pattern = np.asarray(cv2.flip(grain[rows], 1)) if turned else grain[rows]
+                    np.multiply(noise, pattern, out=noise)
+                    cv2.add(cv2.LUT(picture[rows], levels), noise, dst=developed[rows], dtype=cv2.CV_8U)
+            if knobs.quality < 100:
+                _, file = cv2.imencode(".jpg", developed[part], [cv2.IMWRITE_JPEG_QUALITY, knobs.quality])
+                developed[part] = cv2.imdecode(file, cv2.IMREAD_COLOR)
+
+        # Two halves at a time: they share no block of the compression.
+        middle, height = len(picture) // 2 // _BLOCK * _BLOCK, len(picture)
+        with ThreadPoolExecutor(1) as other:
+            upper = other.submit(develop, slice(0, middle)) if middle else None
+            develop(slice(middle, height))
+            if upper is not None:
+                upper.result()
+        return developed

@@ -14,7 +14,7 @@ from torchvision_dddas.simulation.world import World
 
 _STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
 _LEVELS = 8
-_BETWEEN = 16  # shares in which two levels are mixed
+_BETWEEN = 32  # shares in which two levels are mixed
 _SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
 _VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
 _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
