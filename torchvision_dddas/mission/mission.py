@@ -38,6 +38,8 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     watch = Watch(locator, colours, load_colours(backend)) if by_landmarks else Watch(locator, None, None)
     closer = CloserLook(settings, recognizer_of(settings.people, backend)) if len(colours) else None
     steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
+    if steering is not None:
+        source.steer(steering.begin(locator.flight(0.0)))
     return Mission(source, watch, settings, closer, steering)
 
 

@@ -81,7 +81,6 @@ class SimulatorSource:
                 self.problems.append(Problem(self.last, f"frame {self.last} was dropped by the camera"))
                 continue
             yield shot.frame
-        self.last = self._simulator.frames
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are drawn as well, so that what was seen stays the same."""

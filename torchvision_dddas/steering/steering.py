@@ -39,6 +39,15 @@ class Steering:
         self._sampled_s = -np.inf
         self._every, self._before, self._alert_s, self._alert = 1, 0, -np.inf, ""
 
+    def begin(self, flight: Flight | None) -> Command:
+        """Before anything is found: as many frames as a walker needs to show at this altitude."""
+        knobs = self.settings.steering
+        if knobs.on and knobs.sampling and flight is not None and flight.altitude_m > 0:
+            least = every_least(self.camera.focal_px[0] / flight.altitude_m, self.rate_hz, knobs)
+            self._every = int(np.clip(round(least), 1, knobs.maximum_every))
+        self._command = Command(self._every)
+        return self._command
+
     def step(
         self,
         grounded: Grounded,
