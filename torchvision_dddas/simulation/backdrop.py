@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.camera import View
+from torchvision_dddas.simulation.runs import runs
 from torchvision_dddas.simulation.world import World
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
@@ -16,6 +17,7 @@ _FAR_M = 1500.0
 _COLUMN_PX = 16  # rays are cast so many columns apart
 _STEPS = 110  # places on the ground on each ray
 _LEVELS = 7
+_BETWEEN = 32  # shares in which two levels, or ground and air, are mixed
 _TILE = 512  # side of the pattern of pebbles, in its own texels
 _GRAIN_M = (0.007, 0.031)  # its texels, laid out twice
 
@@ -51,6 +53,7 @@ class Backdrop:
             self._levels.append(cv2.resize(above, size, interpolation=cv2.INTER_AREA))
         rng = np.random.default_rng([seed, 60])
         self._pebbles = _pebbles(rng)
+        self._maps: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         self._ridge = rng.uniform(0.3, 1, 6) / np.arange(1, 7), rng.uniform(0, 2 * np.pi, 6)
 
     def seen(self, view: View, size: tuple[int, int]) -> Seen:
@@ -60,23 +63,34 @@ class Backdrop:
         rays = _rays(view, columns, height)
         inverse = self._inverse_distance(view, rays)
         # Between the columns all goes evenly; cv2.resize would count from the pixels' edges.
-        at = np.linspace(0, len(columns) - 1, width, dtype=np.float32)
-        whole_inverse = _widened(inverse, at)
+        whole_inverse = self._widened(inverse, width)
         whole_inverse[whole_inverse < 0.5 / _FAR_M] = 0
-        rows = np.flatnonzero((whole_inverse > 0).any(axis=1))
+        ground_there = whole_inverse > 0
+        rows = np.flatnonzero(ground_there.any(axis=1))
         first = int(rows[0]) if len(rows) else height
         image = np.empty((height, width, 3), np.uint8)
         last = min(first + _COLUMN_PX * 4, height)  # the ground's edge need not be level
-        while last < height and not (whole_inverse[last] > 0).all():
+        while last < height and not ground_there[last].all():
             last += 1
         sky = self._sky(_Rays(*(part[:last] for part in rays)), view)
-        image[:last] = _widened(sky, at)
+        image[:last] = self._widened(sky, width)
         if first < height:
-            ground = self._ground(view, whole_inverse[first:], _rays(view, np.arange(width), height, first), first)
+            ground = self._ground(view, whole_inverse[first:], _Rays(*(part[first:] for part in rays)))
             mixed, onto = last - first, image[first:last]
-            onto[:] = np.where((whole_inverse[first:last] > 0)[..., None], ground[:mixed], onto)
+            onto[:] = np.where(ground_there[first:last, :, None], ground[:mixed], onto)
             image[last:] = ground[mixed:]
         return Seen(image, whole_inverse)
+
+    def _widened(self, image: np.ndarray, width: int) -> np.ndarray:
+        """(H, width) of an image (H, C) of some columns, evenly between them."""
+        shape = *image.shape[:2], width
+        if shape not in self._maps:
+            at = np.linspace(0, shape[1] - 1, width, dtype=np.float32)
+            v = np.arange(shape[0], dtype=np.float32)[:, None]
+            u, v = (np.ascontiguousarray(np.broadcast_to(one, (shape[0], width))) for one in (at, v))
+            self._maps[shape] = u, v
+        u, v = self._maps[shape]
+        return cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
 
     def _inverse_distance(self, view: View, rays: _Rays) -> np.ndarray:
         """(H, C) on each ray the first place at which the ground reaches it, as 1 / metres; 0: none."""
@@ -93,46 +107,64 @@ class Backdrop:
             inverse[:, k] = np.interp(-rays.rise[:, k], slopes[::-1, k], 1 / r[::-1], left=0.0)
         return inverse
 
-    def _ground(self, view: View, inverse: np.ndarray, rays: _Rays, first: int) -> np.ndarray:
-        """(H, W, 3) uint8, rows from the first on which there is ground."""
+    def _ground(self, view: View, inverse: np.ndarray, rays: _Rays) -> np.ndarray:
+        """(H, W, 3) uint8, the rows on which there is ground. rays: those of some columns."""
         inverse = np.maximum(inverse, np.float32(0.5 / _FAR_M))
-        depth = 1 / (inverse * rays.level)
-        x = rays.east * depth + np.float32(view.position_m[0])
-        y = rays.north * depth + np.float32(view.position_m[1])
+        x, y = (
+            cv2.divide(self._widened(way / rays.level, inverse.shape[1]), inverse) for way in (rays.east, rays.north)
+        )
+        place = view.position_m[:2]
         focal = float(np.linalg.norm(view.image_from_world[0, :3]))
-        eye = max(float(view.position_m[2] - self._world.up_m(view.position_m[None, :2])[0]), 0.2)
+        eye = max(float(view.position_m[2] - self._world.up_m(place[None])[0]), 0.2)
         # A pixel covers far / focal across and far^2 / (focal eye) along the line of sight; alike all along a row.
         far = 1 / np.median(inverse[:, ::16], axis=1)
         across, along = far / focal, far**2 / (focal * eye)
         blur = np.log2(np.maximum(np.sqrt(across * along) / self._world.texel_m, 1))
-        blur = np.clip(blur, 0, len(self._levels) - 1.001)
-        clear = np.exp(-far / VISIBILITY_M).astype(np.float32)
+        blur = np.round(np.clip(blur, 0, len(self._levels) - 1) * _BETWEEN).astype(int)
+        clear = np.round(np.exp(-far / VISIBILITY_M) * _BETWEEN).astype(int) / _BETWEEN
         image = np.empty((*x.shape, 3), np.uint8)
-        for k in np.unique(np.floor(blur).astype(int)):
-            rows = np.flatnonzero(np.floor(blur) == k)
-            part = slice(int(rows[0]), int(rows[-1]) + 1)
-            fine = self._texture(int(k), x[part], y[part])
-            share = (blur[part] - k).astype(np.float32)[:, None, None]
-            if share.max() > 0:
-                fine = fine + (self._texture(int(k) + 1, x[part], y[part]) - fine) * share
-            for grain in _GRAIN_M:
-                strength = np.clip(1.3 - along[part] / (6 * grain), 0, 1).astype(np.float32)
-                if strength.max() > 0:
-                    near = slice(int(np.argmax(strength > 0)), None)  # farther rows are above
-                    # Beyond 16 bits OpenCV would lose count of the tiles.
-                    u, v = (np.mod(c[part][near] / np.float32(grain), np.float32(_TILE)) for c in (x, y))
-                    pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-                    pebbles = 1 + strength[near, None] * pebbles
-                    fine[near] = cv2.multiply(fine[near], cv2.merge([pebbles] * 3))
-            share = clear[part, None, None]
-            image[part] = np.clip(fine * share + HAZE * (1 - share), 0, 255)
+        air = np.broadcast_to(np.round(HAZE).astype(np.uint8), image.shape)
+        for first, last in runs(blur // _BETWEEN):
+            part, k = slice(first, last), int(blur[first]) // _BETWEEN
+            fine = self._texture(k, x[part], y[part], place)
+            share = blur[part] % _BETWEEN
+            if share.any():
+                coarse = self._texture(k + 1, x[part], y[part], place)
+                for begin, end in runs(share):
+                    weight = float(share[begin]) / _BETWEEN
+                    cv2.addWeighted(fine[begin:end], 1 - weight, coarse[begin:end], weight, 0, dst=fine[begin:end])
+            image[part] = fine
+        self._strew(image, x, y, place, along)
+        for begin, end in runs(clear):
+            if clear[begin] < 1:
+                haze = np.ascontiguousarray(air[begin:end])
+                cv2.addWeighted(image[begin:end], clear[begin], haze, 1 - clear[begin], 0, dst=image[begin:end])
         return image
 
-    def _texture(self, level: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        texture, half = self._levels[level], np.float32(self._world.side_m / 2)
-        per_m = np.float32(texture.shape[1] / self._world.side_m)
-        u, v = (x + half) * per_m - np.float32(0.5), (half - y) * per_m - np.float32(0.5)
-        return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32)
+    def _strew(self, image: np.ndarray, x: np.ndarray, y: np.ndarray, place_m: np.ndarray, along_m: np.ndarray) -> None:
+        """Lay pebbles on the ground of a picture, x east and y north of a place, where it is near enough."""
+        for grain in _GRAIN_M:
+            strength = np.clip(1.3 - along_m / (6 * grain), 0, 1).astype(np.float32)
+            if strength.max() > 0:
+                near = slice(int(np.argmax(strength > 0)), None)  # farther rows are above
+                laid = []
+                for way, start in zip((x, y), place_m, strict=True):
+                    texel = cv2.addWeighted(way[near], 1 / grain, way[near], 0, float(np.mod(start / grain, _TILE)))
+                    # Beyond 16 bits OpenCV would lose count of the tiles.
+                    tiles = np.floor(texel * np.float32(1 / _TILE))
+                    texel -= np.multiply(tiles, np.float32(_TILE), out=tiles)
+                    laid.append(texel)
+                pebbles = cv2.remap(self._pebbles, *laid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                pebbles *= 64 * strength[near, None]
+                bright = cv2.cvtColor(cv2.add(pebbles, 64.0, dtype=cv2.CV_8U), cv2.COLOR_GRAY2BGR)
+                cv2.multiply(image[near], bright, dst=image[near], scale=1 / 64)
+
+    def _texture(self, level: int, x: np.ndarray, y: np.ndarray, place_m: np.ndarray) -> np.ndarray:
+        texture, half = self._levels[level], self._world.side_m / 2
+        per_m = texture.shape[1] / self._world.side_m
+        u = cv2.addWeighted(x, per_m, x, 0, (half + float(place_m[0])) * per_m - 0.5)
+        v = cv2.addWeighted(y, -per_m, y, 0, (half - float(place_m[1])) * per_m - 0.5)
+        return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
     def _sky(self, rays: _Rays, view: View) -> np.ndarray:
         """(H, C, 3) float32."""
@@ -147,21 +179,13 @@ class Backdrop:
         return sky + (_RIDGE * 0.6 + HAZE * 0.4 - sky) * covered
 
 
-def _rays(view: View, columns: np.ndarray, height: int, first: int = 0) -> _Rays:
-    """Those through some columns of a picture, from its row `first` on."""
+def _rays(view: View, columns: np.ndarray, height: int) -> _Rays:
+    """Those through some columns of a picture."""
     matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # of a pixel (u, v, 1)
-    u, v = columns.astype(np.float32), np.arange(first, height, dtype=np.float32)[:, None]
+    u, v = columns.astype(np.float32), np.arange(height, dtype=np.float32)[:, None]
     east, north, up = (matrix[i, 0] * u + (matrix[i, 1] * v + matrix[i, 2]) for i in range(3))
     level = cv2.magnitude(east, north)
     return _Rays(east, north, level, up / level)
-
-
-def _widened(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(H, W) of an image (H, C) whose columns are looked up, evenly between them, at `at` (W,)."""
-    shape = len(image), len(at)
-    v = np.arange(len(image), dtype=np.float32)[:, None]
-    u, v = (np.ascontiguousarray(np.broadcast_to(one, shape)) for one in (at, v))
-    return cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
 
 
 def _pebbles(rng: np.random.Generator) -> np.ndarray:

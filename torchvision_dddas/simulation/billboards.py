@@ -54,10 +54,11 @@ def draw_plant(
         along, start = -along, right - x0 - 0.5 * along - 0.5
     place = np.array([[along, 0, start], [0, down, top - y0 + 0.5 * down - 0.5]])
     seen = cv2.warpAffine(layer, place, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    cover, light = seen[..., :1], seen[..., 1:]
+    clear = cv2.transform(seen, np.array([[-1.0, 0, 1]] * 3))
+    lit = cv2.transform(seen, np.c_[np.zeros(3), colour])
     part = canvas.picture[y0:y1, x0:x1]
-    part[:] = np.minimum(part * (1 - cover) + light * colour.astype(np.float32), 255)
-    canvas.mask[y0:y1, x0:x1][cover[..., 0] > 0.5] = 0
+    part[:] = cv2.add(cv2.multiply(part, clear, dtype=cv2.CV_32F), lit, dtype=cv2.CV_8U)
+    np.copyto(canvas.mask[y0:y1, x0:x1], 0, where=seen[..., 0] > 0.5)
 
 
 def draw_building(

@@ -13,7 +13,7 @@ _TROUSERS = ((92, 66, 48), (40, 38, 36), (70, 70, 72), (84, 112, 132), (56, 74, 
 _SKIN = ((142, 172, 214), (104, 140, 188), (78, 108, 156), (52, 74, 112))
 _HAIR = ((22, 24, 28), (34, 48, 66), (60, 82, 110), (110, 112, 116))
 _SHOES = np.array([34.0, 36, 42])
-_ROUND = np.linspace(0, np.pi, 8)
+_ROUND = np.stack([np.cos(np.linspace(0, np.pi, 8)), np.sin(np.linspace(0, np.pi, 8))], axis=1)
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _UP = np.array([0.0, 0.0, 1.0])
 _LEAST_WRINKLED_PX = 30
@@ -161,9 +161,11 @@ def outlines(
 def _hulls(px: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Outlines (L, 16, 2) of limbs with ends (L, 2, 2) and radii (L, 2), px: half a circle about each end."""
     way = px[:, 1] - px[:, 0]
-    angle = np.arctan2(way[:, 1], way[:, 0])
-    turn = np.stack([angle[:, None] + np.pi / 2 + _ROUND, angle[:, None] - np.pi / 2 + _ROUND], axis=1)
-    circles = px[:, :, None] + size[:, :, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    length = np.hypot(way[:, 0], way[:, 1])[:, None]
+    ahead = np.where(length > 1e-9, way / np.maximum(length, 1e-9), (1.0, 0.0))
+    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    half = _ROUND[:, :1] * aside[:, None] - _ROUND[:, 1:] * ahead[:, None]
+    circles = px[:, :, None] + size[:, :, None, None] * np.stack([half, -half], axis=1)
     return circles.reshape(len(px), -1, 2)
 
 

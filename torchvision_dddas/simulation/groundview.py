@@ -154,8 +154,10 @@ class GroundCamera:
             mover = n >= len(standing)
             if gone[n] and not mover:
                 continue
-            part = _inside(boxes[n], self.size_px)
-            before = (canvas.picture[part].copy(), canvas.mask[part].copy()) if covered[n] else None
+            part, before = (slice(0), slice(0)), None
+            if covered[n]:
+                part = _inside(boxes[n], self.size_px)
+                before = canvas.picture[part].copy(), canvas.mask[part].copy()
             haze = 1 - float(np.exp(-distance[n] / VISIBILITY_M))
             if not mover:
                 self._draw_thing(int(standing[n]), boxes[n], view, canvas, haze)

@@ -1,6 +1,5 @@
 """Bodies and their shadows as convex outlines in a picture from the air."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from torchvision_dddas.simulation import vehicles
 from torchvision_dddas.simulation.figures import Dress, dress, figures
 from torchvision_dddas.simulation.moment import Moment
+from torchvision_dddas.simulation.runs import runs
 from torchvision_dddas.simulation.shutter import Shutter
 from torchvision_dddas.simulation.sunlight import SHADE_BGR
 from torchvision_dddas.simulation.world import World
@@ -33,7 +33,7 @@ class Outlines(NamedTuple):
     @property
     def runs(self) -> list[tuple[int, int]]:
         """The first row of each body and the one after its last."""
-        return list(pairwise([0, *(np.flatnonzero(np.diff(self.body)) + 1).tolist(), len(self.body)]))
+        return list(runs(self.body))
 
 
 class Shapes:

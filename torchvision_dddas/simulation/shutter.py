@@ -59,6 +59,7 @@ class Shutter:
             terms += [away @ (once @ once @ pose.axes / 2) + slide @ (once @ pose.axes)]
         seen = terms[0]
         # The row tells the time and the time the row; the shutter is far faster than what moves.
+        row = np.zeros(0)
         for again in range(3 if self.readout_s > 0 else 1):
             if again:
                 lag = self.lag_s(row)[:, None]

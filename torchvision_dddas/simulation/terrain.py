@@ -1,7 +1,6 @@
 """The ground of a world as a camera above it sees it: where each pixel lies, and its colour."""
 
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -9,6 +8,7 @@ import numpy as np
 
 from torchvision_dddas.simulation.march import Met, Sights, Standing
 from torchvision_dddas.simulation.moment import Moment
+from torchvision_dddas.simulation.runs import runs
 from torchvision_dddas.simulation.shutter import Shutter, landing
 from torchvision_dddas.simulation.world import World
 
@@ -83,7 +83,7 @@ class Terrain:
         lie = Lie(east, north, each_row, haze=self._enlarged(haze) if haze.max() > _CLEAR else None)
         if self._standing.tallest_m <= 0:
             return lie
-        sights = _sights(place.reshape(-1, 2).T, start.T, up, pixel_m.ravel())
+        sights = _sights(list(place.reshape(-1, 2).T), list(start.T), up, pixel_m.ravel())
         longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
         top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
         # Low things that lean by less than a pixel may lie flat.
@@ -151,13 +151,13 @@ class Terrain:
         level = np.clip(np.log2(lie.pixel_m / world.texel_m), 0, len(self._levels) - 1)
         level = np.round(level * _BETWEEN).astype(int)
         picture = np.empty((*lie.east_m.shape, 3), np.uint8)
-        for first, last in _runs(level // _BETWEEN):
+        for first, last in runs(level // _BETWEEN):
             rows, at = slice(first, last), int(level[first]) // _BETWEEN
             share = level[rows] % _BETWEEN
             fine = self._look(at, lie.east_m[rows], lie.north_m[rows])
             if share.any():
                 coarse = self._look(at + 1, lie.east_m[rows], lie.north_m[rows])
-                for begin, end in _runs(share):
+                for begin, end in runs(share):
                     part, weight = slice(begin, end), float(share[begin]) / _BETWEEN
                     cv2.addWeighted(fine[part], 1 - weight, coarse[part], weight, 0, dst=fine[part])
             picture[rows] = fine
@@ -186,11 +186,6 @@ class Terrain:
         u = cv2.addWeighted(east_m, across, east_m, 0, half * across - 0.5)
         v = cv2.addWeighted(north_m, -down, north_m, 0, half * down - 0.5)
         return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-
-
-def _runs(values: np.ndarray) -> Iterable[tuple[int, int]]:
-    """The first row of each run of equal values (N,), and the one after its last."""
-    return pairwise([0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)])
 
 
 def _sights(
