@@ -154,9 +154,11 @@ class Backdrop:
                     tiles = np.floor(texel * np.float32(1 / _TILE))
                     texel -= np.multiply(tiles, np.float32(_TILE), out=tiles)
                     laid.append(texel)
-                pebbles = cv2.remap(self._pebbles, *laid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-                pebbles *= 64 * strength[near, None]
-                bright = cv2.cvtColor(cv2.add(pebbles, 64.0, dtype=cv2.CV_8U), cv2.COLOR_GRAY2BGR)
+                u, v = laid
+                pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                weight = np.repeat(64 * strength[near, None], pebbles.shape[1], axis=1)
+                bright = cv2.multiply(pebbles, weight)
+                bright = cv2.cvtColor(cv2.convertScaleAbs(bright, alpha=1, beta=64), cv2.COLOR_GRAY2BGR)
                 cv2.multiply(image[near], bright, dst=image[near], scale=1 / 64)
 
     def _texture(self, level: int, x: np.ndarray, y: np.ndarray, place_m: np.ndarray) -> np.ndarray:

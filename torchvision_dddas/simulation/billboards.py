@@ -19,6 +19,7 @@ _DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
 _WHEEL_M = (0.7, 0.3, 0.33)  # from the middle to a wheel's, its width, its radius
 _SPOKES = 12
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
+_CLEAR = np.array([[-1.0, 0, 1]] * 3)  # of what is covered: what is not, three times
 NEAR_M = 0.4  # what is nearer to the camera, in depth, is not drawn
 
 
@@ -54,8 +55,8 @@ def draw_plant(
         along, start = -along, right - x0 - 0.5 * along - 0.5
     place = np.array([[along, 0, start], [0, down, top - y0 + 0.5 * down - 0.5]])
     seen = cv2.warpAffine(layer, place, (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    clear = cv2.transform(seen, np.array([[-1.0, 0, 1]] * 3))
-    lit = cv2.transform(seen, np.c_[np.zeros(3), colour])
+    clear = cv2.transform(seen, _CLEAR)
+    lit = cv2.transform(seen, np.array([[0.0, tone] for tone in colour.tolist()]))
     part = canvas.picture[y0:y1, x0:x1]
     part[:] = cv2.add(cv2.multiply(part, clear, dtype=cv2.CV_32F), lit, dtype=cv2.CV_8U)
     np.copyto(canvas.mask[y0:y1, x0:x1], 0, where=seen[..., 0] > 0.5)

@@ -151,7 +151,8 @@ def outlines(
     ends_m: np.ndarray, radius_m: np.ndarray, view: View, widen: float = 1.0, aside: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
     """(L, 16, 2) pixels of limbs (L, 2, 3), (L, 2), so much wider, moved aside by shares of their radius."""
-    seen = ends_m @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]
+    seen = ends_m.reshape(-1, 3) @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]
+    seen = seen.reshape(ends_m.shape)
     depth = seen[..., 2]
     size = radius_m * np.linalg.norm(view.image_from_world[0, :3]) / depth
     px = seen[..., :2] / depth[..., None] + size[..., None] * aside
@@ -191,8 +192,10 @@ def draw_figure(
     whole = outlines(ends_m, radius_m, view)
     part = outlines(ends_m, radius_m, view, 0.66 + 0.2 * front, (side * 0.32 * (1 - abs(facing)), -0.12))
     dark, bright = (np.clip(colour * tone, 0, 255).tolist() for tone in (0.62 + 0.12 * front, 0.82 + 0.25 * front))
-    fixed_whole, fixed_part = (np.round(np.clip(one, -3e4, 3e4) * 2**_BITS).astype(np.int32) for one in (whole, part))
-    for k in np.argsort(-away):
+    fixed_whole, fixed_part = (
+        list(np.round(np.clip(one, -3e4, 3e4) * 2**_BITS).astype(np.int32)) for one in (whole, part)
+    )
+    for k in np.argsort(-away).tolist():
         cv2.fillConvexPoly(canvas.picture, fixed_whole[k], dark[k], cv2.LINE_AA, _BITS)
         cv2.fillConvexPoly(canvas.mask, fixed_whole[k], value, cv2.LINE_8, _BITS)
         cv2.fillConvexPoly(canvas.picture, fixed_part[k], bright[k], cv2.LINE_AA, _BITS)

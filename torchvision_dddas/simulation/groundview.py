@@ -1,12 +1,13 @@
 """What the camera of a ground vehicle sees: sky, ground, what stands on it, people, cars and the other vehicles."""
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation import vehicles
-from torchvision_dddas.simulation.backdrop import HAZE, VISIBILITY_M, Backdrop
+from torchvision_dddas.simulation.backdrop import HAZE, VISIBILITY_M, Backdrop, Seen
 from torchvision_dddas.simulation.billboards import NEAR_M, draw_building, draw_plant, draw_vehicle, plants, rover
 from torchvision_dddas.simulation.bodies import Canvas
 from torchvision_dddas.simulation.camera import View, axes, view_of
@@ -112,17 +113,19 @@ class GroundCamera:
     def _drawn(self, moment: Moment, vehicle: int) -> tuple[np.ndarray, np.ndarray, View, dict[int, np.ndarray]]:
         """Picture, mask, view, and by number the outlines of each person's limbs."""
         view = self.view(moment, vehicle)
-        seen = self._backdrop.seen(view, self.size_px)
-        canvas = Canvas(seen.image)
-        whole = self._draw(moment.bodies, vehicle, view, canvas, seen.inverse_m)
+        # The ground is looked up while the bodies and their shadows are laid out.
+        with ThreadPoolExecutor(1) as other:
+            canvas, whole = self._draw(
+                moment.bodies, vehicle, view, other.submit(self._backdrop.seen, view, self.size_px)
+            )
         if vehicle not in self._sensors:
             self._sensors[vehicle] = Sensor(_SENSOR, self.size_px, self._scenario.seed, _STREAM + vehicle)
         image = self._sensors[vehicle].expose(canvas.picture, moment.number, moment.time_s)
         return image, canvas.mask, view, whole
 
     def _draw(
-        self, bodies: Bodies, vehicle: int, view: View, canvas: Canvas, inverse_m: np.ndarray
-    ) -> dict[int, np.ndarray]:
+        self, bodies: Bodies, vehicle: int, view: View, looking: Future[Seen]
+    ) -> tuple[Canvas, dict[int, np.ndarray]]:
         things, eye = self._world.things, view.position_m
         far = np.hypot(*(things.east_north_m - eye[:2]).T)
         least = _LEAST_PX / self.focal_px[1]
@@ -137,7 +140,7 @@ class GroundCamera:
         people = moving[bodies.kind[moving] == "person"]
         limbs = self._limbs(bodies, people)
         row_of = {int(k): row for row, k in enumerate(people)}
-        self._shade(bodies, moving, limbs, row_of, view, canvas.picture, away)
+        shadows = self._shadows(bodies, moving, limbs, row_of, view, away)
 
         feet = np.concatenate([np.c_[things.east_north_m[standing], self._foot_m[standing]], bodies.place_m[moving]])
         distance = np.concatenate([far[standing], away[moving]])
@@ -148,6 +151,9 @@ class GroundCamera:
             ]
         )
         boxes = self._boxes(feet, size, view)
+        backdrop, inverse_m = looking.result()
+        canvas = Canvas(backdrop)
+        _darken(backdrop, shadows)
         covered, gone = self._behind_ground(boxes, distance, inverse_m)
         whole: dict[int, np.ndarray] = {}
         for n in np.argsort(-distance).tolist():
@@ -176,7 +182,7 @@ class GroundCamera:
                 nearer = inverse_m[part] > 1 / distance[n] + self._slack
                 for layer, old in zip((canvas.picture, canvas.mask), before, strict=True):
                     layer[part][nearer] = old[nearer]
-        return whole
+        return canvas, whole
 
     @property
     def _slack(self) -> float:
@@ -244,18 +250,17 @@ class GroundCamera:
         box = left, top, right, bottom + 0.02 * (right - left)
         draw_plant(shapes[k % len(shapes)], canvas, box, colour, turned)
 
-    def _shade(
+    def _shadows(
         self,
         bodies: Bodies,
         moving: np.ndarray,
         limbs: Figures,
         row_of: dict[int, int],
         view: View,
-        image: np.ndarray,
         away_m: np.ndarray,
-    ) -> None:
-        """The shadows that moving bodies cast on the ground."""
-        sun, layer = self._world.to_sun, np.zeros(image.shape[:2], np.uint8)
+    ) -> np.ndarray:
+        """(H, W) uint8, 255 where moving bodies cast shadows on the ground."""
+        sun, layer = self._world.to_sun, np.zeros(self.size_px[::-1], np.uint8)
         for k in moving[away_m[moving] < _SHADED_M].tolist():
             up = float(bodies.place_m[k, 2])
             if bodies.kind[k] == "person":
@@ -270,13 +275,18 @@ class GroundCamera:
             if (seen[..., 2] < NEAR_M).any():
                 continue
             px = np.clip(seen[..., :2] / seen[..., 2:], -3e4, 3e4)
-            for outline in np.round(px * 16).astype(np.int32):
+            for outline in list(np.round(px * 16).astype(np.int32)):
                 cv2.fillConvexPoly(layer, outline, 255, cv2.LINE_AA, 4)
-        rows = np.flatnonzero(layer.any(axis=1))
-        if len(rows):
-            part = slice(max(int(rows[0]) - 3, 0), int(rows[-1]) + 4)
-            soft = 255 - (1 - _SHADE) * cv2.GaussianBlur(layer[part], (0, 0), 0.9)
-            image[part] = cv2.multiply(image[part], cv2.merge([soft.astype(np.uint8)] * 3), scale=1 / 255)
+        return layer
+
+
+def _darken(image: np.ndarray, layer: np.ndarray) -> None:
+    """Darken a picture where a layer (H, W) uint8 says that there is a shadow."""
+    rows = np.flatnonzero(layer.any(axis=1))
+    if len(rows):
+        part = slice(max(int(rows[0]) - 3, 0), int(rows[-1]) + 4)
+        soft = 255 - (1 - _SHADE) * cv2.GaussianBlur(layer[part], (0, 0), 0.9)
+        image[part] = cv2.multiply(image[part], cv2.merge([soft.astype(np.uint8)] * 3), scale=1 / 255)
 
 
 def _inside(box_px: np.ndarray, size_px: tuple[int, int]) -> tuple[slice, slice]:
