@@ -74,23 +74,26 @@ def fly_into(
         from torchvision_dddas.metrics.crowds import CrowdScorer
         from torchvision_dddas.mission import Begun, mission_of
         from torchvision_dddas.settings import load
+        from torchvision_dddas.simulation.scenario import load as load_scenario
         from torchvision_dddas.simulation.scenario import settings_of
-        from torchvision_dddas.sources.simulator import open_scenario
+        from torchvision_dddas.sources.simulator import SimulatorSource, named
         from torchvision_dddas.surveying import survey
         from torchvision_dddas.targets import geodesy
         from torchvision_dddas.vision import load as load_vision
 
-        simulated: SimulatorSource = open_scenario(scenario, scene, seed)
-        if simulated.scenario.clip.located_by == "nothing":
+        chosen = load_scenario(scenario, scene, seed)
+        if chosen.clip.located_by == "nothing":
             raise InputError(
                 f"scenario {scenario} is located by nothing, and where nothing is located nothing can be steered; add "
                 "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
             )
-        own = settings_of(simulated.scenario)
-        own.setdefault("landmarks.common_sigma_m", simulated.scenario.gps.common_m)
+        own = settings_of(chosen)
+        own.setdefault("landmarks.common_sigma_m", chosen.gps.common_m)
         settings = load(config or CONFIG, overrides, own)
+        with named(scenario):
+            simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = Begun(simulated)
-        mission = mission_of(source, settings, backend, simulated.scenario.clip.located_by == "landmarks")
+        mission = mission_of(source, settings, backend, chosen.clip.located_by == "landmarks")
         vision = load_vision(backend, mission.settings)
         journal = _begin(output, mission, simulated, vision.name)
         output.knows(partial(geodesy.lonlat, origin_deg=simulated.origin_deg))
