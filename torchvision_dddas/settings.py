@@ -503,7 +503,9 @@ class LandmarkKnobs(Group):
         5.0, "s", 0, 3600, meaning="a dropout of reports longer than this without planned waypoints ends a landmark"
     )
     drift_m_s: float = knob(0.5, "m/s", 0, 100, meaning="how fast a place gets uncertain during a dropout")
-    height_m: float = knob(0.0, "m", 0, 20, meaning="height above ground of the point that shows in the picture")
+    height_m: float = knob(
+        0.0, "m", 0, 20, meaning="height of the colour above ground, or of the point that the table has pixels of"
+    )
     length_m: float = knob(
         4.0, "m", 0.1, 50, meaning="length of a vehicle: what moves at its colour and is no longer is it, and no target"
     )

@@ -80,6 +80,18 @@ class Locator:
         """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
         return ground_points(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
 
+    def feet(self, pixels: np.ndarray, fix: Fix, height_m: float) -> np.ndarray | None:
+        """Pixels (N, 2) of the feet of bodies so high that are seen together with their shadows.
+
+        None where shadows do not count, or it is not known how the camera stands or the sun.
+        """
+        sun = self._sun(self.time_s(fix.frame)) if self.settings.aerial.shadows else None
+        if sun is None or fix.pose is None:
+            return None
+        near = self.places(fix, pixels)
+        up_m = np.zeros(len(near)) if self._ground is None else self._ground(near)
+        return feet_below(pixels, np.c_[near, up_m], fix.pose, self.camera, height_m, shadow_m(sun, height_m))
+
     def time_s(self, frame: int) -> float:
         """Of a frame, since the clip's first."""
         return (frame - 1) / self.rate_hz
@@ -155,9 +167,8 @@ class Locator:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
         knobs = self.settings.aerial
         pixels, lift = points_of(targets, knobs, fix.pose is not None)
-        sun = self._sun(self.time_s(fix.frame)) if knobs.shadows and targets.bodies and lift.any() else None
-        if sun is not None and fix.pose is not None:
-            pixels, lift = self._feet(pixels, fix, sun), np.zeros(len(pixels))
+        if targets.bodies and lift.any() and (feet := self.feet(pixels, fix, knobs.target_height_m)) is not None:
+            pixels, lift = feet, np.zeros(len(pixels))
         place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
         _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
         variance = sigma_of(targets, knobs) ** 2
@@ -174,14 +185,6 @@ class Locator:
             start = site.telemetry.start_utc_s
             sun = sun_at(*site.origin_deg, start + time_s) if math.isfinite(start) else None
         return sun if sun is not None and sun[1] > 0 else None
-
-    def _feet(self, pixels: np.ndarray, fix: Fix, sun: tuple[float, float]) -> np.ndarray:
-        """Pixels (N, 2) of the feet of bodies that are seen together with their shadows."""
-        assert fix.pose is not None
-        near = self.places(fix, pixels)
-        up_m = np.zeros(len(near)) if self._ground is None else self._ground(near)
-        height = self.settings.aerial.target_height_m
-        return feet_below(pixels, np.c_[near, up_m], fix.pose, self.camera, height, shadow_m(sun, height))
 
     def _standing(self, marks: Marks) -> Marks:
         if self._ground is None or not len(marks):

@@ -10,7 +10,9 @@ from torchvision_dddas.types import Fix, Followed
 
 
 def named(followed: Followed, fix: Fix, locator: Locator, roll: RollCall) -> Followed:
-    """The frame with its targets under the names that roll gives them; boxes that bridge a gap keep theirs.
+    """The frame with its targets under the names that roll gives them, without those that it gives none.
+
+    Boxes that bridge a gap keep the name that they had.
 
     fix: how its picture lies on the ground. Feed it frames in order.
     """

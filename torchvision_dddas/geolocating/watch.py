@@ -117,7 +117,20 @@ class Watch:
                 pixels[row], by[row] = seen.image_px[k], seen.by[k]
                 if by[row] == "motion" and _astray(pixels[row], seen.colour_px[k], expected[k], marks.pixel_sigma[row]):
                     pixels[row], by[row] = seen.colour_px[k], "colour"
-        return replace(marks, image_px=pixels), self._cut(scene, seen, length), tuple(by)
+        marks = self._from_bodies(replace(marks, image_px=pixels), np.array([how == "motion" for how in by], bool))
+        return marks, self._cut(scene, seen, length), tuple(by)
+
+    def _from_bodies(self, marks: Marks, moving: np.ndarray) -> Marks:
+        """Blobs (n,) are of whole vehicles and their shadows; colours are at height_m, and stay as they are."""
+        height = self.locator.settings.landmarks.height_m
+        if not height or not moving.any():
+            return marks
+        up_m, pixels = marks.up_m.copy(), marks.image_px.copy()
+        feet = None if self._fix is None else self.locator.feet(pixels[moving], self._fix, height)
+        up_m[moving] -= height / 2 if feet is None else height
+        if feet is not None:
+            pixels[moving] = feet
+        return replace(marks, up_m=up_m, image_px=pixels)
 
     def _cut(self, scene: Scene, seen: Sighted, length_px: np.ndarray) -> Scene:
         """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""

@@ -27,7 +27,8 @@ class Instrument(Protocol):
     """A source of frames that flies where it is told to, and tells meanwhile what its vehicles report.
 
     camera: the aerial one. colours: of the landmarks. elevation: of the ground, in metres about origin_deg, longitude
-    and latitude. sun_rad: azimuth and height of the sun, None where nobody knows.
+    and latitude. sun_rad: azimuth and height of the sun, None where nobody knows. plate_m: height of the landmarks'
+    colours above ground.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Instrument(Protocol):
     elevation: Elevation
     origin_deg: tuple[float, float]
     sun_rad: tuple[float, float] | None
+    plate_m: float
 
     def __iter__(self) -> Iterator[Frame]: ...
 

@@ -30,6 +30,8 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     if settings.gates.focal_px == Settings().gates.focal_px:
         # So that sizes in metres hold, as for a clip whose camera is known.
         settings = with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0])})
+    if settings.landmarks.height_m == Settings().landmarks.height_m:
+        settings = with_knobs(settings, {"landmarks.height_m": source.plate_m})
     site = _site_of(source)
     site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site), sun_rad=source.sun_rad)
     locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)

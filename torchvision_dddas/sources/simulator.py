@@ -12,6 +12,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, load
 from torchvision_dddas.simulation.simulator import Simulator
+from torchvision_dddas.simulation.vehicles import UGV_HEIGHT_M
 from torchvision_dddas.sources.elevation import read_elevation, read_ortho
 from torchvision_dddas.sources.source import Problem, looked_at
 from torchvision_dddas.types import (
@@ -50,6 +51,7 @@ class SimulatorSource:
         self.colours: Colours = simulator.colours
         self.elevation: Elevation = simulator.world.relief
         self.origin_deg = scenario.world.origin_deg
+        self.plate_m = UGV_HEIGHT_M
         world = scenario.world
         self.sun_rad: tuple[float, float] | None = (
             math.radians(world.sun_azimuth_deg),
