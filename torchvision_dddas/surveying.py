@@ -5,10 +5,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from torchvision_dddas import following, run
-from torchvision_dddas.geolocating import Locator, Targets, Watch, Watched, gathered
+from torchvision_dddas.geolocating import Locator, Targets, Watch, Watched, gathered, named
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.sources.source import Source
 from torchvision_dddas.targets import geodesy
+from torchvision_dddas.targets.rollcall import RollCall
 from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
 from torchvision_dddas.vision import Vision
 
@@ -31,6 +32,7 @@ def survey(
     target is located by the picture in which it was seen.
     """
     waiting: dict[int, Watched] = {}
+    roll = RollCall() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
         for scene in run.run(source, vision, settings, telemetry):
@@ -48,6 +50,8 @@ def survey(
             yield Surveyed(followed)
             continue
         past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
+        if roll is not None:
+            followed = named(followed, past[-1].look.fix, watch.locator, roll)
         surveyed = _located(followed, past, watch.locator)
         yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
 
