@@ -138,9 +138,15 @@ EVERY = SteeringKnobs(sampling_share=0.5, maximum_every=6)
 
 
 def test_of_so_many_frames_one_is_looked_at_as_a_share_of_the_interval_says():
+    assert every_wanted(8.0, 10, np.array([0.1]), np.array([2.0]), EVERY) == (4.0, "")
+
+
+def test_while_nothing_is_found_a_walker_who_comes_into_the_picture_is():
+    """1 m at 1.4 m/s and 10 Hz: half of it in 3.6 frames."""
     none = np.zeros(0)
-    assert every_wanted(8.0, 10, none, none, EVERY) == (4.0, "")
-    assert every_wanted(8.0, 10, np.array([np.nan]), np.array([2.0]), EVERY) == (4.0, "")
+    assert every_wanted(8.0, 10, none, none, EVERY) == (3.0, "; nothing is found yet")
+    assert every_wanted(8.0, 10, np.array([np.nan]), np.array([2.0]), EVERY)[0] == 3.0
+    assert every_wanted(4.0, 10, none, none, EVERY) == (2.0, "")
 
 
 def test_between_two_looks_no_target_moves_by_more_than_half_its_size():

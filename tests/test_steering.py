@@ -439,8 +439,8 @@ def sampled_by(targets, velocity, speed_m_s=0.5, misses=None, step=None, size_m=
 
 def test_frames_are_left_out_by_height_and_speed_as_many_as_the_rule_says():
     """50 m at 5 Hz and 1.25 m/s: 50 / 20 x 5 / 1.25 x 5 / 10 = 5 frames, and half of it by the share."""
-    assert sampled_by([], [], speed_m_s=1.3)[0][-1] == 2
-    every, (change,) = sampled_by([], [], speed_m_s=0.5)
+    assert sampled_by([[0, 0]], [[0.0, 0.0]], speed_m_s=1.3)[0][-1] == 2
+    every, (change,) = sampled_by([[0, 0]], [[0.0, 0.0]], speed_m_s=0.5)
     assert every[-1] == 5
     assert (change.new, change.cause) == (5.0, "altitude 50.0 m, speed 0.5 m/s")
 

@@ -16,8 +16,8 @@ _ALTITUDE_STEP = 0.2
 # Between two looks a target moves by this share of its size at most.
 _MOVED_SHARE = 0.5
 
-# How fast people walk.
-_WALKER_M_S = 1.4
+# How fast people walk, and how wide one shows with his shadow: who comes into the picture is at least that.
+_WALKER_M_S, _WALKER_M = 1.4, 1.0
 
 # Landmarks count as well detected again once they are slower than this share of the speed at which they are not.
 _CALM = 0.8
@@ -70,12 +70,14 @@ def every_wanted(
 
     interval: as the rule gives it, before its bounds; sampling_share of it is taken. speed_m_s, size_m: (N,) of the
     targets that are known. Between two looks none may move by more than half its size: the two places then still share
-    half of it, and are nearer to each other than to any other target, since two that part are a size apart.
+    half of it, and are nearer to each other than to any other target, since two that part are a size apart. Where none
+    is known, so that a walker who comes into the picture is found.
     """
     wanted = knobs.sampling_share * interval
     known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
     if not known.any():
-        return wanted, ""
+        most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / _WALKER_M_S)), 1.0)
+        return (most, "; nothing is found yet") if most < min(wanted, knobs.maximum_every) else (wanted, "")
     frames = _MOVED_SHARE * size_m[known] * rate_hz / np.maximum(speed_m_s[known], 1e-3)
     tightest = int(frames.argmin())
     if frames[tightest] >= min(wanted, knobs.maximum_every):

@@ -17,6 +17,8 @@ UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)
 """Half the length and half the width."""
 _APART_M, _ROOM_M = 2.1, 3.0
 """How near another's middle they can be, and how far from it they mean to pass."""
+_KEPT_OFF_M = 6.0
+"""How far from people they mean to pass while nobody tells them where to go."""
 _LOOK_S = 0.25
 """Steps in which they think ahead."""
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
@@ -93,7 +95,7 @@ class Team:
         wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
         direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
         direction = self._obstacles.steer(self.place, direction, 1.7)
-        direction = self._round_one_another(direction)
+        direction = self._round_one_another(self._round_people(direction, people))
         error = _wrapped(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
         turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
         wanted = np.where(arrived, 0.0, wanted * np.clip(np.cos(error), 0, 1))
@@ -157,6 +159,17 @@ class Team:
             reach, turn = self._knobs.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
             self._drawn[k, n] = self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
         return self._drawn[k, n]
+
+    def _round_people(self, direction: np.ndarray, people: np.ndarray) -> np.ndarray:
+        """Who goes by himself keeps off people: beside them a vehicle is no landmark, and hides who they are."""
+        free = np.flatnonzero(np.isnan(self._ordered[:, 0]))
+        if not len(free) or not len(people):
+            return direction
+        centre = np.broadcast_to(people, (len(free), *people.shape))
+        radius = np.full((len(free), len(people)), _KEPT_OFF_M)
+        direction = direction.copy()
+        direction[free] = round_discs(self.place[free], direction[free], centre, radius)
+        return direction
 
     def _round_one_another(self, direction: np.ndarray) -> np.ndarray:
         if len(self) < 2:

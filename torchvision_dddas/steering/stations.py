@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 from torchvision_dddas.steering.footprint import Stand
 from torchvision_dddas.steering.outlook import Outlook
 
-# No vehicle comes nearer to the border of a crowd than this.
-KEEP_OFF_M = 4.0
+# No vehicle comes nearer to the border of a crowd than this: from above they would be one blob.
+KEEP_OFF_M = 5.0
 # A station is this far within the aerial picture, as a share of its half.
 _WITHIN = 0.2
 # Turns of the ring that are tried; it is turned, or vehicles change places, where the ways become so much shorter, ...

@@ -123,7 +123,8 @@ class Steering:
                 why = f"background flow {step.flow_px / between:.2f} px a frame"
             else:
                 return
-            seen = outlook.missed == 0
+            # One that is missed for a moment goes on.
+            seen = outlook.missed <= _MISSED
             wanted, limit = every_wanted(
                 wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], knobs
             )
