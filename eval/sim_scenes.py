@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.control import every_least
 from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, site_of
 from torchvision_dddas.metrics.crowd_frames import shown
 from torchvision_dddas.metrics.crowds import CrowdScorer
+from torchvision_dddas.mission import Begun
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.settings import load as load_settings
@@ -19,7 +21,20 @@ from torchvision_dddas.simulation.receiver import Receivers
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
 from torchvision_dddas.sources.simulator import SimulatorSource
 from torchvision_dddas.targets import geodesy
-from torchvision_dddas.types import Colours, Elevation, Fix, Followed, Frame, Landmarks, Scene, Surveyed, Tracks, Truth
+from torchvision_dddas.targets.elevation import about
+from torchvision_dddas.types import (
+    Colours,
+    Command,
+    Elevation,
+    Fix,
+    Followed,
+    Frame,
+    Landmarks,
+    Scene,
+    Surveyed,
+    Tracks,
+    Truth,
+)
 from torchvision_dddas.vision import load, load_colours, load_solver
 
 CONFIG = "patrol"
@@ -42,7 +57,8 @@ class Way:
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
     """What `dddas run sim:` takes, with the camera's own focal length, so that sizes in metres hold."""
     settings = load_settings(CONFIG, (), settings_of(source.scenario))
-    return with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0]), **(more or {})})
+    own = {"gates.focal_px": float(source.camera.focal_px[0]), "landmarks.height_m": source.plate_m}
+    return with_knobs(settings, {**own, **(more or {})})
 
 
 class OnceAFrame:
@@ -131,7 +147,7 @@ class Eye:
         telemetry = self._source.telemetry()
         if self._watch is None:
             site = site_of(reports, telemetry)
-            return replace(site, elevation=self._elevation(site))
+            return replace(site, elevation=self._elevation(site), sun_rad=self._source.sun_rad)
         site = self._watch.locator.site
         origin = site.origin_deg
         assert origin is not None
@@ -142,8 +158,7 @@ class Eye:
     def _elevation(self, site: Site) -> Elevation:
         elevation, origin = self._source.elevation, site.origin_deg
         assert origin is not None
-        east, north = self._local(np.array([origin]))[0].tolist()
-        return replace(elevation, corner_m=(elevation.corner_m[0] - east, elevation.corner_m[1] - north))
+        return about(elevation, self._local(np.array([origin]))[0])
 
     def _reports(self) -> Landmarks:
         """Those of the landmarks in use, with the receivers' errors; without planned waypoints."""
@@ -185,7 +200,11 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
     astray: dict[str, list[list[float]]] = {name: [[] for _ in edges] for name in eyes}
     truths: dict[int, Truth] = {}
     settings = usual(source)
-    for scene in run(source, load("onboard", settings), settings):
+    # As many frames are left out as the closed loop does before anything is found.
+    begun: Any = Begun(source)
+    least = every_least(source.camera.focal_px[0] / scenario.uav.altitude_m, source.rate_hz, settings.steering)
+    source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
+    for scene in run(begun, load("onboard", settings), settings):
         truths |= {truth.frame: truth for truth in source.truths()}
         truth = truths.pop(scene.frame.number, None)
         if truth is None:

@@ -13,7 +13,7 @@ from torchvision_dddas.recognizing import recognizer_of
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.steering import Steering
 from torchvision_dddas.targets import geodesy
-from torchvision_dddas.targets.elevation import up
+from torchvision_dddas.targets.elevation import about
 from torchvision_dddas.types import Command, Elevation, Landmarks, Order, Registration, Scene, Surveyed, Telemetry
 from torchvision_dddas.vision import load_colours, load_solver
 
@@ -33,7 +33,7 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     if settings.landmarks.height_m == Settings().landmarks.height_m:
         settings = with_knobs(settings, {"landmarks.height_m": source.plate_m})
     site = _site_of(source)
-    site = replace(site, elevation=_moved(source.elevation, source.origin_deg, site), sun_rad=source.sun_rad)
+    site = replace(site, elevation=_elevation(source, site), sun_rad=source.sun_rad)
     locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
     colours = source.colours
     by_landmarks = by_landmarks and len(colours) > 0
@@ -160,14 +160,11 @@ def _site_of(source: Instrument) -> Site:
     return Site(landmarks, replace(telemetry, place=here[1], geographic=False), origin)
 
 
-def _moved(elevation: Elevation, origin_deg: tuple[float, float], site: Site) -> Elevation:
-    """Heights about one origin as heights about the site's: metres from there, above the ground there."""
+def _elevation(source: Instrument, site: Site) -> Elevation:
+    """The heights of the ground in the metres of the site."""
     if site.origin_deg is None:
-        return elevation
-    shift = geodesy.east_north(np.array([origin_deg]), site.origin_deg)[0]
-    here = replace(elevation, corner_m=(elevation.corner_m[0] + shift[0], elevation.corner_m[1] + shift[1]))
-    base = float(up(here, np.zeros((1, 2)))[0])
-    return replace(here, up_m=here.up_m - base, base_m=here.base_m + base)
+        return source.elevation
+    return about(source.elevation, -geodesy.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
 
 
 def _recent(landmarks: Landmarks, first: float) -> Landmarks:

@@ -1,6 +1,7 @@
 """How high the ground is at a place, from a grid of heights."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -28,3 +29,10 @@ def up(elevation: Elevation, east_north_m: Float[np.ndarray, "N 2"]) -> Float[np
 def surface(elevation: Elevation) -> Callable[[np.ndarray], np.ndarray]:
     """`up` of one elevation, for what asks a ground for its height: (N, 2) east and north -> (N,)."""
     return lambda east_north_m: up(elevation, east_north_m)
+
+
+def about(elevation: Elevation, origin_m: np.ndarray) -> Elevation:
+    """The same heights in metres about another origin, given as (2,) in those of now, above the ground there."""
+    base = float(up(elevation, np.asarray(origin_m, float)[None])[0])
+    corner = elevation.corner_m[0] - float(origin_m[0]), elevation.corner_m[1] - float(origin_m[1])
+    return replace(elevation, up_m=elevation.up_m - base, corner_m=corner, base_m=elevation.base_m + base)
