@@ -199,28 +199,28 @@ def fill(points_m: np.ndarray, colour: np.ndarray, value: int, view: View, canva
 def _bush(rng: np.random.Generator) -> Plant:
     """A dome of small leaves with gaps, its foot in the shade, and bare twigs that stick out."""
     width, height = _SIZE_PX
-    cover, light = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    plant = np.zeros((height, width, 2), np.float32)
     lobes = [
         (rng.uniform(0.2, 0.8), rng.uniform(0.0, 0.25), rng.uniform(0.14, 0.3), rng.uniform(0.4, 0.9))
         for _ in range(rng.integers(4, 8))
     ]
     for _ in range(14):
-        _twig(rng, cover, light, (rng.uniform(0.35, 0.65) * width, height - 1), rng.uniform(-0.9, 0.9), 0.75 * height)
+        _twig(rng, plant, (rng.uniform(0.35, 0.65) * width, height - 1), rng.uniform(-0.9, 0.9), 0.75 * height)
     for _ in range(rng.integers(700, 1300)):
         x, foot, across, tall = lobes[rng.integers(len(lobes))]
         angle, r = rng.uniform(0, np.pi), np.sqrt(rng.uniform(0.05, 1))
         a, b = r * np.cos(angle), r * np.sin(angle)
-        _leaf(rng, cover, light, (x + across * a) * width, (1 - foot - tall * b) * height, 0.25 * a + 0.55 * b)
-    return _smaller(cover, light)
+        _leaf(rng, plant, (x + across * a) * width, (1 - foot - tall * b) * height, 0.25 * a + 0.55 * b)
+    return _smaller(plant)
 
 
 def _tree(rng: np.random.Generator) -> Plant:
     """Several stems that part, and a wide crown in lumps."""
     width, height = _SIZE_PX
-    cover, light = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    plant = np.zeros((height, width, 2), np.float32)
     for _ in range(rng.integers(2, 5)):
         start = (rng.uniform(0.46, 0.54) * width, height - 1)
-        _twig(rng, cover, light, start, rng.uniform(-0.6, 0.6), 0.65 * height, int(rng.integers(3, 6)))
+        _twig(rng, plant, start, rng.uniform(-0.6, 0.6), 0.65 * height, int(rng.integers(3, 6)))
     lumps = [
         (rng.uniform(0.14, 0.86), rng.uniform(0.24, 0.87), rng.uniform(0.09, 0.2)) for _ in range(rng.integers(11, 17))
     ]
@@ -229,23 +229,21 @@ def _tree(rng: np.random.Generator) -> Plant:
         angle, r = rng.uniform(0, 2 * np.pi), np.sqrt(rng.uniform(0, 1))
         a, b = r * np.cos(angle), r * np.sin(angle)
         rise = 0.2 * a + 0.45 * b + 0.5 * (up - 0.6)
-        _leaf(rng, cover, light, (x + size * a) * width, (1 - up - 0.8 * size * b) * height, rise)
-    return _smaller(cover, light)
+        _leaf(rng, plant, (x + size * a) * width, (1 - up - 0.8 * size * b) * height, rise)
+    return _smaller(plant)
 
 
-def _leaf(rng: np.random.Generator, cover: np.ndarray, light: np.ndarray, x: float, y: float, rise: float) -> None:
-    bright = float(np.clip(0.62 + 0.5 * rise + rng.normal(0, 0.16), 0.2, 1.6))
+def _leaf(rng: np.random.Generator, plant: np.ndarray, x: float, y: float, rise: float) -> None:
+    bright = min(max(0.62 + 0.5 * rise + rng.normal(0, 0.16), 0.2), 1.6)
     place = (round(x * 16), round(y * 16))
     axes = (round(rng.uniform(1.2, 4.2) * 16), round(rng.uniform(0.8, 2.2) * 16))
     turn = float(rng.uniform(0, 180))
-    for layer, value in ((cover, 1.0), (light, bright)):
-        cv2.ellipse(layer, place, axes, turn, 0, 360, value, -1, cv2.LINE_8, 4)
+    cv2.ellipse(plant, place, axes, turn, 0, 360, (1.0, bright), -1, cv2.LINE_8, 4)
 
 
 def _twig(
     rng: np.random.Generator,
-    cover: np.ndarray,
-    light: np.ndarray,
+    plant: np.ndarray,
     start: tuple[float, float],
     lean: float,
     length: float,
@@ -255,13 +253,12 @@ def _twig(
     bright = float(rng.uniform(0.25, 0.6))
     for k in range(6):
         x1, y1 = x + lean * length / 6, y - length / 6 * np.sqrt(max(1 - lean**2, 0.05))
-        for layer, value in ((cover, 1.0), (light, bright)):
-            cv2.line(layer, (round(x), round(y)), (round(x1), round(y1)), value, max(1, thick - k // 2))
+        cv2.line(plant, (round(x), round(y)), (round(x1), round(y1)), (1.0, bright), max(1, thick - k // 2))
         x, y, lean = x1, y1, float(np.clip(lean + rng.normal(0, 0.22), -0.98, 0.98))
 
 
-def _smaller(cover: np.ndarray, light: np.ndarray) -> Plant:
-    layers = [np.stack([cover, light], axis=2)]
+def _smaller(plant: np.ndarray) -> Plant:
+    layers = [plant]
     while min(layers[-1].shape[:2]) > 5:
         size = layers[-1].shape[1] // 2, layers[-1].shape[0] // 2
         layers.append(cv2.resize(layers[-1], size, interpolation=cv2.INTER_AREA))
