@@ -41,8 +41,8 @@ def of_raster(given: Elevation, side_m: float) -> Elevation:
     rows, columns = ((metres - given.corner_m[k]) / given.step_m for k in (1, 0))
     covered = _between(rows, heights.shape[0], 1) @ known @ _between(columns, heights.shape[1], 1).T > 1 - 1e-6
     if not covered.all():
-        low = given.corner_m
-        high = [low[k] + given.step_m * (heights.shape[1 - k] - 1) for k in (0, 1)]
+        there = [np.flatnonzero(known.any(axis=k)) for k in (0, 1)]  # columns, rows
+        low, high = ([given.corner_m[k] + given.step_m * there[k][end] for k in (0, 1)] for end in (0, -1))
         raise InputError(
             f"the elevation covers {np.floor(100 * covered.mean()):.0f} % of the world: it has heights from "
             f"{low[0]:.0f} m to {high[0]:.0f} m east and {low[1]:.0f} m to {high[1]:.0f} m north of world.origin_deg, "

@@ -189,8 +189,12 @@ def simulator_of(scenario: Scenario) -> Simulator:
     """A run of a scenario, with the rasters of the ground that it names. Raises InputError."""
     world = scenario.world
     ends = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]) * world.side_m / 2
-    elevation = read_elevation(world.elevation, ends, world.origin_deg, 10.0) if world.elevation else None
-    photo = read_ortho(world.photo, ends, world.origin_deg, 0.0) if world.photo else None
+    try:
+        elevation = read_elevation(world.elevation, ends, world.origin_deg, 10.0) if world.elevation else None
+        photo = read_ortho(world.photo, ends, world.origin_deg, 0.0) if world.photo else None
+    except InputError as error:
+        # The reader knows of landmarks alone.
+        raise InputError(str(error).replace("the landmarks lie", "the world lies")) from None
     return Simulator(scenario, elevation, photo)
 
 

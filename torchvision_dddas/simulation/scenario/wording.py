@@ -27,6 +27,8 @@ def explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) -
         return f"unknown knob '{full}'; {nearest_knob(full)}"
     if kind == "value_error":  # a rule across knobs
         return f"{name}: {said.removeprefix('Value error, ')}"
+    if name == "settings" and len(loc) > 1 and not isinstance(value, dict):
+        name = f"settings.{loc[1]}"
     if field is None or _group(field) is not None or name.startswith("settings"):
         wanted = "a list of tables" if listed or name in ("crowd", "car", "happening", "fault") else "a table"
         return f"{name} = {_shown(value)} will not do; wanted {wanted}"
