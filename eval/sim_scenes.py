@@ -223,16 +223,18 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
 
 
 def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
-    """A team about two crowds that walk through its ring in directions of their own, as the seed has it.
+    """A team about two crowds that walk side by side through its ring, to one side or past one another.
 
     tables: knobs beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
     """
     rng = np.random.default_rng([seed, 5])
     crowds = []
-    heading, turn = rng.uniform(0, 360), rng.uniform(60, 300)
+    heading, turn = rng.uniform(0, 360), rng.choice([0.0, 180.0])
     for k, people in enumerate(rng.integers(6, 13, 2).tolist()):
-        ahead = np.radians(heading + k * turn)
-        speed, aside = rng.uniform(0.7, 1.4), rng.uniform(-4, 4)
+        ahead = np.radians(heading + k * turn + rng.uniform(-10, 10))
+        speed = rng.uniform(0.7, 1.4)
+        # They pass one another at some distance: who is who where they meet is another question.
+        aside = (-1 if k == 0 else 1) * rng.uniform(5, 7) * (1 if turn == 0 or k == 0 else -1)
         way = np.array([np.sin(ahead), np.cos(ahead)])
         # In the middle of the ring halfway through the run.
         start = -way * speed * min(seconds / 2, 12) + aside * way[::-1] * (1, -1)
