@@ -1,6 +1,7 @@
 """A closer look: people whom ground vehicles recognize tell which of the aerial camera's targets are human."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,15 @@ from torchvision_dddas.targets.collaboration import Beliefs, Look, look, view_of
 from torchvision_dddas.targets.ranging import sight
 from torchvision_dddas.types import Confirmed, Grounded, GroundPicture, Poses
 from torchvision_dddas.vision import Recognizer
+
+# People do not run faster.
+_RUNNING_M_S = 4.0
+
+
+def slow_enough(seen: Look, velocity_m_s: np.ndarray) -> Look:
+    """The look without the people at what goes faster than people do, (N, 2): they stand beside its way."""
+    fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
+    return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
 
 
 class CloserLook:
@@ -72,7 +82,7 @@ class CloserLook:
         view = view_of(camera, place[0], camera.heading_rad, settings.people, settings.ground)
         # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
         spread = positions.covariance_m2 + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
-        return look(
+        found = look(
             positions.east_north_m,
             spread,
             seen.east_north_m[known],
@@ -81,3 +91,4 @@ class CloserLook:
             [view],
             settings.confirm,
         )
+        return slow_enough(found, grounded.velocity_m_s)
