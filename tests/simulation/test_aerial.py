@@ -34,7 +34,7 @@ def bare() -> World:
 
 
 def scenario(**camera: float) -> Scenario:
-    return Scenario(camera=CameraKnobs(**{**CLEAR, **camera}), seed=5)
+    return Scenario(camera=CameraKnobs.model_validate({**CLEAR, **camera}), seed=5)
 
 
 def people(places: np.ndarray, world: World, target: np.ndarray | int = 1, facing: float = 0.4) -> Bodies:

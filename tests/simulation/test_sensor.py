@@ -1,5 +1,7 @@
 """The sensor: noise of the strength asked for, exposure that drifts within its bounds, the same for the same number."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,8 @@ SIZE = (320, 240)
 CLEAR = {"sharpness_px": 0, "shot_noise": 0, "read_noise": 0, "drift": 0, "quality": 100}
 
 
-def sensor(seed: int = 0, stream: int = 0, **knobs: float) -> Sensor:
-    return Sensor(CameraKnobs(**{**CLEAR, **knobs}), SIZE, seed, stream)
+def sensor(seed: int = 0, stream: int = 0, **knobs: Any) -> Sensor:
+    return Sensor(CameraKnobs.model_validate({**CLEAR, **knobs}), SIZE, seed, stream)
 
 
 def grey(level: int) -> np.ndarray:
@@ -47,7 +49,7 @@ def test_exposure_drifts_slowly_and_no_further_than_asked():
 
 
 def test_a_picture_depends_on_seed_stream_and_number_and_on_nothing_before_it():
-    knobs = {"shot_noise": 0.2, "read_noise": 1.0, "drift": 0.05, "quality": 90, "sharpness_px": 0.6}
+    knobs: dict[str, Any] = {"shot_noise": 0.2, "read_noise": 1.0, "drift": 0.05, "quality": 90, "sharpness_px": 0.6}
     first, second = sensor(3, **knobs), sensor(3, **knobs)
     first.expose(grey(90), 1, 0.1)
     assert np.array_equal(first.expose(grey(90), 2, 0.2), second.expose(grey(90), 2, 0.2))

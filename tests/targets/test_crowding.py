@@ -1,5 +1,7 @@
 """Crowds: who is close together on the ground and goes the same way is one target."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -68,8 +70,7 @@ def test_the_middle_is_the_mean_of_the_foreground():
 
 def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
     found, mask = scene()
-    found = Detections(*(getattr(found, n) for n in ("box_px", "score", "area_px", "heading_rad", "speed_px")),
-                       middle_px=with_middles(found, mask))  # fmt: skip
+    found = replace(found, middle_px=with_middles(found, mask))
     crowds, numbered = joined(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
     assert crowds.score.tolist() == [0.9, 0.7]

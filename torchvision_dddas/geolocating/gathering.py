@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from torchvision_dddas.geolocating.locator import Locator
-from torchvision_dddas.geolocating.watch import Watched
+from torchvision_dddas.geolocating.watch import Watched, without
+from torchvision_dddas.settings import LandmarkKnobs
 from torchvision_dddas.targets.crowding import joined, together, with_middles
-from torchvision_dddas.types import Detections, Fix
+from torchvision_dddas.types import Detections, Fix, Marks, Scene
 
 
 def gathered(watched: Watched, locator: Locator, rate_hz: float) -> Watched:
@@ -18,11 +19,27 @@ def gathered(watched: Watched, locator: Locator, rate_hz: float) -> Watched:
     knobs, scene = locator.settings.crowds, watched.scene
     if not knobs.join_m or not len(scene.detections):
         return watched
-    found = replace(scene.detections, middle_px=with_middles(scene.detections, scene.mask, scene.core))
+    place, radius, _ = _on_ground(_with_middles(scene), watched.look.fix, locator, rate_hz)
+    scene = without(scene, _beside(place, radius, locator.marks(scene.frame.number), locator.settings.landmarks))
+    found = _with_middles(scene)
     place, radius, velocity = _on_ground(found, watched.look.fix, locator, rate_hz)
     crowd = together(place, radius, velocity, knobs.join_m, knobs.speed_m_s)
     detections, mask = joined(found, scene.mask, crowd)
     return replace(watched, scene=replace(scene, detections=detections, mask=mask))
+
+
+def _with_middles(scene: Scene) -> Detections:
+    return replace(scene.detections, middle_px=with_middles(scene.detections, scene.mask, scene.core))
+
+
+def _beside(place_m: np.ndarray, radius_m: np.ndarray, marks: Marks, knobs: LandmarkKnobs) -> np.ndarray:
+    """(N,) bool, what is no larger than a vehicle and lies where one stands: of it something, or its shadow.
+
+    Its colour need not be seen for that: where it is, it says itself.
+    """
+    away = np.linalg.norm(place_m[:, None] - marks.east_north_m[None], axis=-1)
+    beside: np.ndarray = (away <= knobs.length_m + 2 * marks.sigma_m).any(axis=1) & (radius_m <= knobs.length_m / 2)
+    return beside
 
 
 def _on_ground(

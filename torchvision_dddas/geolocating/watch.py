@@ -80,7 +80,7 @@ class Watch:
             marks, scene, by = self._found(scene, marks)
         else:
             by = ("table",) * len(marks)
-            scene = _without(scene, _holding(scene.detections.box_px, marks.image_px))
+            scene = without(scene, _holding(scene.detections.box_px, marks.image_px))
         spent = time.perf_counter() - start
         look = self.locator.look(frame, marks)
         self._fix = look.fix
@@ -136,7 +136,7 @@ class Watch:
         """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
         knobs = self.locator.settings.landmarks
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
-            return _without(scene, seen.rows)
+            return without(scene, seen.rows)
         metre = np.nanmedian(length_px) / knobs.length_m if np.isfinite(length_px).any() else np.nan
         least = max(self.locator.settings.small.min_area_px, LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
         found, mask = cut_out(scene.detections, scene.mask, seen.rows, seen.colour_px, REACH * length_px, least)
@@ -182,7 +182,7 @@ def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
     return held
 
 
-def _without(scene: Scene, rows: np.ndarray) -> Scene:
+def without(scene: Scene, rows: np.ndarray) -> Scene:
     """A scene without some of its detections."""
     if not rows.any():
         return scene
