@@ -12,6 +12,7 @@ from torchvision_dddas.control import (
     best_spread,
     bounded,
     chosen,
+    every_least,
     every_wanted,
     interval_from_flow,
     interval_from_telemetry,
@@ -242,3 +243,17 @@ def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmark
 def test_landmarks_all_on_one_line_are_taken_as_far_apart_as_they_are():
     row = np.array([[k, 2.0 * k] for k in range(6)])
     assert {0, 5} <= set(best_spread(row, 4).tolist())
+
+
+def test_gaps_are_closed_in_metres_where_that_is_asked_for_and_never_wider_than_in_pixels():
+    base = with_knobs(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
+    closes = [regime_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
+    assert closes == [base.morphology.close_px, 17, 4]
+    plain = regime_at(200.0, 10.0, Settings())
+    assert plain.settings.morphology.close_px == Settings().morphology.close_px
+
+
+def test_from_look_to_look_a_walker_moves_far_enough_to_show():
+    knobs = Settings().steering
+    frames = every_least(554 / 200, 10.0, knobs)
+    assert frames / 10 * 1.4 * 554 / 200 == pytest.approx(knobs.least_move_px)
