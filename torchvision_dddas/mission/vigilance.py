@@ -126,7 +126,8 @@ class Vigilance:
             usual = np.median([v for _, v in self._usual], axis=0)
             if (change := float(np.linalg.norm(speed - usual))) > _JERK_M_S:
                 self._jerked_s = frame.time_s
-                self._say(frame.number, f"the picture jerks, as in a gust or a quick turn of the camera: by {change:.1f} m/s over the ground")
+                what = f"the picture jerks by {change:.1f} m/s over the ground"
+                self._say(frame.number, f"{what}: a gust, or a quick turn of the camera")
         self._usual.append((frame.time_s, speed))
 
     def _say(self, frame: int, text: str) -> None:
