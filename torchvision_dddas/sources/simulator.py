@@ -91,7 +91,9 @@ class SimulatorSource:
     def steer(self, command: Command) -> None:
         """Do as told from the next frame on; places in longitude and latitude. Raises InputError as Simulator does."""
         self._simulator.steer(command)
-        self._wanted = [order.vehicle for order in command.orders if order.picture]
+        # A later command before the next frame takes nothing back: what was asked for is one look.
+        asked = [order.vehicle for order in command.orders if order.picture]
+        self._wanted += [name for name in asked if name not in self._wanted]
 
     def landmarks(self) -> Landmarks:
         """All reports of the ground vehicles until now, in longitude and latitude; of plans for a frame the newest."""
