@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.control import every_least
-from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, site_of
+from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, local, site_of
 from torchvision_dddas.metrics.crowd_frames import shown
 from torchvision_dddas.metrics.crowds import CrowdScorer
-from torchvision_dddas.mission import Begun
+from torchvision_dddas.mission import Begun, fitted
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.settings import load as load_settings
 from torchvision_dddas.simulation.camera import view_of
-from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.receiver import SIGMAS_95, Receivers
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
 from torchvision_dddas.sources.simulator import SimulatorSource
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.elevation import about
+from torchvision_dddas.targets.gates import pixels_per_metre
 from torchvision_dddas.types import (
     Colours,
     Command,
@@ -55,10 +56,8 @@ class Way:
 
 
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
-    """What `dddas run sim:` takes, with the camera's own focal length, so that sizes in metres hold."""
-    settings = load_settings(CONFIG, (), settings_of(source.scenario))
-    own = {"gates.focal_px": float(source.camera.focal_px[0]), "landmarks.height_m": source.plate_m}
-    return with_knobs(settings, {**own, **(more or {})})
+    """What `dddas run sim:` takes, and more."""
+    return with_knobs(fitted(load_settings(CONFIG, (), settings_of(source.scenario)), source), more or {})
 
 
 class OnceAFrame:
@@ -149,11 +148,8 @@ class Eye:
             site = site_of(reports, telemetry)
             return replace(site, elevation=self._elevation(site), sun_rad=self._source.sun_rad)
         site = self._watch.locator.site
-        origin = site.origin_deg
-        assert origin is not None
-        local = replace(reports, place=geodesy.east_north(reports.place, origin), geographic=False)
-        flown = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
-        return replace(site, landmarks=local, telemetry=flown)
+        assert site.origin_deg is not None
+        return replace(site, landmarks=local(reports, site.origin_deg), telemetry=local(telemetry, site.origin_deg))
 
     def _elevation(self, site: Site) -> Elevation:
         elevation, origin = self._source.elevation, site.origin_deg
@@ -168,7 +164,7 @@ class Eye:
         if self._way.gps95_m:
             metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
             place = geodesy.lonlat(metres, self._source.scenario.world.origin_deg)
-            sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / np.sqrt(5.991))
+            sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / SIGMAS_95)
         return Landmarks(
             tuple(table.names[k] for k in self._kept), frame, np.searchsorted(self._kept, which),
             table.image_px[kept], place, sigma, table.planned[kept], table.line[kept], True, table.path,
@@ -202,7 +198,8 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
     settings = usual(source)
     # As many frames are left out as the closed loop does before anything is found.
     begun: Any = Begun(source)
-    least = every_least(source.camera.focal_px[0] / scenario.uav.altitude_m, source.rate_hz, settings.steering)
+    scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
+    least = every_least(scale, source.rate_hz, settings.steering)
     source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
     for scene in run(begun, load("onboard", settings), settings):
         truths |= {truth.frame: truth for truth in source.truths()}

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.targets.crowding import joined, together, with_middles
+from torchvision_dddas.targets.crowding import joined, together
+from torchvision_dddas.targets.touching import middles_of
 from torchvision_dddas.types import Detections
 
 STILL = np.zeros((3, 2))
@@ -63,14 +64,14 @@ def scene():
 
 def test_the_middle_is_the_mean_of_the_foreground():
     found, mask = scene()
-    assert with_middles(found, mask).tolist() == [[4.5, 3.5], [23.5, 10.5], [9.5, 3.5]]
+    assert middles_of(found.box_px, mask).tolist() == [[4.5, 3.5], [23.5, 10.5], [9.5, 3.5]]
     mask[mask == 2] = 0
-    assert np.isnan(with_middles(found, mask)[1]).all()
+    assert np.isnan(middles_of(found.box_px, mask)[1]).all()
 
 
 def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
     found, mask = scene()
-    found = replace(found, middle_px=with_middles(found, mask))
+    found = replace(found, middle_px=middles_of(found.box_px, mask))
     crowds, numbered = joined(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
     assert crowds.score.tolist() == [0.9, 0.7]

@@ -140,7 +140,7 @@ def aerial_into(
         )
         check_table(read, locator)
         facts = {"input": table, **given.facts, "rows": len(read), **about(locator), "settings": settings.model_dump()}
-        journal = output.begin(facts, **ground_facts(locator, given))
+        journal = output.begin(facts, **ground_facts(locator, given.background))
         journal.notes += notes
         if not len(read):
             journal.notes.append("the table has no rows: nothing to locate")
@@ -228,14 +228,14 @@ def about(locator: "Locator") -> dict[str, Any]:
     }
 
 
-def ground_facts(locator: "Locator", given: AerialInput) -> dict[str, Any]:
+def ground_facts(locator: "Locator", background: Path | None) -> dict[str, Any]:
     """What GroundedOutput.begin wants to know. Raises InputError for a background that cannot be read."""
     from functools import partial
 
     from torchvision_dddas.sources.elevation import read_ortho
     from torchvision_dddas.targets import geodesy
 
-    site, background = locator.site, given.background
+    site = locator.site
     start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
     return {
         "names": site.landmarks.names,

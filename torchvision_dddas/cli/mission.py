@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from torchvision_dddas.cli.aerial import ground_facts
 from torchvision_dddas.cli.clips import clip_facts
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
@@ -133,8 +134,6 @@ def _noticed(output: Any, mission: "Mission") -> None:
 
 def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: str) -> "Record":
     """Say what the run is."""
-    from torchvision_dddas.targets import geodesy
-
     locator, site = mission.watch.locator, mission.watch.locator.site
     facts: dict[str, Any] = {
         "input": f"{SIMULATED}{source.name}",
@@ -144,16 +143,7 @@ def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: 
         "origin_deg": site.origin_deg,
         "settings": mission.settings.model_dump(),
     }
-    journal = output.begin(
-        facts,
-        names=site.landmarks.names,
-        origin_deg=site.origin_deg,
-        start_utc_s=float("nan"),
-        rate_hz=source.rate_hz,
-        background=None,
-        camera=locator.camera,
-        degrees=None if site.origin_deg is None else partial(geodesy.lonlat, origin_deg=site.origin_deg),
-    )
+    journal = output.begin(facts, **ground_facts(locator, None))
     output.also(journal, source.rate_hz, source.size, site.landmarks.names, site.origin_deg is not None)
     kept: Record = journal
     return kept

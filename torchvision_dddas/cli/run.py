@@ -150,7 +150,7 @@ def run_into(
             assert watch is not None
             site = watch.locator.site
             facts |= {**given.facts, **about(watch.locator), "settings": settings.model_dump()}
-            journal = output.begin(facts, **ground_facts(watch.locator, given))
+            journal = output.begin(facts, **ground_facts(watch.locator, given.background))
             output.also(journal, rate, source.size, site.landmarks.names, site.origin_deg is not None)
             write = output.survey
         else:

@@ -3,7 +3,7 @@
 from torchvision_dddas.geolocating.gathering import gathered
 from torchvision_dddas.geolocating.locator import Locator, Targets
 from torchvision_dddas.geolocating.naming import named
-from torchvision_dddas.geolocating.site import Site, camera_of, check_span, site_of, unknown_heights
+from torchvision_dddas.geolocating.site import Site, camera_of, check_span, local, site_of, unknown_heights
 from torchvision_dddas.geolocating.table import check_table, locate
 from torchvision_dddas.geolocating.watch import Watch, Watched, check_colours, unpictured
 
@@ -18,6 +18,7 @@ __all__ = [
     "check_span",
     "check_table",
     "gathered",
+    "local",
     "locate",
     "named",
     "site_of",

@@ -80,6 +80,13 @@ class Locator:
         """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
         return ground_points(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
 
+    def radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
+        """(N,) m, of circles as large as the ellipses within boxes (N, 4) on the ground; NaN where it is not known."""
+        low, high = box_px[:, :2] - 0.5, box_px[:, :2] + box_px[:, 2:] - 0.5
+        corners = low, np.c_[high[:, 0], low[:, 1]], np.c_[low[:, 0], high[:, 1]]
+        start, right, below = np.split(self.places(fix, np.concatenate(corners)), 3)
+        return np.asarray(np.sqrt(np.linalg.norm(right - start, axis=1) * np.linalg.norm(below - start, axis=1)) / 2)
+
     def feet(self, pixels: np.ndarray, fix: Fix, height_m: float) -> np.ndarray | None:
         """Pixels (N, 2) of the feet of bodies so high that are seen together with their shadows.
 

@@ -20,15 +20,8 @@ def named(followed: Followed, fix: Fix, locator: Locator, roll: RollCall) -> Fol
     seen = np.flatnonzero(tracks.row >= 0)
     box = tracks.box_px[seen]
     middle = followed.detections.middle_px[tracks.row[seen]]
-    low, high = box[:, :2] - 0.5, box[:, :2] + box[:, 2:] - 0.5
-    middle = np.where(np.isfinite(middle), middle, (low + high) / 2)
-    unknown = np.full((len(seen), 2), np.nan)
-    place, radius = unknown, unknown[:, 0]
-    if fix.by and len(seen):
-        corners = low, high, np.c_[low[:, 0], high[:, 1]], np.c_[high[:, 0], low[:, 1]]
-        place, *ends = np.split(locator.places(fix, np.concatenate([middle, *corners])), 5)
-        across, along = (np.linalg.norm(a - b, axis=1) for a, b in ((ends[0], ends[3]), (ends[0], ends[2])))
-        radius = np.sqrt(across * along) / 2
+    middle = np.where(np.isfinite(middle), middle, box[:, :2] + (box[:, 2:] - 1) / 2)
+    place, radius = locator.places(fix, middle), locator.radii(fix, box)
     identity = np.zeros(len(tracks), np.int64)
     identity[seen] = roll.step(locator.time_s(followed.number), tracks.identity[seen], place, radius)
     taken = set(identity[seen].tolist())

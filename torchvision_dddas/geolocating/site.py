@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from torchvision_dddas.sources.landmarks import looks_swapped
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.elevation import up
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
+
+_Reports = TypeVar("_Reports", Landmarks, Telemetry)
 
 HOLDS_S = 1.0
 """So long before its first and after its last sample telemetry holds."""
@@ -74,11 +77,16 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
             )
     longitude, latitude = landmarks.place[known][0].tolist()
     origin = (longitude, latitude)
-    local = replace(landmarks, place=geodesy.east_north(landmarks.place, origin), geographic=False)
+    landmarks = local(landmarks, origin)
     if telemetry is not None:
-        telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, origin), geographic=False)
-        _near(local, telemetry)
-    return Site(local, telemetry, origin)
+        telemetry = local(telemetry, origin)
+        _near(landmarks, telemetry)
+    return Site(landmarks, telemetry, origin)
+
+
+def local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
+    """What was reported in degrees, in metres east and north of (longitude, latitude)."""
+    return replace(reports, place=geodesy.east_north(reports.place, origin_deg), geographic=False)
 
 
 def _looks_down(telemetry: Telemetry) -> None:

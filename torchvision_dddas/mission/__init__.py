@@ -2,7 +2,7 @@
 
 from torchvision_dddas.mission.closer import CloserLook
 from torchvision_dddas.mission.instrument import Begun, Instrument
-from torchvision_dddas.mission.mission import Mission, mission_of
+from torchvision_dddas.mission.mission import Mission, fitted, mission_of
 from torchvision_dddas.mission.vigilance import Notice, Vigilance
 
-__all__ = ["Begun", "CloserLook", "Instrument", "Mission", "Notice", "Vigilance", "mission_of"]
+__all__ = ["Begun", "CloserLook", "Instrument", "Mission", "Notice", "Vigilance", "fitted", "mission_of"]

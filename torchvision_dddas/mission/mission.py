@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.geolocating import Locator, Site, Watch, site_of
+from torchvision_dddas.geolocating import Locator, Site, Watch, local, site_of
 from torchvision_dddas.mission.closer import CloserLook
 from torchvision_dddas.mission.instrument import Instrument
 from torchvision_dddas.mission.vigilance import Notice, Vigilance
@@ -27,11 +27,7 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     by_landmarks: whether the ground vehicles' markers are looked for; else telemetry alone lays pictures on the ground.
     Raises InputError where the reports do not do.
     """
-    if settings.gates.focal_px == Settings().gates.focal_px:
-        # So that sizes in metres hold, as for a clip whose camera is known.
-        settings = with_knobs(settings, {"gates.focal_px": float(source.camera.focal_px[0])})
-    if settings.landmarks.height_m == Settings().landmarks.height_m:
-        settings = with_knobs(settings, {"landmarks.height_m": source.plate_m})
+    settings = fitted(settings, source)
     site = _site_of(source)
     site = replace(site, elevation=_elevation(source, site), sun_rad=source.sun_rad)
     locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
@@ -43,6 +39,16 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     if steering is not None:
         source.steer(steering.begin(locator.flight(0.0)))
     return Mission(source, watch, settings, closer, steering)
+
+
+def fitted(settings: Settings, source: Instrument) -> Settings:
+    """The settings with what the source says of itself where nothing else was set: sizes in metres hold by it."""
+    own: dict[str, object] = {}
+    if settings.gates.focal_px == Settings().gates.focal_px:
+        own["gates.focal_px"] = float(source.camera.focal_px[0])
+    if settings.landmarks.height_m == Settings().landmarks.height_m:
+        own["landmarks.height_m"] = source.plate_m
+    return with_knobs(settings, own)
 
 
 class Mission:
@@ -98,10 +104,10 @@ class Mission:
             now = self.source.last
             now_s = (now - 1) / self.source.rate_hz
             locator = self.watch.locator
-            local, moved = self._steering.step(
+            there, moved = self._steering.step(
                 grounded, confirmed, now_s, locator.marks(now), locator.flight(now_s), step
             )
-            command = self._in_degrees(local)
+            command = self._in_degrees(there)
             self.source.steer(command)
             adjustments = (*adjustments, *moved)
             seconds["steer"] = time.perf_counter() - start
@@ -112,8 +118,7 @@ class Mission:
         """The reports in the metres of the site."""
         site = self.watch.locator.site
         if self._origin is not None:
-            landmarks = replace(landmarks, place=geodesy.east_north(landmarks.place, self._origin), geographic=False)
-            telemetry = replace(telemetry, place=geodesy.east_north(telemetry.place, self._origin), geographic=False)
+            landmarks, telemetry = local(landmarks, self._origin), local(telemetry, self._origin)
         return replace(site, landmarks=landmarks, telemetry=telemetry)
 
     def _metres_per_px(self, time_s: float) -> float:
@@ -128,10 +133,7 @@ class Mission:
         """(P,) radius of each located target on the ground; 0 where unknown."""
         grounded = surveyed.grounded
         assert grounded is not None
-        box = grounded.box_px[grounded.row]
-        corners = np.concatenate([box[:, :2] - 0.5, box[:, :2] + box[:, 2:] - 0.5])
-        low, high = np.split(self.watch.locator.places(grounded.fix, corners), 2)
-        return np.nan_to_num(np.linalg.norm(high - low, axis=1) / 2 / np.sqrt(2))
+        return np.nan_to_num(self.watch.locator.radii(grounded.fix, grounded.box_px[grounded.row]))
 
     def _in_degrees(self, command: Command) -> Command:
         """A command with the places that the vehicles understand."""
@@ -155,9 +157,7 @@ def _site_of(source: Instrument) -> Site:
     if np.isfinite(landmarks.place).all(axis=1).any():
         return site_of(landmarks, telemetry)
     origin = source.origin_deg
-    here = geodesy.east_north(landmarks.place, origin), geodesy.east_north(telemetry.place, origin)
-    landmarks = replace(landmarks, place=here[0], geographic=False)
-    return Site(landmarks, replace(telemetry, place=here[1], geographic=False), origin)
+    return Site(local(landmarks, origin), local(telemetry, origin), origin)
 
 
 def _elevation(source: Instrument, site: Site) -> Elevation:

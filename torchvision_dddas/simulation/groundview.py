@@ -13,6 +13,7 @@ from torchvision_dddas.simulation.bodies import Canvas
 from torchvision_dddas.simulation.camera import View, axes, view_of
 from torchvision_dddas.simulation.figures import Dress, Figures, draw_figure, dress, figures, shadow
 from torchvision_dddas.simulation.moment import Moment
+from torchvision_dddas.simulation.receiver import SIGMAS_95
 from torchvision_dddas.simulation.scenario import CameraKnobs, Scenario
 from torchvision_dddas.simulation.sensor import Sensor
 from torchvision_dddas.simulation.world import World
@@ -86,7 +87,7 @@ class GroundCamera:
             heading_rad=float(np.mod(moment.said_heading_rad[vehicle], 2 * np.pi)),
             height_m=self._scenario.team.camera_m,
             heading_sigma_rad=HEADING_SIGMA_RAD,
-            position_sigma_m=max(self._scenario.gps.error95_m / 2.4477, _LEAST_SIGMA_M),
+            position_sigma_m=max(self._scenario.gps.error95_m / SIGMAS_95, _LEAST_SIGMA_M),
         )
         image, _, _, _ = self._drawn(moment, vehicle)
         return GroundPicture(name, moment.number, image, camera)

@@ -12,6 +12,7 @@ from torchvision_dddas.steering.footprint import Stand, inside, looked_at, stand
 from torchvision_dddas.steering.outlook import Memory, Outlook
 from torchvision_dddas.steering.record import Record
 from torchvision_dddas.steering.team import Team
+from torchvision_dddas.targets.gates import pixels_per_metre
 from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flight, Grounded, Marks, Registration
 
 # Vehicles are given new goals so often at most: what is found is a second old, and they do not turn faster.
@@ -43,8 +44,7 @@ class Steering:
         """Before anything is found: as many frames as a walker needs to show at this altitude."""
         knobs = self.settings.steering
         if knobs.on and knobs.sampling and flight is not None and flight.altitude_m > 0:
-            least = every_least(self.camera.focal_px[0] / flight.altitude_m, self.rate_hz, knobs)
-            self._every = int(np.clip(round(least), 1, knobs.maximum_every))
+            self._every = int(np.clip(round(self._least(flight)), 1, knobs.maximum_every))
         self._command = Command(self._every)
         return self._command
 
@@ -88,6 +88,11 @@ class Steering:
         self._command = Command(self._every, self._fly_to(look_at), look_at, self._follow.altitude_m, orders)
         return self._command, self._record.made()
 
+    def _least(self, flight: Flight) -> float:
+        """Of how many frames one shows a walker at this altitude."""
+        scale = pixels_per_metre(flight.altitude_m, self.camera.focal_px[0])
+        return every_least(scale, self.rate_hz, self.settings.steering)
+
     def _aloft(self) -> Stand | None:
         """How the aerial camera is carried at the altitude at which it was asked to be."""
         if self._stand is None or self._follow.altitude_m is None:
@@ -130,7 +135,7 @@ class Steering:
             )
             why += limit
         if flight is not None and flight.altitude_m > 0:
-            wanted = max(wanted, every_least(self.camera.focal_px[0] / flight.altitude_m, self.rate_hz, knobs))
+            wanted = max(wanted, self._least(flight))
         every, made = sampled(frame, self._every, wanted, why, knobs)
         if every > self._every and now_s - self._sampled_s < _CALM_S:
             return

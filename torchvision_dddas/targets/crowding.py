@@ -71,17 +71,3 @@ def joined(found: Detections, mask: np.ndarray, crowd: Int[np.ndarray, " N"]) ->
         middle,
     )
     return crowds, number[mask]
-
-
-def with_middles(found: Detections, mask: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
-    """(N, 2) u, v of the mean of each detection's pixels in the mask; NaN for one without any.
-
-    core: (H, W) bool, the pixels that count: of what is between the people of a crowd nothing follows. None: all.
-    """
-    rows, columns = np.nonzero(mask if core is None else mask * core)
-    value = mask[rows, columns].astype(np.int64)
-    count = np.bincount(value, minlength=len(found) + 1)[1 : len(found) + 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.stack(
-            [np.bincount(value, at, len(found) + 1)[1 : len(found) + 1] / count for at in (columns, rows)], axis=1
-        )

@@ -11,13 +11,25 @@ _NEAR_PX = 2.0
 def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
     """(N, 2) of the blobs' mass where the foreground is given, else of their boxes."""
     centres = boxes[:, :2] + (boxes[:, 2:] - 1) / 2
-    if foreground is not None:
-        for row, box in enumerate(boxes):
-            left, top, right, bottom = _pixels(box, foreground.shape)
-            v, u = np.nonzero(foreground[top:bottom, left:right] == row + 1)
-            if len(u):
-                centres[row] = left + u.mean(), top + v.mean()
-    return centres
+    if foreground is None:
+        return centres
+    middles = middles_of(boxes, foreground)
+    return np.where(np.isfinite(middles), middles, centres)
+
+
+def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
+
+    core: (H, W) bool, the pixels that count: of what is between the people of a crowd nothing follows. None: all.
+    """
+    middles = np.full((len(boxes), 2), np.nan)
+    for row, box in enumerate(boxes):
+        left, top, right, bottom = _pixels(box, foreground.shape)
+        mine = foreground[top:bottom, left:right] == row + 1
+        v, u = np.nonzero(mine if core is None else mine & core[top:bottom, left:right])
+        if len(u):
+            middles[row] = left + u.mean(), top + v.mean()
+    return middles
 
 
 def covering(
