@@ -132,6 +132,30 @@ def test_a_rolling_shutter_shifts_each_row_by_what_the_camera_did_until_it_was_r
         assert np.hypot(u.mean() - pixel[0], v.mean() - pixel[1]) < 0.5 * np.hypot(*(pixel - (319.5, 239.5))) * 0.05 + 3
 
 
+def test_vibration_moves_rows_aside_anew_in_each_picture_and_only_while_the_shutter_rolls(bare):
+    world = marked(bare, PLACES)
+    camera = AerialCamera(world, scenario(readout_s=0.015, vibration_px=2))
+    calm = moment(world, nobody(world), 60)
+    steady = view_of(calm.pose, camera.camera).project(np.c_[PLACES, world.up_m(PLACES)])
+    offs = []
+    for number in (1, 2):
+        image, _, _ = camera.take(replace(calm, number=number))
+        offs.append(spots(image, steady) - steady)
+        # The truth moves with the picture.
+        _, _, bodies = camera.take(replace(calm, number=number, bodies=people(PLACES, world)))
+        _, _, unmoved = AerialCamera(world, scenario()).take(replace(calm, bodies=people(PLACES, world)))
+        for k in range(len(PLACES)):
+            shown, meant = (np.argwhere(mask == k + 1).mean(axis=0)[::-1] for mask in (bodies, unmoved))
+            assert np.abs(shown - meant - offs[-1][k]).max() < 0.6
+    assert np.abs(offs[0] - offs[1]).max() > 1
+    assert np.abs(offs).max() < 2 * np.sqrt(2) + 0.1
+    assert np.ptp(offs[0], axis=0).max() > 1
+    global_shutter = AerialCamera(world, scenario(readout_s=0, vibration_px=2))
+    image, _, _ = global_shutter.take(calm)
+    plain = spots(image, steady) - steady
+    assert np.abs(plain - plain[0]).max() < 0.1
+
+
 @pytest.mark.parametrize(("altitude", "pitch"), [(50, 90), (50, 45), (150, 90)])
 def test_the_mask_of_a_crowd_lies_where_its_people_are(bare, altitude, pitch):
     grid = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1).reshape(-1, 2)

@@ -26,7 +26,7 @@ class AerialCamera:
         focal = size[0] / 2 / np.tan(np.radians(knobs.hfov_deg) / 2)
         self.camera = Camera("uav", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2))
         self._world, self._exposure_s = world, knobs.exposure_s
-        self._shutter = Shutter(self.camera, knobs.readout_s)
+        self._shutter = Shutter(self.camera, knobs.readout_s, knobs.vibration_px, scenario.seed)
         self._terrain = Terrain(world, self._shutter)
         self._painter = Painter(world, self._shutter, knobs.exposure_s, scenario.seed)
         self._sensor = Sensor(knobs, size, scenario.seed)

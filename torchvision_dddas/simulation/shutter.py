@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,25 +13,38 @@ _LOWEST = 0.004  # rays sink at least so much for each metre along the axis: tho
 _FURTHEST_M = 20_000.0
 _LANDINGS = 8
 _CLOSE_M = 0.004
+_VIBRATION_HZ = 120.0  # of rotors that turn 60 times a second, two blades each
 
 
 class Shutter:
-    """A camera without distortion whose last row is read readout_s after its first."""
+    """A camera without distortion whose last row is read readout_s after its first.
 
-    def __init__(self, camera: Camera, readout_s: float) -> None:
+    vibration_px: standard deviation along each axis of how far vibration moves a row aside; seed: of its phase.
+    """
+
+    def __init__(self, camera: Camera, readout_s: float, vibration_px: float = 0.0, seed: int = 0) -> None:
         self.camera = camera
         self.readout_s = readout_s
+        self._vibration_px, self._seed = vibration_px, seed
 
     def lag_s(self, v: np.ndarray) -> np.ndarray:
         """When a row is read, after the middle one."""
         last = self.camera.size_px[1] - 1
         return (np.clip(v, 0, last) / last - 0.5) * self.readout_s
 
+    def aside_px(self, number: int, v: np.ndarray) -> np.ndarray | float:
+        """(N, 2) how far vibration moves rows (N,) of a picture aside."""
+        if not self._vibration_px:
+            return 0.0
+        turns = 2 * np.pi * _VIBRATION_HZ * self.lag_s(v)[:, None]
+        return np.sqrt(2) * self._vibration_px * np.sin(turns + _phases(self._seed, number))
+
     def rays(self, moment: Moment, image_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the rays through pixels (N, 2) start and whither they go, (N, 3) each, a metre along the axis long."""
         camera, pose = self.camera, moment.pose
         focal = np.array(camera.focal_px) * pose.focal
-        flat = (image_px - np.array(camera.centre_px)) / focal
+        steady_px = image_px - self.aside_px(moment.number, image_px[:, 1])
+        flat = (steady_px - np.array(camera.centre_px)) / focal
         lag = self.lag_s(image_px[:, 1])[:, None]
         way = turned(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
         return pose.place_m + lag * moment.velocity_m_s, way
@@ -68,7 +82,13 @@ class Shutter:
             over = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
             row = seen[:, 1] * over * focal[1] + centre[1]
         column = seen[:, 0] * over * focal[0] + centre[0]
-        return np.stack([column, row], axis=1), depth
+        return np.stack([column, row], axis=1) + self.aside_px(moment.number, row), depth
+
+
+@lru_cache(maxsize=8)
+def _phases(seed: int, number: int) -> np.ndarray:
+    """(2,) of the vibration in a picture's middle row: no frame rate keeps step with it."""
+    return np.random.default_rng([seed, 79, number]).uniform(0, 2 * np.pi, 2)
 
 
 def turned(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:

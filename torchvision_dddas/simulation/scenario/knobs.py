@@ -128,6 +128,9 @@ class CameraKnobs(Group):
     hfov_deg: float = knob(60.0, "deg", 5, 120, meaning="width of the field of view")
     exposure_s: float = knob(0.002, "s", 0, 0.5, meaning="time of exposure: what moves is blurred along its way")
     readout_s: float = knob(0.015, "s", 0, 0.5, meaning="rolling shutter: the last row is read so much later")
+    vibration_px: float = knob(
+        0.04, "px", 0, 10, meaning="rolling shutter: standard deviation of how far vibration moves rows aside"
+    )
     sharpness_px: float = knob(0.6, "px", 0, 10, meaning="standard deviation of the lens's blur")
     shot_noise: float = knob(0.015, "-", 0, 10, meaning="variance of the noise, in grey levels, for each grey level")
     read_noise: float = knob(0.6, "grey levels", 0, 50, meaning="standard deviation of the noise in the dark")
