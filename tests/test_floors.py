@@ -69,6 +69,8 @@ FLOORS: dict[str, set[str]] = {
         "settings",
         "errors",
     },
+    # A run that keeps up with a camera: capture, load, health, the page that shows it.
+    "live": {"numpy", "run", "surveying", "control", "sources", "vision", "types", "settings", "errors"},
     "sources": {"numpy", "cv2", "av", "simulation", "types", "errors"},
     "sources.telemetry": {"numpy", "av", "pymavlink", "pyulog", "pynmea2", "sources", "types", "errors"},
     "sources.elevation": {"numpy", "rasterio", "types", "errors"},

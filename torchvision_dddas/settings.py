@@ -626,6 +626,34 @@ class SteeringKnobs(Group):
     )
 
 
+class LiveKnobs(Group):
+    """A run that must keep up with a camera."""
+
+    pace: float = knob(
+        1.0, "-", 0, 1000, meaning="a file plays so many times as fast as it was filmed; 0: as fast as it is taken"
+    )
+    queue_frames: int = knob(2, "frames", 1, 64, meaning="pictures that may wait; of more the oldest is dropped")
+    deadline_ms: float = knob(
+        80.0,
+        "ms",
+        1,
+        60_000,
+        meaning="what a picture may take from camera to results, those it waits for apart",
+    )
+    shed: bool = knob(True, "-", meaning="look at less when it takes too long; false: pictures are dropped instead")
+    load: float = knob(0.85, "-", 0.1, 1, meaning="share of the time between two pictures that looking at one may take")
+    calm_s: float = knob(5.0, "s", 0.1, 600, meaning="more is looked at again after so long with time to spare")
+    least_keypoints: int = knob(80, "-", 16, 10_000, meaning="no fewer keypoints than this, however busy")
+    maximum_every: int = knob(8, "frames", 1, 60, meaning="at least one of so many pictures is looked at, however busy")
+    stall_s: float = knob(5.0, "s", 0.1, 600, meaning="a stream that sends nothing for so long counts as lost")
+    retry_s: float = knob(0.5, "s", 0.01, 600, meaning="a lost stream is opened again after this, then twice that")
+    retry_most_s: float = knob(30.0, "s", 0.01, 3600, meaning="... and so on up to this")
+    watchdog_s: float = knob(30.0, "s", 0, 3600, meaning="a step that takes so long counts as hung; 0: none does")
+    status_s: float = knob(
+        2.0, "s", 0.1, 600, meaning="how often the state of the run is written, and results are put to disk"
+    )
+
+
 class Settings(Group):
     """All knobs, by group."""
 
@@ -647,6 +675,7 @@ class Settings(Group):
     aerial: AerialKnobs = AerialKnobs()
     crowds: CrowdKnobs = CrowdKnobs()
     steering: SteeringKnobs = SteeringKnobs()
+    live: LiveKnobs = LiveKnobs()
 
 
 # --------------------------------------------------------------------------------------------------------------------

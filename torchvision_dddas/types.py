@@ -12,12 +12,14 @@ class Frame:
     number: 1-based position in the clip. time_s: seconds since the clip's first frame.
     image: uint8, (H, W) grey or (H, W, 3) in OpenCV's BGR order.
     skipped: how many frames just before it were left out on purpose: they are not missing.
+    taken_s: by the monotonic clock of this machine, when a camera gave it; NaN for a recording.
     """
 
     number: int
     time_s: float
     image: np.ndarray
     skipped: int = 0
+    taken_s: float = float("nan")
 
 
 @dataclass(frozen=True)
