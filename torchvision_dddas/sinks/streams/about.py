@@ -1,0 +1,17 @@
+"""What the lines of a stream need to know of the run."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class About:
+    """What does not change from frame to frame.
+
+    start_utc_s: seconds since 1970 at time_s = 0, NaN where no clock is known. geographic: whether targets get
+    longitudes and latitudes. landmarks: their names. source: what the run is called in Cursor-on-Target events.
+    """
+
+    start_utc_s: float = float("nan")
+    geographic: bool = False
+    landmarks: tuple[str, ...] = ()
+    source: str = "dddas"

@@ -1,0 +1,114 @@
+"""A stream: frames in, messages out, and what to do while nobody takes them."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from torchvision_dddas.sinks.streams.outlet import Outlet
+from torchvision_dddas.types import Followed, Surveyed
+
+Tell = Callable[[str, str], object]
+"""Called with a kind, `sink`, and words for a person."""
+
+
+class Encoder(Protocol):
+    """What makes messages of a frame."""
+
+    def __call__(
+        self, surveyed: Surveyed | None, people: Followed | None, age_s: float, most_bytes: int
+    ) -> Sequence[bytes]:
+        """Messages with their line ends, of most_bytes at most where that can be; 0: of any length."""
+
+
+class Stream:
+    """Feed it frames in order. No trouble of the outlet ends the run: it is told once, and tried again with back-off.
+
+    name: as the user wrote it. sent: messages given to the outlet. lost: messages that nobody will get.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        encode: Encoder,
+        outlet: Outlet,
+        tell: Tell,
+        retry_s: float = 0.5,
+        retry_most_s: float = 30.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """retry_s: a broken outlet is tried again after this, then twice that, up to retry_most_s."""
+        self.name = name
+        self.sent = 0
+        self._encode, self._outlet, self._tell, self._clock = encode, outlet, tell, clock
+        self._retry_s, self._retry_most_s = retry_s, retry_most_s
+        self._trouble = ""
+        self._wait_s = self._due_s = 0.0
+        self._told_lost = 0
+        self._tell_lost_s = -math.inf
+
+    @property
+    def lost(self) -> int:
+        """Messages that nobody will get."""
+        return self._outlet.lost
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing goes out at the moment; empty where all is well."""
+        return self._trouble
+
+    def write(self, surveyed: Surveyed | None, people: Followed | None = None) -> None:
+        """Send a frame: its targets, and the people seen in it; None: not told, or not searched for. Never raises."""
+        followed = surveyed.followed if surveyed is not None else people
+        if followed is None:
+            return
+        age_s = float("nan") if followed.frame is None else self._clock() - followed.frame.taken_s
+        messages = list(self._encode(surveyed, people, age_s, self._outlet.most_bytes))
+        self.sent += len(messages)
+        self._outlet.put(messages)
+        self._flush()
+
+    def sync(self) -> None:
+        """Put what was sent where a loss of power leaves it. Never raises."""
+        if self._trouble:
+            return
+        try:
+            self._outlet.sync()
+        except OSError as error:
+            self._broke(error)
+
+    def close(self) -> None:
+        """Send what can be sent soon, and say what was lost. Never raises."""
+        self._outlet.close()
+        if self.lost > self._told_lost:
+            self._tell("sink", f"{self.name} closed; {self._newly_lost()}")
+
+    def _flush(self) -> None:
+        if self._trouble and self._clock() < self._due_s:
+            return
+        try:
+            if self._trouble:
+                self._outlet.mend()
+            self._outlet.flush()
+        except OSError as error:
+            self._broke(error)
+            return
+        if self._trouble:
+            self._trouble = ""
+            self._tell("sink", f"{self.name} works again; {self._newly_lost()}")
+        elif self.lost > self._told_lost and self._clock() >= self._tell_lost_s:
+            self._tell_lost_s = self._clock() + self._retry_most_s
+            self._tell("sink", f"{self.name} is taken too slowly; {self._newly_lost()}")
+
+    def _broke(self, error: OSError) -> None:
+        trouble = error.strerror or str(error)
+        self._wait_s = min(2 * self._wait_s, self._retry_most_s) if self._trouble else self._retry_s
+        self._due_s = self._clock() + self._wait_s
+        if trouble != self._trouble:
+            self._tell("sink", f"{self.name}: {trouble}; trying again in {self._wait_s:g} s")
+        self._trouble = trouble
+
+    def _newly_lost(self) -> str:
+        """In words, what was lost since it was last told."""
+        lost, self._told_lost = self.lost - self._told_lost, self.lost
+        return f"{lost or 'no'} message{'' if lost == 1 else 's'} lost"
