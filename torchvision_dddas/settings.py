@@ -71,6 +71,7 @@ class RegistrationKnobs(Group):
     redetect_frames: int = knob(
         1, "frames", 1, 60, meaning="new keypoints every so many frames; between, inliers are carried on (onboard)"
     )
+    halved: bool = knob(False, "-", meaning="search pictures of half the size: quicker, half as exact (onboard)")
     min_inliers: int = knob(20, "points", 4, 5000, meaning="fewer inliers make the registration unreliable")
     min_inlier_share: float = knob(
         0.4, "-", 0, 1, meaning="a smaller share of inliers makes the registration unreliable"
@@ -127,6 +128,7 @@ class DifferenceKnobs(Group):
     peak: float = knob(7.0, "-", 0, 255, meaning="a target's largest difference reaches at least this, same unit")
     blur_px: Odd = knob(5, "px", 1, 31, meaning="Gaussian kernel on the difference, odd; 1 is none")
     border_px: int = knob(4, "px", 0, 50, meaning="strip inside a warped frame's border that counts as outside")
+    halved: bool = knob(False, "-", meaning="compare pictures of half the size: quicker, coarser outlines (onboard)")
 
 
 class MorphologyKnobs(Group):
@@ -315,7 +317,7 @@ class PeopleKnobs(Group):
         "opencv", "-", meaning="opencv: the coefficients of its default people detector; or a file of a linear SVM's"
     )
     graphs: str = knob(
-        "shipped", "-", meaning="onboard: the ONNX graphs; a folder that export/people_graph.py made, or shipped"
+        "shipped", "-", meaning="onboard: the ONNX graphs; a folder that `dddas export` made, or shipped"
     )
     window_width_px: int = knob(64, "px", 8, 1024, meaning="width of the window that the classifier sees")
     window_height_px: int = knob(128, "px", 8, 1024, meaning="height of the window that the classifier sees")

@@ -49,14 +49,14 @@ def register(earlier: View, later: View, knobs: RegistrationKnobs) -> Registrati
     carrying = knobs.redetect_frames > 1
     carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
     if carried is not None and _worn(carried, earlier.size, knobs):
-        points = keypoints(earlier.grey, knobs, halved=True)
+        points = keypoints(earlier.grey, knobs, halved=not knobs.halved)
         carried = _Carried(points, carried.step, 0, len(points), _cover(points, earlier.size))
     if carried is not None:
         found, inliers = _step(earlier, later, carried.points, knobs, carried.step)
         if found.inliers < _LEAST_SHARE * len(carried.points) or not found.reliable:
             carried = None
     if carried is None:
-        points = keypoints(earlier.grey, knobs, halved=carrying)
+        points = keypoints(earlier.grey, knobs, halved=carrying and not knobs.halved)
         carried = _Carried(points, np.eye(3), 0, len(points), _cover(points, earlier.size))
         found, inliers = _step(earlier, later, points, knobs, None)
     if carrying and found.reliable:

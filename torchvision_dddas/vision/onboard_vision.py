@@ -9,6 +9,14 @@ from torchvision_dddas.settings import DifferenceKnobs, Settings
 from torchvision_dddas.targets.silhouette import closed, ellipse
 from torchvision_dddas.types import Registration
 from torchvision_dddas.vision.exposure import to_light_of
+from torchvision_dddas.vision.onboard_half import (
+    half_knobs,
+    half_of,
+    half_settings,
+    half_window,
+    whole_maps,
+    whole_step,
+)
 from torchvision_dddas.vision.onboard_pixels import exposed, inside, lit, median_above, texture_of, warp
 from torchvision_dddas.vision.onboard_registration import register
 from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, Foreground, View, Window
@@ -28,11 +36,19 @@ class OnboardVision:
 
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
         """Keypoints, pyramidal Lucas-Kanade, RANSAC, refits on the inliers."""
-        return [register(earlier, later, self.knobs.registration) for earlier, later in pairs]
+        knobs = self.knobs.registration
+        if knobs.halved:
+            small = half_knobs(knobs)
+            return [whole_step(register(half_of(a), half_of(b), small)) for a, b in pairs]
+        return [register(earlier, later, knobs) for earlier, later in pairs]
 
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """Differences to the warped neighbours, threshold, morphology."""
-        return [_foreground(window, self.knobs) for window in windows]
+        if not self.knobs.difference.halved:
+            return [_foreground(window, self.knobs) for window in windows]
+        small = half_settings(self.knobs)
+        flow = self.knobs.persistence.on or self.knobs.refine.on
+        return [whole_maps(_foreground(half_window(window), small), window.reference.size, flow) for window in windows]
 
 
 def _foreground(window: Window, settings: Settings) -> Foreground:
