@@ -3,18 +3,28 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test lint peers
+.PHONY: demo test lint onboard peers
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
 
-test: lint
-	$(BIN)/python -m pytest
+test: lint onboard
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The wheel with nothing but its own dependencies, as on a vehicle: does it work without torch?
+onboard: .venv-onboard/.installed
+	.venv-onboard/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
+	.venv-onboard/bin/python -I tests/torch_free.py
+
+.venv-onboard/.installed: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check .
+	@touch $@
 
 # Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
 # tracking measures TrackEval's? DATA may name a folder of MOTChallenge 2015 sequences to check them on as well.
