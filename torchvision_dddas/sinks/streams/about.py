@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass
 class About:
-    """What does not change from frame to frame.
-
-    start_utc_s: seconds since 1970 at time_s = 0, NaN where no clock is known. geographic: whether targets get
-    longitudes and latitudes. landmarks: their names. source: what the run is called in Cursor-on-Target events.
+    """start_utc_s: seconds since 1970 at time_s = 0, NaN where no clock is known. A live run sets it with its first
+    picture, and again when the machine's clock is set. geographic: whether targets get longitudes and latitudes. landmarks: their names. source: what the run is called in Cursor-on-Target events.
     """
 
     start_utc_s: float = float("nan")
