@@ -14,20 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from torchvision_dddas.simulation.scene import render
-
-
-def write_video(path: Path, images: list[np.ndarray], count: int) -> None:
-    """`count` frames of a clip played forwards and backwards."""
-    height, width = images[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (width, height))
-    period = 2 * len(images) - 2
-    for i in range(count):
-        writer.write(images[min(i % period, period - i % period)])
-    writer.release()
+sys.path.insert(0, str(Path(__file__).parent))
+from films import scene, write_video
 
 
 def measured(command: list[str]) -> dict[str, float]:
@@ -57,7 +45,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     width, height = (int(v) for v in options.size.split("x"))
-    images, rows = render(seed=0, frames=30, size=(width, height)).images, []
+    images, rows = scene((width, height), 30), []
     with tempfile.TemporaryDirectory() as folder:
         for count in options.frames:
             write_video(Path(folder) / f"{count}.mp4", images, count)

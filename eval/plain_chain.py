@@ -1,5 +1,6 @@
 """The plain OpenCV chain that speed is measured against: every three-frame window computed from nothing."""
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -32,15 +33,22 @@ def register(grey: np.ndarray, later: np.ndarray, start: np.ndarray) -> np.ndarr
     return np.eye(3) if grey_from_later is None else grey_from_later
 
 
-def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) uint8 mask of what moves in the first of three BGR frames, and its (N, 4) boxes x, y, width, height."""
+def plain_window(
+    first: np.ndarray, second: np.ndarray, third: np.ndarray, lap: Callable[[str], None] = lambda stage: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) uint8 mask of what moves in the first of three BGR frames, and its (N, 4) boxes x, y, width, height.
+
+    lap: told the name of a stage when it is over.
+    """
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second, third)]
+    lap("prepare")
     height, width = greys[0].shape
     start = keypoints(greys[0])
+    homographies = [register(greys[0], later, start) for later in greys[1:]]
+    lap("register")
     seen = np.full((height, width), 255, np.uint8)
     difference = seen.copy()
-    for later in greys[1:]:
-        homography = register(greys[0], later, start)
+    for later, homography in zip(greys[1:], homographies, strict=True):
         warped = cv2.warpPerspective(later, homography, (width, height))
         full = np.full((height, width), 255, np.uint8)
         seen &= cv2.warpPerspective(full, homography, (width, height), flags=cv2.INTER_NEAREST)
@@ -49,6 +57,7 @@ def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> tu
     smooth = cv2.bitwise_and(cv2.GaussianBlur(difference, (7, 7), 0), seen)
     mask = cv2.threshold(smooth, THRESHOLD, 255, cv2.THRESH_BINARY)[1]
     mask = cv2.morphologyEx(cv2.erode(mask, ellipse(3)), cv2.MORPH_CLOSE, ellipse(15))
+    lap("foreground")
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
     large = np.zeros(count, np.uint8)
     large[1:] = np.where(stats[1:, cv2.CC_STAT_AREA] >= LEAST_AREA_PX, 255, 0)
@@ -56,4 +65,5 @@ def plain_window(first: np.ndarray, second: np.ndarray, third: np.ndarray) -> tu
     hulls = np.zeros((height, width), np.uint8)
     for outline in outlines:
         cv2.fillConvexPoly(hulls, cv2.convexHull(outline), 255)
+    lap("targets")
     return hulls, stats[1:, :4][stats[1:, cv2.CC_STAT_AREA] >= LEAST_AREA_PX].astype(float)

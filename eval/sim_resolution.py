@@ -17,6 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 import cv2
 import numpy as np
+from films import resized
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, walking
 
@@ -66,13 +67,6 @@ def work(case: Case) -> Case:
             if turn >= WARM_UP:
                 times[size, config].append((time.perf_counter() - start) / TURN)
     return {key(size, config): float(np.median(spent)) for (size, config), spent in times.items()}
-
-
-def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The middle of a picture with the sides of the size asked for, made as large as that."""
-    rows = round(image.shape[1] * size[1] / size[0])
-    top = (image.shape[0] - rows) // 2
-    return cv2.resize(image[top : top + rows], size, interpolation=cv2.INTER_AREA)
 
 
 def key(size: tuple[int, int], config: str) -> str:

@@ -1,0 +1,233 @@
+"""The chains whose speed and memory are compared, timed in turns and stage by stage.
+
+usage: python eval/chains.py CHAIN VIDEO: takes one chain through a video and ends; for a look at its memory from
+outside. Nothing is imported but what the chain needs.
+"""
+
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads must not spin through the others' turns
+
+import numpy as np
+import plain_chain
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.run import Loop
+from torchvision_dddas.settings import load
+from torchvision_dddas.types import Frame, Registration
+from torchvision_dddas.vision import Foreground, View, Vision, Window
+from torchvision_dddas.vision import load as load_vision
+
+TURN, WARM_UP = 8, 3
+STAGES = ("prepare", "register", "foreground", "targets")
+"""Grey pictures; the camera's motion; difference to mask; mask to targets, and all that belongs to no other stage."""
+ONBOARD = ("onboard fast", "onboard half", "onboard default")
+TORCH = tuple(f"torch {config} b{batch}" for config in ("fast", "default") for batch in (1, 8))
+CHAINS = (*ONBOARD, *TORCH)
+
+
+class Stopwatch:
+    """Seconds by the clock and of the processor over all threads, added up for each stage."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, np.ndarray] = {}
+        self.last = _now()
+
+    def start(self) -> None:
+        """What comes next is of the stage that the next lap names."""
+        self.last = _now()
+
+    def lap(self, stage: str) -> None:
+        """A stage is over; another begins."""
+        now = _now()
+        self.spent[stage] = self.spent.get(stage, 0) + now - self.last
+        self.last = now
+
+
+def _now() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+class Clocked:
+    """A back end whose stages are clocked: a `Vision` itself."""
+
+    def __init__(self, vision: Vision, watch: Stopwatch) -> None:
+        self.vision, self.watch, self.name = vision, watch, vision.name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.vision, name)
+
+    def prepare(self, image: np.ndarray) -> View:
+        """As the back end's own, and so the next two."""
+        return self._clocked("prepare", self.vision.prepare, image)
+
+    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
+        """Motion of the camera."""
+        return self._clocked("register", self.vision.register, pairs)
+
+    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+        """What differs."""
+        return self._clocked("foreground", self.vision.foreground, windows)
+
+    def _clocked(self, stage: str, call: Callable[[Any], Any], argument: Any) -> Any:
+        self.watch.start()
+        result = call(argument)
+        self.watch.lap(stage)
+        return result
+
+
+class Chain:
+    """One of those compared. boxes: how many were found in each frame of the turn; watch: its stages."""
+
+    def __init__(self, name: str) -> None:
+        self.watch = Stopwatch()
+        self.boxes: list[int] = []
+        self.window = 3 if name == "plain" else 1
+        if name == "plain":
+            self._one = self._plain
+            return
+        backend, config, *batch = name.split()
+        settings = load(None if config == "default" else config)
+        vision = Clocked(load_vision(backend, settings), self.watch)
+        self.loop = Loop(vision, settings, 10.0, batch=int(batch[0][1:]) if batch else 1)
+        self._one = self._ours
+
+    def turn(self, frames: list[np.ndarray], start: int, count: int = TURN) -> None:
+        """So many frames of a clip, from an index on."""
+        for i in range(start, start + count):
+            self._one(frames, i)
+
+    def _plain(self, frames: list[np.ndarray], i: int) -> None:
+        self.watch.start()
+        _, boxes = plain_chain.plain_window(*frames[i : i + 3], self.watch.lap)
+        self.boxes.append(len(boxes))
+
+    def _ours(self, frames: list[np.ndarray], i: int) -> None:
+        for scene in self.loop.feed(Frame(i + 1, i / 10.0, frames[i])):
+            self.boxes.append(len(scene.detections.box_px))
+
+
+def available(names: Sequence[str] = CHAINS) -> list[str]:
+    """Those that can run here: torch is installed, the configuration is there."""
+    return [name for name in names if _can_run(name)]
+
+
+def _can_run(name: str) -> bool:
+    backend, config = name.split()[:2]
+    if backend == "torch" and not (find_spec("torch") and find_spec("kornia")):
+        return False
+    try:
+        load(None if config == "default" else config)
+    except InputError:
+        return False
+    return True
+
+
+class Timed:
+    """A chain's turns: times by the clock, and of the processor over all threads; boxes: the median."""
+
+    def __init__(self) -> None:
+        self._whole: list[np.ndarray] = []
+        self._stages: dict[str, list[np.ndarray]] = {stage: [] for stage in STAGES}
+        self._boxes: list[int] = []
+
+    def add(self, spent: np.ndarray, stages: dict[str, np.ndarray], boxes: Sequence[int]) -> None:
+        """A turn: seconds in all and by stage."""
+        ms = 1e3 / TURN
+        rest = spent - sum((value for name, value in stages.items() if name != "targets"), np.zeros(2))
+        for stage in STAGES[:-1]:
+            self._stages[stage].append(ms * stages.get(stage, np.zeros(2)))
+        self._stages["targets"].append(ms * rest)
+        self._whole.append(ms * spent)
+        self._boxes += boxes
+
+    @property
+    def whole(self) -> np.ndarray:
+        """(turns, 2) ms a frame."""
+        return np.array(self._whole)
+
+    @property
+    def stages(self) -> dict[str, np.ndarray]:
+        """(turns, 2) ms a frame of each stage."""
+        return {stage: np.array(turns) for stage, turns in self._stages.items()}
+
+    @property
+    def boxes(self) -> float:
+        """Targets in a frame."""
+        return float(np.median(self._boxes)) if self._boxes else 0.0
+
+
+def timed(clips: dict[str, list[np.ndarray]], chains: Sequence[str], rounds: int) -> Iterator[dict[str, Timed]]:
+    """All chains in turns of TURN frames through clips of the same length, the plain chain among them.
+
+    clips: by chain where they differ, else under "". Yields after each turn that counts: {chain: Timed}, added to.
+    """
+    running = {name: Chain(name) for name in dict.fromkeys(("plain", *chains))}
+    found = {name: Timed() for name in running}
+    for k in range(rounds + WARM_UP):
+        for name, chain in running.items():
+            frames = clips[name if name in clips else ""]
+            gc.collect()
+            chain.watch.spent, chain.boxes = {}, []
+            start = _now()
+            chain.turn(frames, k * TURN)
+            spent = _now() - start
+            if k >= WARM_UP:
+                found[name].add(spent, chain.watch.spent, chain.boxes)
+        if k >= WARM_UP:
+            yield found
+
+
+def frames_needed(rounds: int) -> int:
+    """How many frames so many turns go through."""
+    return (rounds + WARM_UP) * TURN + 2
+
+
+def row(spent: np.ndarray, plain: np.ndarray) -> dict[str, float]:
+    """The figures of one chain on one clip, of its turns and of the plain chain's; (turns, 2) each."""
+    (spent, busy), (plain, plain_busy) = spent.T, plain.T
+    ratio, busy_ratio = spent / plain, busy / plain_busy
+    return {
+        "median_ms": float(np.median(spent)),
+        "mean_ms": float(spent.mean()),
+        **quartiles("ratio", ratio),
+        "ratio_of_means": float(spent.mean() / plain.mean()),
+        **quartiles("processor_ms", busy),
+        **quartiles("processor_ratio", busy_ratio),
+        "processor_ratio_of_means": float(busy.mean() / plain_busy.mean()),
+    }
+
+
+def quartiles(name: str, values: np.ndarray) -> dict[str, float]:
+    """{name: median, name_25, name_75}."""
+    low, middle, high = np.percentile(values, [25, 50, 75]).tolist()
+    return {name: middle, f"{name}_25": low, f"{name}_75": high}
+
+
+def alone(name: str, path: str) -> None:
+    """One chain through a video, as a process that does nothing else."""
+    from torchvision_dddas.sources import open_source
+
+    chain = Chain(name)
+    frames: list[np.ndarray] = []
+    for frame in open_source(path):
+        frames = [*frames[1 - chain.window :], frame.image] if chain.window > 1 else [frame.image]
+        if len(frames) < chain.window:
+            continue
+        if name == "plain":
+            chain.turn(frames, 0, 1)
+        else:
+            for _ in chain.loop.feed(frame):
+                pass
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    alone(*sys.argv[1:])
