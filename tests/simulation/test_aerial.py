@@ -132,6 +132,16 @@ def test_a_rolling_shutter_shifts_each_row_by_what_the_camera_did_until_it_was_r
         assert np.hypot(u.mean() - pixel[0], v.mean() - pixel[1]) < 0.5 * np.hypot(*(pixel - (319.5, 239.5))) * 0.05 + 3
 
 
+def test_a_picture_may_be_full_of_what_stands(bare):
+    # So many lines of sight that OpenCV would not take them in one row.
+    v, u = np.mgrid[: bare.surface.shape[0], : bare.surface.shape[1]] // 4
+    covered = replace(bare, surface=np.where((u + v) % 2 == 0, 3, 0).astype(bare.surface.dtype))
+    now = moment(bare, nobody(bare), 50, 60)
+    image, _, _ = AerialCamera(covered, scenario()).take(now)
+    plain, _, _ = AerialCamera(bare, scenario()).take(now)
+    assert np.ptp(plain) < 20 < np.ptp(image)
+
+
 def test_vibration_moves_rows_aside_anew_in_each_picture_and_only_while_the_shutter_rolls(bare):
     world = marked(bare, PLACES)
     camera = AerialCamera(world, scenario(readout_s=0.015, vibration_px=2))

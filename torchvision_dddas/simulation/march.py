@@ -173,8 +173,13 @@ class Standing:
 
     def _up(self, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
         """Heights (N,) of what stands at places."""
-        none = np.zeros_like(east_m)
-        return self._looked(self._levels[0], Sights(east_m, north_m, none, none, none), none[None], cv2.INTER_LINEAR)[0]
+        up = np.empty_like(east_m)
+        for first in range(0, len(up), _WIDE):
+            part = slice(first, first + _WIDE)
+            none = np.zeros_like(east_m[part])
+            plumb = Sights(east_m[part], north_m[part], none, none, none)
+            up[part] = self._looked(self._levels[0], plumb, none[None], cv2.INTER_LINEAR)[0]
+        return up
 
     def _looked(self, texture: np.ndarray, sights: Sights, up_m: np.ndarray, how: int) -> np.ndarray:
         """(K, N) what a texture (H, W) of the whole world says of where N lines of sight pass so high (K, N)."""
