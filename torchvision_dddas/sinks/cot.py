@@ -6,6 +6,7 @@ import numpy as np
 
 from torchvision_dddas.sinks.ellipses import semi_axes
 from torchvision_dddas.sinks.ground_tracks import GroundTracks, iso_utc
+from torchvision_dddas.sinks.kml import plain
 
 UNKNOWN = "9999999.0"
 """A height or an error that is not known."""
@@ -30,20 +31,37 @@ def cot(tracks: GroundTracks, source: str = "dddas") -> str:
     rows = np.array([row for of in tracks.of.values() for row in _each_second(tracks, of)], int)
     rows = rows[np.lexsort((tracks.target[rows], tracks.time_s[rows]))]
     axes, _ = semi_axes(tracks.covariance_m2[rows], chi2=1.0)
-    begun = f"{source}-{tracks.start_utc_s:.0f}"
     stale = iso_utc(tracks.start_utc_s + tracks.time_s[rows] + STALE_S)
     lines = []
-    for row, (sigma, _), until in zip(rows.tolist(), axes.tolist(), stale, strict=True):
+    for row, (sigma_m, _), until in zip(rows.tolist(), axes.tolist(), stale, strict=True):
         longitude, latitude = tracks.lonlat_deg[row].tolist()
-        time, target = tracks.times_utc[row], tracks.target[row]
-        lines.append(
-            f'<event version="2.0" uid="{begun}-{target}" type="{KIND}" how="m-f" '
-            f'time="{time}" start="{time}" stale="{until}">'
-            f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{UNKNOWN}" '
-            f'ce="{_metres(sigma)}" le="{UNKNOWN}"/>'
-            f'<detail><contact callsign="target {target}"/>{_motion(tracks.velocity_m_s[row])}</detail></event>\n'
-        )
+        uid = name(source, tracks.start_utc_s, tracks.target[row])
+        when = tracks.times_utc[row], until
+        lines.append(event(uid, tracks.target[row], when, (longitude, latitude), sigma_m, tracks.velocity_m_s[row]))
     return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + "".join(lines) + "</events>\n"
+
+
+def name(source: str, start_utc_s: float, target: int) -> str:
+    """What tells a target of a run from all others."""
+    return f"{plain(source)}-{start_utc_s:.0f}-{target}"
+
+
+def event(
+    uid: str,
+    target: int,
+    when: tuple[str, str],
+    lonlat_deg: tuple[float, float],
+    sigma_m: float,
+    velocity_m_s: np.ndarray,
+) -> str:
+    """One event, a line. when: its time, and until when it is to be believed; sigma_m: what is told as ce."""
+    longitude, latitude = lonlat_deg
+    time, stale = when
+    return (
+        f'<event version="2.0" uid="{uid}" type="{KIND}" how="m-f" time="{time}" start="{time}" stale="{stale}">'
+        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{UNKNOWN}" ce="{_metres(sigma_m)}" le="{UNKNOWN}"/>'
+        f'<detail><contact callsign="target {target}"/>{_motion(velocity_m_s)}</detail></event>\n'
+    )
 
 
 def _each_second(tracks: GroundTracks, rows: slice) -> list[int]:

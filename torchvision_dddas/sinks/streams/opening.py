@@ -1,19 +1,20 @@
 """What a user asks for in one word, `json:-` or `cot:udp://239.2.3.1:6969`, as a stream."""
 
+import os
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sinks.streams.about import About
-from torchvision_dddas.sinks.streams.json_lines import json_lines
-from torchvision_dddas.sinks.streams.line_outlet import LineOutlet
 from torchvision_dddas.sinks.streams.outlet import Outlet
 from torchvision_dddas.sinks.streams.stream import Encoder, Stream, Tell
 
-KINDS = ("json", "mot", "cot")
 WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
+
+_BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
+_MOST_WAIT_S = 2.0  # a datagram costs nothing to try
 
 
 def open_stream(
@@ -22,19 +23,19 @@ def open_stream(
     """The stream that a user asks for. tell: called with `sink` and words when something is wrong, and when it is well.
 
     retry_s, retry_most_s: a broken outlet is tried again after the first, then twice that, up to the second.
-    Raises InputError with one line: not such a word, a file that cannot be written, a host that is not known.
+    Raises InputError with one line: not such a word, a file that cannot be written or holds something else, a host that
+    is not known, events for which there are no places or no clock.
     """
     kind, colon, place = text.partition(":")
-    if kind not in KINDS or not colon or not place:
+    datagrams = _is_address(place)
+    if kind not in _BEGINS or not colon or not place or ("://" in place and not datagrams):
         raise InputError(f"{option} {text!r} is no stream; {WANTED}")
-    encode = _encoder(kind, about)
+    encode = _encoder(kind, about, f"{option} {text}")
     try:
-        outlet = _outlet(place)
+        outlet = _datagrams(place, f"{option} {text}") if datagrams else _lines(place, kind, f"{option} {text}")
     except OSError as error:
-        raise InputError(
-            f"{option} {text}: cannot write {place}: {error.strerror or error}; choose another place"
-        ) from None
-    return Stream(text, encode, outlet, tell, retry_s, retry_most_s)
+        raise InputError(f"{option} {text}: {error.strerror or error}; choose another place") from None
+    return Stream(text, encode, outlet, tell, retry_s, min(retry_most_s, _MOST_WAIT_S) if datagrams else retry_most_s)
 
 
 def open_streams(
@@ -45,28 +46,78 @@ def open_streams(
     retry_most_s: float = 30.0,
     option: str = "--emit",
 ) -> list[Stream]:
-    """Several, all or none. Raises InputError as open_stream does, and where two would write to the same place."""
-    streams: list[Stream] = []
-    try:
-        streams.extend(open_stream(text, about, tell, retry_s, retry_most_s, option) for text in texts)
-    except BaseException:
-        for stream in streams:
-            with suppress(Exception):
-                stream.close()
-        raise
+    """Several, all or none. Raises InputError as open_stream does, and where two would write to one file."""
+    places: dict[str, str] = {}
+    for text in texts:
+        place = text.partition(":")[2]
+        if not _is_address(place):
+            other = places.setdefault(
+                place if place == "-" else os.path.realpath(_path(place, f"{option} {text}")), text
+            )
+            if other is not text:
+                raise InputError(f"{option} {other} and {option} {text} go to the same place; choose another for one")
+    with ExitStack() as opened:
+        streams = []
+        for text in texts:
+            streams.append(open_stream(text, about, tell, retry_s, retry_most_s, option))
+            opened.callback(streams[-1].close)
+        opened.pop_all()
     return streams
 
 
-def _encoder(kind: str, about: About) -> Encoder:
-    encoders: dict[str, Callable[[], Encoder]] = {
-        "json": lambda: lambda surveyed, people, age_s, most: json_lines(surveyed, people, about, age_s, most),
-    }
-    return encoders[kind]()
+def _is_address(place: str) -> bool:
+    return place.lower().startswith("udp:")
 
 
-def _outlet(place: str) -> Outlet:
+def _path(place: str, asked: str) -> Path:
+    try:
+        if "\0" in place:
+            raise ValueError("a zero byte is in no file's name")
+        return Path(place).expanduser()
+    except (RuntimeError, ValueError) as error:  # ~nobody
+        raise InputError(f"{asked!r}: {error}; choose another place") from None
+
+
+def _encoder(kind: str, about: About, asked: str) -> Encoder:
+    # Each is loaded only when asked for.
+    if kind == "json":
+        from torchvision_dddas.sinks.streams.json_lines import json_lines
+
+        return lambda surveyed, people, age_s, most_bytes: json_lines(surveyed, people, about, age_s, most_bytes)
+    if kind == "mot":
+        from torchvision_dddas.sinks.streams.mot_rows import mot_rows
+
+        return lambda surveyed, people, age_s, most_bytes: mot_rows(surveyed, people, most_bytes)
+    if not about.geographic:
+        raise InputError(
+            f"{asked}: such events need longitudes and latitudes; give --landmarks or --telemetry in degrees, or "
+            "emit json instead"
+        )
+    if not about.clock:
+        raise InputError(f"{asked}: such events need the time of day, and neither input nor telemetry tells it")
+    from torchvision_dddas.sinks.streams.cot_events import CotEvents
+
+    events = CotEvents(about)
+    return lambda surveyed, people, age_s, most_bytes: events(surveyed)
+
+
+def _datagrams(place: str, asked: str) -> Outlet:
+    from torchvision_dddas.sinks.streams.datagrams import DatagramOutlet, address
+
+    return DatagramOutlet(address(place, asked))
+
+
+def _lines(place: str, kind: str, asked: str) -> Outlet:
+    from torchvision_dddas.sinks.streams.line_outlet import LineOutlet
+
     if place == "-":
         if sys.__stdout__ is None:
             raise OSError("standard output is closed")
         return LineOutlet(None)
-    return LineOutlet(Path(place).expanduser())
+    path = _path(place, asked)
+    if path.is_file() and os.access(path, os.R_OK):
+        with path.open("rb") as file:
+            first = file.read(1)
+        if first not in _BEGINS[kind]:  # of an empty file nothing is in all
+            raise InputError(f"{asked}: the file holds something else than {kind}; choose another file")
+    return LineOutlet(path)

@@ -7,11 +7,12 @@ from typing import Protocol
 class Outlet(Protocol):
     """A place that takes messages, one after another, without ever waiting long.
 
-    most_bytes: of a message; 0: any. lost: messages given up so far, because the place did not take them in time.
+    most_bytes: of a message; 0: any. lost: messages that nobody got so far; reason: why the last of them, in words.
     """
 
     most_bytes: int
     lost: int
+    reason: str
 
     def put(self, messages: Sequence[bytes]) -> None:
         """Keep messages until they can be sent. What is kept is bounded: then the oldest are lost."""

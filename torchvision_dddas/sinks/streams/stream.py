@@ -12,6 +12,9 @@ Tell = Callable[[str, str], object]
 """Called with a kind, `sink`, and words for a person."""
 
 
+_SELDOM_S = 3600.0
+
+
 class Encoder(Protocol):
     """What makes messages of a frame."""
 
@@ -45,7 +48,8 @@ class Stream:
         self._trouble = ""
         self._wait_s = self._due_s = 0.0
         self._told_lost = 0
-        self._tell_lost_s = -math.inf
+        self._told_reason = ""
+        self._lost_wait_s, self._lost_due_s = 0.0, -math.inf
 
     @property
     def lost(self) -> int:
@@ -96,9 +100,8 @@ class Stream:
         if self._trouble:
             self._trouble = ""
             self._tell("sink", f"{self.name} works again; {self._newly_lost()}")
-        elif self.lost > self._told_lost and self._clock() >= self._tell_lost_s:
-            self._tell_lost_s = self._clock() + self._retry_most_s
-            self._tell("sink", f"{self.name} is taken too slowly; {self._newly_lost()}")
+        elif self.lost > self._told_lost:
+            self._tell_lost()
 
     def _broke(self, error: OSError) -> None:
         trouble = error.strerror or str(error)
@@ -107,6 +110,16 @@ class Stream:
         if trouble != self._trouble:
             self._tell("sink", f"{self.name}: {trouble}; trying again in {self._wait_s:g} s")
         self._trouble = trouble
+
+    def _tell_lost(self) -> None:
+        """Now and then, less and less often while the reason stays the same."""
+        reason, now_s = self._outlet.reason, self._clock()
+        if reason == self._told_reason and now_s < self._lost_due_s:
+            return
+        again = reason == self._told_reason
+        self._lost_wait_s = min(2 * self._lost_wait_s, _SELDOM_S) if again else self._retry_most_s
+        self._lost_due_s, self._told_reason = now_s + self._lost_wait_s, reason
+        self._tell("sink", f"{self.name}: {reason}; {self._newly_lost()}")
 
     def _newly_lost(self) -> str:
         """In words, what was lost since it was last told."""
