@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Protocol
@@ -20,6 +20,9 @@ from torchvision_dddas.targets.projective import chain
 from torchvision_dddas.targets.small import SmallTracks, candidates
 from torchvision_dddas.types import Adjustment, Flight, Frame, Registration, Scene, Telemetry
 from torchvision_dddas.vision.protocol import View, Vision, Window
+
+Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
+"""Asked before a frame is taken: the settings from then on, and the record of what changed."""
 
 # A picture whose grey levels spread by less than this shows nothing, not even through fog.
 _BLANK_LEVELS = 1.0
@@ -69,12 +72,18 @@ class _Slot:
 
 
 def run(
-    source: Clip, vision: Vision, settings: Settings, telemetry: Telemetry | None = None, batch: int | None = None
+    source: Clip,
+    vision: Vision,
+    settings: Settings,
+    telemetry: Telemetry | None = None,
+    batch: int | None = None,
+    retune: Retune | None = None,
 ) -> Iterator[Scene]:
     """A scene for every frame number of the clip, in order.
 
     Frames that could not be read, or whose registration cannot be trusted, give empty scenes flagged unreliable.
     batch: windows given to the back end at once; the result does not depend on it. None takes 8 for torch, else 1.
+    retune: may give other settings between frames; what changed is in the scene of the frame that it was asked for.
     A source that can be steered has a method `telemetry` that tells what was reported so far, in place of a whole log.
     Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
     """
@@ -88,7 +97,11 @@ def run(
         last_s = frame.time_s
         if live is not None:
             loop.telemetry = live()
-        yield from loop.feed(frame)
+        adjustments: tuple[Adjustment, ...] = ()
+        if retune is not None:
+            settings, adjustments = retune(frame)
+            loop.retune(settings)
+        yield from loop.feed(frame, adjustments)
     if telemetry is not None:
         check_overlap(telemetry, last_s)
     yield from loop.end(getattr(source, "last", 0))
@@ -122,11 +135,24 @@ class Loop:
         self.history = MotionHistory(settings.history.duration_frames)
         self.remembered = 0  # frames below this index are in the history
 
-    def feed(self, frame: Frame) -> Iterator[Scene]:
-        """Take one frame; yields the scenes that are settled by it."""
+    def retune(self, settings: Settings) -> None:
+        """Go on with other settings. How small targets and the motion's history are kept stays as it was."""
+        if settings is self.settings:
+            return
+        self.settings = self.vision.knobs = settings
+        # Frames that windows may look at are kept for the longer of the two.
+        self.memory = max(self.memory, _memory(settings))
+        altitude_m = self.regime.altitude_m
+        self.regime = (
+            control.Regime(settings) if altitude_m is None else control.regime_at(altitude_m, self.rate_hz, settings)
+        )
+
+    def feed(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
+        """Take one frame; yields the scenes that are settled by it. adjustments: made before it, for its scene."""
         start = time.perf_counter()
         self.skipped += frame.skipped
-        slot = _Slot(frame, self.vision.prepare(frame.image), frame.number - self.skipped)
+        view = self.vision.prepare(frame.image)
+        slot = _Slot(frame, view, frame.number - self.skipped, adjustments=adjustments)
         slot.seconds["prepare"] = time.perf_counter() - start
         self.shape = frame.image.shape
         self.slots.append(slot)
@@ -214,7 +240,8 @@ class Loop:
         # A log may tell one of them and not the other, or fall silent for a while.
         altitude = flight.altitude_m if flight is not None and np.isfinite(flight.altitude_m) else None
         number = slot.frame.number
-        self.regime, slot.adjustments = control.steered(number, self.regime, altitude, self.rate_hz, self.settings)
+        self.regime, moved = control.steered(number, self.regime, altitude, self.rate_hz, self.settings)
+        slot.adjustments += moved
         slot.regime = self.regime
         apart = slot.frame.skipped + 1  # frames from look to look
         if slot.step is not None and slot.step.reliable:

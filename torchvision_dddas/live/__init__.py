@@ -1,5 +1,6 @@
 """A run that keeps up with a camera: capture in a thread of its own, less work where it takes too long, health."""
 
+from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Event, Health, Snapshot
 
-__all__ = ["Event", "Health", "Snapshot"]
+__all__ = ["Event", "Health", "LiveSource", "Snapshot"]

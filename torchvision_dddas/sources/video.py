@@ -151,24 +151,7 @@ class VideoSource:
         return count
 
     def _open(self) -> cv2.VideoCapture:
-        with quiet_opencv():
-            # A camera needs the system's own driver; files and streams go to FFmpeg alone, because other back ends take
-            # a numbered image or a text file for a video.
-            capture = (
-                cv2.VideoCapture(self._target)
-                if isinstance(self._target, int)
-                else cv2.VideoCapture(self._target, cv2.CAP_FFMPEG)
-            )
-        if not capture.isOpened():
-            kind = "stream" if self._live else "video"
-            what = f"camera {self._target}" if isinstance(self._target, int) else f"{self.name} as a {kind}"
-            raise InputError(
-                f"cannot open {what}; " + ("is it there?" if self._live else "it is damaged or no video file")
-            )
-        if int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True) in _TEXT_AS_VIDEO:
-            capture.release()
-            raise InputError(f"{self.name} is a text file, not a video")
-        return capture
+        return open_capture(self._target, self.name)
 
     def _check(self, image: np.ndarray, number: int) -> None:
         if (size := (image.shape[1], image.shape[0])) != self.size:
@@ -176,6 +159,31 @@ class VideoSource:
                 f"frame {number} of {self.name} is {size[0]}x{size[1]} but the first is {self.size[0]}x{self.size[1]}; "
                 "all frames of a clip must have one size"
             )
+
+
+def open_capture(target: str | int, name: str, limit_s: float | None = None) -> cv2.VideoCapture:
+    """A file, a camera's index or a stream's address through OpenCV.
+
+    limit_s: opening a file or stream, and later reading from it, fails after so long; None: after FFmpeg's own 30 s.
+    Raises InputError: cannot be opened, is no video.
+    """
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC] if limit_s else []
+    given = [value for limit in limits for value in (limit, int(1000 * (limit_s or 0)))]
+    with quiet_opencv():
+        # A camera needs the system's own driver; files and streams go to FFmpeg alone, because other back ends take
+        # a numbered image or a text file for a video.
+        capture = (
+            cv2.VideoCapture(target) if isinstance(target, int) else cv2.VideoCapture(target, cv2.CAP_FFMPEG, given)
+        )
+    live = isinstance(target, int) or "://" in target
+    if not capture.isOpened():
+        kind = "stream" if live else "video"
+        what = f"camera {target}" if isinstance(target, int) else f"{name} as a {kind}"
+        raise InputError(f"cannot open {what}; " + ("is it there?" if live else "it is damaged or no video file"))
+    if int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True) in _TEXT_AS_VIDEO:
+        capture.release()
+        raise InputError(f"{name} is a text file, not a video")
+    return capture
 
 
 def _lost_words(first: int, last: int) -> str:

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from torchvision_dddas.settings import Settings
 from torchvision_dddas.types import Part, Registration
 
 # Evidence crosses the seam as 8-bit maps: in sixteenths of the local noise, cut off at 15 noise units.
@@ -74,9 +75,10 @@ class Foreground:
 
 
 class Vision(Protocol):
-    """A back end."""
+    """A back end. knobs: the settings in force; others may be put in their place between two frames."""
 
     name: str
+    knobs: Settings
 
     def prepare(self, image: np.ndarray) -> View:
         """Whatever is computed once per frame."""
