@@ -8,7 +8,7 @@ import gc
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads must n
 
 import numpy as np
 import plain_chain
+from films import there_and_back
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.run import Loop
@@ -30,6 +31,8 @@ STAGES = ("prepare", "register", "foreground", "targets")
 ONBOARD = ("onboard fast", "onboard half", "onboard default")
 TORCH = tuple(f"torch {config} b{batch}" for config in ("fast", "default") for batch in (1, 8))
 CHAINS = (*ONBOARD, *TORCH)
+Lanes = Mapping[str, tuple[str, list[np.ndarray]]]
+"""By a name, a chain and the frames that it goes through."""
 
 
 class Stopwatch:
@@ -163,30 +166,30 @@ class Timed:
         return float(np.median(self._boxes)) if self._boxes else 0.0
 
 
-def timed(clips: dict[str, list[np.ndarray]], chains: Sequence[str], rounds: int) -> Iterator[dict[str, Timed]]:
-    """All chains in turns of TURN frames through clips of the same length, the plain chain among them.
+def lanes_of(frames: list[np.ndarray], chains: Sequence[str], rounds: int) -> Lanes:
+    """The plain chain, and others, on the same clip: forwards and backwards as often as it takes."""
+    frames = there_and_back(frames, (rounds + WARM_UP) * TURN + 2)
+    return {name: (name, frames) for name in dict.fromkeys(("plain", *chains))}
 
-    clips: by chain where they differ, else under "". Yields after each turn that counts: {chain: Timed}, added to.
+
+def timed(lanes: Lanes, rounds: int) -> Iterator[dict[str, Timed]]:
+    """All lanes, a chain on a clip each, in turns of TURN frames. Yields what was added to after each turn that counts.
+
+    Other programs meet all lanes alike. The first turns do not count.
     """
-    running = {name: Chain(name) for name in dict.fromkeys(("plain", *chains))}
-    found = {name: Timed() for name in running}
+    running = {lane: Chain(name) for lane, (name, _) in lanes.items()}
+    found = {lane: Timed() for lane in lanes}
     for k in range(rounds + WARM_UP):
-        for name, chain in running.items():
-            frames = clips[name if name in clips else ""]
+        for lane, chain in running.items():
             gc.collect()
             chain.watch.spent, chain.boxes = {}, []
             start = _now()
-            chain.turn(frames, k * TURN)
+            chain.turn(lanes[lane][1], k * TURN)
             spent = _now() - start
             if k >= WARM_UP:
-                found[name].add(spent, chain.watch.spent, chain.boxes)
+                found[lane].add(spent, chain.watch.spent, chain.boxes)
         if k >= WARM_UP:
             yield found
-
-
-def frames_needed(rounds: int) -> int:
-    """How many frames so many turns go through."""
-    return (rounds + WARM_UP) * TURN + 2
 
 
 def row(spent: np.ndarray, plain: np.ndarray) -> dict[str, float]:
@@ -211,12 +214,14 @@ def quartiles(name: str, values: np.ndarray) -> dict[str, float]:
 
 
 def alone(name: str, path: str) -> None:
-    """One chain through a video, as a process that does nothing else."""
+    """One chain through a video, as a process that does nothing else. `nothing`: the video is only read."""
     from torchvision_dddas.sources import open_source
 
-    chain = Chain(name)
+    chain = Chain(name) if name != "nothing" else None
     frames: list[np.ndarray] = []
     for frame in open_source(path):
+        if chain is None:
+            continue
         frames = [*frames[1 - chain.window :], frame.image] if chain.window > 1 else [frame.image]
         if len(frames) < chain.window:
             continue

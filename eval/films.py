@@ -1,5 +1,6 @@
 """What the studies of speed look at: clips named by the user, or the project's own scene, at the sizes asked for."""
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,15 @@ from torchvision_dddas.sources import open_source
 
 Size = tuple[int, int]
 """Width and height, px."""
+
+
+def size_of(text: str) -> Size:
+    """Of an option such as 640x480."""
+    try:
+        width, height = (int(side) for side in text.split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no size; give one as 640x480") from None
+    return width, height
 
 
 def clips(arguments: list[str], sizes: list[Size], frames: int = 40) -> Iterator[tuple[str, list[np.ndarray]]]:

@@ -67,16 +67,16 @@ def _own_s() -> float:
     return sum(use.ru_utime + use.ru_stime for use in uses)
 
 
-def ran_and_waited_s(pid: int) -> tuple[float, float]:
-    """Seconds that a process's living threads ran, and that they were ready to but had no core; NaN where unknown."""
-    ran = waited = 0
-    try:
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            on, off, _ = map(int, (task / "schedstat").read_text().split())
-            ran, waited = ran + on, waited + off
-    except (OSError, ValueError):
-        return float("nan"), float("nan")
-    return ran / 1e9, waited / 1e9
+def ran_and_waited_ns(pid: int) -> dict[str, tuple[int, int]]:
+    """How long each living thread of a process ran, and was ready to but had no core; OSError where it is over."""
+    found = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            ran, waited, _ = map(int, (task / "schedstat").read_text().split())
+        except (OSError, ValueError):  # a thread that ended, or a kernel that keeps no such account
+            continue
+        found[task.name] = ran, waited
+    return found
 
 
 def copied_gb_s(megabytes: float, seconds: float = 0.05) -> float:

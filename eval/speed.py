@@ -17,8 +17,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 import machine
 import registration_error
-from chains import CHAINS, available, frames_needed, row, timed
-from films import clips, there_and_back
+from chains import CHAINS, available, lanes_of, row, timed
+from films import clips
 
 
 def main() -> None:
@@ -38,7 +38,7 @@ def main() -> None:
             print(f"{name}: {len(frames)} frames are too few", file=sys.stderr)
             continue
         others = machine.Others()
-        *_, found = timed({"": there_and_back(frames, frames_needed(options.rounds))}, chains, options.rounds)
+        *_, found = timed(lanes_of(frames, chains, options.rounds), options.rounds)
         rows = {chain: row(taken.whole, found["plain"].whole) for chain, taken in found.items()}
         load = others.cores()
         errors = registration_error.errors(frames)
