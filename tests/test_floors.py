@@ -14,12 +14,13 @@ import torchvision_dddas
 PACKAGE = Path(torchvision_dddas.__file__).parent
 OWN = "torchvision_dddas"
 
-# Module or folder -> what it may import beside the standard library, itself and `jaxtyping`. The longest name that fits
+# Module or folder -> what it may import beside the standard library, itself and names of shapes. The longest name that fits
 # decides. A new module or folder needs a line here. "*" is anything but torch and kornia at module level.
 FLOORS: dict[str, set[str]] = {
     "__init__": set(),
     "types": {"numpy"},
     "errors": set(),
+    "shapes": set(),
     "settings": {"pydantic", "errors"},
     "ops": {"torch", "kornia", "errors"},
     # Labelling stays in OpenCV for every runtime: hence cv2 here.
@@ -58,6 +59,7 @@ FLOORS: dict[str, set[str]] = {
     "steering": {"numpy", "scipy", "control", "targets", "types", "settings", "errors"},
     # The whole path, and the loop about it.
     "surveying": {"following", "run", "geolocating", "sources", "vision", "targets", "mission", "types", "settings"},
+    "spotting": {"numpy", "recognizing", "following", "sources", "vision", "targets", "types", "settings", "errors"},
     "mission": {
         "numpy",
         "steering",
@@ -163,7 +165,11 @@ def strangers(module: str, source: str, is_package: bool = False) -> list[str]:
             if asked is not None and asked != home and (at_module_level or home is not None):
                 wrong.append(name)
             continue
-        if name == "jaxtyping" or (not is_torch and below(name, floor)) or any(below(name, other) for other in allowed):
+        if (
+            name in ("jaxtyping", "shapes")
+            or (not is_torch and below(name, floor))
+            or any(below(name, other) for other in allowed)
+        ):
             continue
         if "*" in allowed and not (is_torch and at_module_level):
             continue

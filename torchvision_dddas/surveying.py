@@ -1,6 +1,6 @@
 """The whole path, frame by frame: what moves, who is who, where on the ground; and where an instrument goes next."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,24 +25,31 @@ def survey(
     watch: Watch | None = None,
     interval: int = 1,
     mission: "Mission | None" = None,
+    seen: Callable[[Scene], object] | None = None,
+    retune: run.Retune | None = None,
 ) -> Iterator[Surveyed]:
     """Everything of each frame that is followed, in order.
 
     Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
-    target is located by the picture in which it was seen.
+    target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
+    retune: as in run.run.
     """
     waiting: dict[int, Watched] = {}
     roll = RollCall() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
-        for scene in run.run(source, vision, settings, telemetry):
+        for scene in run.run(source, vision, settings, telemetry, retune=retune):
             if watch is None:
+                if seen is not None:
+                    seen(scene)
                 yield scene
                 continue
             if mission is not None:
                 mission.refresh(scene)
             watched = gathered(watch.step(scene), watch.locator, source.rate_hz)
             waiting[scene.frame.number] = watched
+            if seen is not None:
+                seen(watched.scene)
             yield watched.scene
 
     for followed in following.follow_scenes(scenes(), settings, interval, source.size):

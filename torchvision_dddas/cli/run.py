@@ -15,20 +15,18 @@ from torchvision_dddas.cli.aerial import (
     about,
     ground_facts,
     ground_lines,
-    locator_for,
 )
 from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mission import SIMULATED, fly
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.prepared import prepared
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.geolocating import Locator, Watch
     from torchvision_dddas.settings import Settings
     from torchvision_dddas.sinks.journal import Record
-    from torchvision_dddas.sources import Source
 
 
 @explained
@@ -66,6 +64,22 @@ def run(
         list[str] | None, typer.Option("--scene", metavar="KNOB=VALUE", help="Change a knob of a scenario (sim:NAME).")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the scenario's chances, in place of its own.")] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Keep up with the pictures as they come; a folder of its own for each session."),
+    ] = False,
+    emit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="STREAM",
+            help="With --live: json:-, json:FILE, mot:FILE, cot:udp://HOST:PORT, ...; may be repeated.",
+        ),
+    ] = None,
+    serve: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="With --live: a page on how it goes, /metrics and /health.json."),
+    ] = None,
+    people: Annotated[bool, typer.Option("--people", help="With --live: recognize people too.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Find what moves in a clip from the air, give it lasting identities, and locate it by landmarks of known place.
@@ -74,12 +88,12 @@ def run(
     overlay.mp4, maps, a report and run.json under --out.
     """
     from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.survey_output import SAVED
 
     if interval < 1:
         raise InputError(f"--interval is {interval}; wanted 1 or more frames")
-    if clip.startswith(SIMULATED):
+    _check_live(live, {"--emit": emit, "--serve": serve, "--people": people}, {"--save": save, "--scene": scene})
+    _check_live(live, {}, {"--background": background, "--seed": seed})
+    if clip.startswith(SIMULATED) and not live:
         files = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--dem": dem}
         files |= {"--colours": colours, "--camera": camera, "--background": background}
         files["--interval"] = interval if interval != 1 else None
@@ -91,11 +105,34 @@ def run(
     if landmarks is None and (useless := [name for name, given in others.items() if given is not None]):
         raise InputError(f"{useless[0]} is of no use without --landmarks FILE: nothing would be located")
     given = None if landmarks is None else AerialInput(landmarks, telemetry, camera, dem, background, colours)
-    settings, names = load(config, set_ or []), saved(save, SAVED)
+    settings = load(config, set_ or [])
+    if live:
+        from torchvision_dddas.cli.live import run_live
+
+        raise typer.Exit(
+            run_live(
+                out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet
+            )
+        )
+    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.sinks.survey_output import SAVED
+
+    names = saved(save, SAVED)
     journal = run_into(out, clip, given, telemetry, interval, settings, backend.value, names, rate, quiet)
     if not quiet:
         for line in summary(journal, out, given is not None, names):
             typer.echo(line)
+
+
+def _check_live(live: bool, only: dict[str, Any], never: dict[str, Any]) -> None:
+    """Raises InputError for an option that is of no use. only, never: what is given for --live alone, for others."""
+    for option, given in (never if live else only).items():
+        if given is not None and given is not False and given != []:
+            raise InputError(
+                f"{option} is of no use with --live, which draws and steers nothing"
+                if live
+                else f"{option} is for a run that keeps up with a camera; give --live too"
+            )
 
 
 def run_into(
@@ -122,20 +159,11 @@ def run_into(
     refuse_own_input([Path(clip), *files], [folder / name for name in kind.files], "folder with --out")
     with kind(folder, save) as output:
         from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.telemetry import read_telemetry
         from torchvision_dddas.surveying import survey
-        from torchvision_dddas.vision import load
 
         source = open_source(clip, rate_hz=rate_hz)
-        watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
-        flight = None
-        if watch is not None:
-            flight = watch.locator.site.telemetry
-            settings, more = _sized(settings, watch.locator)
-            notes += more
-        elif telemetry is not None:
-            flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
-        vision = load(backend, settings)
+        ready = prepared(given, telemetry, settings, source, backend, clip)
+        settings, vision, watch, notes = ready.settings, ready.vision, ready.watch, ready.notes
         facts: dict[str, Any] = {
             "input": clip,
             "telemetry": telemetry,
@@ -161,40 +189,12 @@ def run_into(
         try:
             count = None if source.count is None else -(-source.count // interval)
             with progress(source.name, count, quiet) as tick:
-                for surveyed in survey(source, vision, settings, flight, watch, interval):
+                for surveyed in survey(source, vision, settings, ready.flight, watch, interval):
                     write(surveyed)
                     tick()
         finally:
             journal.problems += [str(problem) for problem in source.problems]
     return journal
-
-
-def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: str) -> "tuple[Watch, list[str]]":
-    from torchvision_dddas.geolocating import Watch, check_colours
-    from torchvision_dddas.sources.colours import read_colours
-    from torchvision_dddas.vision import load_colours
-
-    colours = read_colours(given.colours) if given.colours is not None else None
-    frames = None if source.count is None else (1, source.count)
-    locator, notes = locator_for(
-        given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
-    )
-    helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
-    check_colours(locator.site.landmarks, colours, helped)
-    if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
-        notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
-    return Watch(locator, colours, load_colours(backend) if colours is not None else None), notes
-
-
-def _sized(settings: "Settings", locator: "Locator") -> "tuple[Settings, list[str]]":
-    """With the camera's own focal length where targets' sizes are told from the altitude, unless another is set."""
-    from torchvision_dddas.settings import Settings, with_knobs
-
-    focal = locator.camera.focal_px[0]
-    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
-        return settings, []
-    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
-    return with_knobs(settings, {"gates.focal_px": focal}), [note]
 
 
 def summary(journal: "Record", folder: Path, located: bool, save: Sequence[str]) -> list[str]:

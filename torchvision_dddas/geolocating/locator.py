@@ -66,10 +66,15 @@ class Locator:
             )
         self.site, self.camera, self.settings, self.rate_hz = site, camera, settings, rate_hz
         self.courses = Courses(site.landmarks, settings.landmarks, rate_hz)
+        self._solver, self._focal_known = solver, focal_known
         self._registrar = Registrar(camera, settings, solver, focal_known, site.landmarks.names)
         self._movers = Movers()
         self._use = LandmarkUse()
         self._ground = surface(site.elevation) if site.elevation is not None else None
+
+    def anew(self) -> "Locator":
+        """The same, as before its first frame."""
+        return Locator(self.site, self.camera, self.settings, self._solver, self.rate_hz, self._focal_known)
 
     def learn(self, site: Site) -> None:
         """What landmarks and vehicle have reported by now, in the metres of the site so far."""

@@ -71,6 +71,10 @@ class Watch:
         self._follower = LandmarkFollower(colours.names, locator.settings.landmarks) if colours else None
         self._fix: Fix | None = None
 
+    def anew(self) -> "Watch":
+        """The same, as before its first scene."""
+        return Watch(self.locator.anew(), self._colours, self._finder)
+
     def step(self, scene: Scene) -> Watched:
         """The next scene."""
         start = time.perf_counter()

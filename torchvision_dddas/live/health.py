@@ -77,19 +77,20 @@ class Health:
             self._events.append(event)
         return event
 
+    def events_since(self, known: int) -> tuple[int, tuple[Event, ...]]:
+        """How many events there were, and those after the first `known` of them, of the latest that are remembered."""
+        with self._lock:
+            told = sum(count for name, count in self._counts.items() if name.startswith("events_"))
+            new = min(told - known, len(self._events))
+            return told, tuple(self._events)[len(self._events) - new :]
+
     def snapshot(self) -> Snapshot:
         """All of it, as it is now."""
         with self._lock:
             now = time.monotonic()
-            seconds = {
-                name: tuple(np.percentile(list(values), (50, 95, 99)).tolist())
-                for name, values in self._seconds.items()
-            }
-            return Snapshot(
-                now - self._start,
-                now - self._result,
-                dict(self._counts),
-                dict(self._gauges),
-                seconds,
-                tuple(self._events),
-            )
+            since_s, idle_s = now - self._start, now - self._result
+            counts, gauges, events = dict(self._counts), dict(self._gauges), tuple(self._events)
+            taken = {name: list(values) for name, values in self._seconds.items()}
+        # Sorting thousands of times takes a millisecond, which a frame must not wait for.
+        seconds = {name: tuple(np.percentile(values, (50, 95, 99)).tolist()) for name, values in taken.items()}
+        return Snapshot(since_s, idle_s, counts, gauges, seconds, events)

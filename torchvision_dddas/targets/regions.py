@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets import scan
 from torchvision_dddas.targets.boxes import shared_px
 from torchvision_dddas.types import Adjustment, Part, People
@@ -150,15 +150,26 @@ class Search:
     """
 
     def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
-        self.knobs, self.blobs = knobs, blobs
+        self.blobs = blobs
         self.steered = knobs.search == "regions"
         self.expected = Expected(knobs)
         self.looks = 0
-        n = knobs.rescan_frames
-        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
+        self.retune(knobs)
         self.there = 0  # people whom the last look found
         self.lost = 0  # how many the look before it had found, where it found none of them
         self.told = 1.0  # share of windows in the last line of the record
+
+    def retune(self, knobs: PeopleKnobs) -> None:
+        """Search more or less widely from the next look on; the kind of search stays."""
+        self.knobs = self.expected.knobs = knobs
+        n = knobs.rescan_frames
+        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
+
+    def use(self, knobs: PeopleKnobs) -> None:
+        """From now on search as these say; whether in regions or everywhere stays as it was."""
+        self.knobs = self.expected.knobs = knobs
+        n = knobs.rescan_frames
+        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
 
     def look(self, frame: int, size: tuple[int, int]) -> Look:
         """Where to search a frame of (width, height)."""

@@ -1,0 +1,78 @@
+"""The folder of one live session: nothing of an earlier one is touched, and all in it is valid at every moment.
+
+results.jsonl grows by a line a frame, events.log by a line an event, run.json is replaced whole.
+"""
+
+import json
+import time
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.sinks.journal import NAME as RECORD
+from torchvision_dddas.sinks.journal import finite, versions
+from torchvision_dddas.sinks.whole import write_whole
+
+RESULTS, EVENTS = "results.jsonl", "events.log"
+
+
+class Told(Protocol):
+    """Something that happened, as `live.Event` tells it."""
+
+    utc_s: float
+    frame: int
+    kind: str
+    text: str
+
+
+def claim(out: Path, utc_s: float | None = None) -> Path:
+    """A new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError where none can be made."""
+    name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for k in range(1, 1000):
+            folder = out / (name if k == 1 else f"{name}-{k}")
+            try:
+                folder.mkdir()
+            except FileExistsError:  # a supervisor may start it twice within a second
+                continue
+            return folder
+    except OSError as error:
+        raise InputError(
+            f"cannot write into {out}: {error.strerror or error}. Choose another folder with --out"
+        ) from None
+    raise InputError(f"{out} holds a thousand sessions that began at {name}; choose another folder with --out")
+
+
+class SessionLog:
+    """events.log and run.json of a session. Every method raises OSError where the disk refuses, and may be tried again.
+
+    facts: what is known before the run.
+    """
+
+    def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
+        self.folder, self.facts = folder, facts
+        # Line by line: a line is written at once and whole.
+        self._events = (folder / EVENTS).open("ab", buffering=0)
+
+    def tell(self, events: Iterable[Told]) -> None:
+        """Append events, a line each: UTC time, frame or -, kind, words."""
+        lines = "".join(f"{stamp(e.utc_s)} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n" for e in events)
+        if lines:
+            self._events.write(lines.encode())
+
+    def state(self, state: str, now: dict[str, Any]) -> None:
+        """Replace run.json. state: running, complete, stopped or failed."""
+        record = {"state": state, "versions": versions(), **self.facts, **now}
+        write_whole(self.folder / RECORD, (json.dumps(finite(record), indent=2) + "\n").encode())
+
+    def close(self) -> None:
+        """Nothing follows."""
+        self._events.close()
+
+
+def stamp(utc_s: float) -> str:
+    """ISO 8601 to the millisecond."""
+    return datetime.fromtimestamp(utc_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
