@@ -1,12 +1,15 @@
 """The feedback rules, by hand."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 
 from torchvision_dddas.control import (
+    SAMPLING,
     LandmarkUse,
+    Load,
     Regime,
     adjusted,
     best_spread,
@@ -17,7 +20,9 @@ from torchvision_dddas.control import (
     interval_from_flow,
     interval_from_telemetry,
     regime_at,
+    rungs,
     sampled,
+    shed,
     spread_m2,
     steered,
 )
@@ -257,3 +262,125 @@ def test_from_look_to_look_a_walker_moves_far_enough_to_show():
     knobs = Settings().steering
     frames = every_least(554 / 200, 10.0, knobs)
     assert frames / 10 * 1.4 * 554 / 200 == pytest.approx(knobs.least_move_px)
+
+
+# -- a run that must keep up with a camera -----------------------------------------------------------------------------
+
+LIVE = with_knobs(
+    Settings(),
+    {
+        "registration.keypoints": 400,
+        "live.least_keypoints": 100,
+        "live.maximum_every": 4,
+        "live.load": 0.8,
+        "live.calm_s": 5.0,
+        "live.deadline_ms": 1000,
+        "people.search": "regions",
+    },
+)
+APART_S = 0.04
+
+
+def driven(cost_ms, looks, now=None, start_s=0.0, settings=LIVE, people=False):
+    """The rule at every look from start_s on, where a look at everything takes cost_ms and half the keypoints 80 %."""
+    now, moved, time_s = now or Load(), [], start_s
+    for k in range(looks):
+        rung = rungs(settings, people)[now.rung]
+        cheaper = 0.8 ** np.log2(settings.registration.keypoints / rung["registration.keypoints"])
+        now, some = shed(k + 1, now, cost_ms / 1000 * cheaper, APART_S, time_s, settings, people)
+        moved += some
+        time_s += rung[SAMPLING] * APART_S
+    return now, moved, time_s
+
+
+def test_keypoints_are_halved_to_the_least_then_the_search_narrows_then_pictures_are_left_out():
+    ladder = rungs(LIVE, people=True)
+    assert [rung["registration.keypoints"] for rung in ladder[:3]] == [400, 200, 100]
+    assert [rung["people.rescan_frames"] for rung in ladder[2:5]] == [10, 20, 40]
+    assert [rung[SAMPLING] for rung in ladder[4:]] == [1, 2, 3, 4]
+    assert {rung[SAMPLING] for rung in ladder[:4]} == {1}
+    for before, after in itertools.pairwise(ladder):
+        assert all(before[name] >= after[name] for name in ("registration.keypoints", "people.region_margin"))
+        assert sum(before[name] != after[name] for name in before) <= 2
+
+
+def test_who_keeps_up_looks_at_everything():
+    now, moved, _ = driven(31, 200)
+    assert now.rung == 0
+    assert not moved
+
+
+def test_too_long_a_look_is_shed_until_it_fits_and_no_further():
+    now, moved, _ = driven(36, 200)
+    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 400, 200)]
+    assert "36 ms" in moved[0].cause
+    assert "90%" in moved[0].cause
+    assert now.rung == 1
+
+
+def test_what_takes_far_too_long_is_shed_at_once_and_fits():
+    now, moved = shed(1, Load(), 0.1, APART_S, 0.0, LIVE)
+    rung = rungs(LIVE)[now.rung]
+    assert (rung["registration.keypoints"], rung[SAMPLING]) == (100, 4)
+    assert {a.knob for a in moved} == {"registration.keypoints", SAMPLING}
+
+
+def test_the_least_is_the_least_however_busy():
+    now, _, _ = driven(5000, 50)
+    assert now.rung == len(rungs(LIVE)) - 1
+    assert shed(60, now, 9.0, APART_S, 60.0, LIVE) == (now, ())
+
+
+def test_pictures_that_miss_their_deadline_are_made_cheaper_but_none_is_left_out_for_it():
+    late = with_knobs(LIVE, {"live.deadline_ms": 20})
+    now = Load()
+    for k in range(20):
+        now, _ = shed(k + 1, now, 0.025, APART_S, k * APART_S, late)
+    assert rungs(late)[now.rung] == {"registration.keypoints": 100, SAMPLING: 1}
+
+
+def test_more_is_looked_at_again_after_calm_s_with_time_to_spare_and_not_before():
+    busy, _, end_s = driven(36, 20)
+    early, moved, _ = driven(15, 124, busy, end_s)
+    assert early.rung == busy.rung
+    assert not moved
+    calm, moved, _ = driven(15, 130, busy, end_s)
+    assert calm.rung == 0
+    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 200, 400)]
+
+
+def test_a_moment_without_time_to_spare_starts_the_wait_anew():
+    now = Load(rung=1)
+    for k in range(200):
+        cost_s = 0.031 if k % 100 == 99 else 0.010
+        now, moved = shed(k, now, cost_s, APART_S, k * APART_S, LIVE)
+        assert not moved
+
+
+def test_what_fits_just_so_is_not_tried_again():
+    _, moved, _ = driven(36, 1000)
+    assert len(moved) == 1
+
+
+def test_each_try_that_did_not_last_makes_the_next_one_wait_twice_as_long():
+    """Half the keypoints take a third here: more than the rule expects of them, so that it falls for it."""
+    now, tries = Load(), []
+    for k in range(3000):
+        cost_s = 0.036 if now.rung == 0 else 0.012
+        now, moved = shed(k + 1, now, cost_s, APART_S, k * APART_S, LIVE)
+        tries += [k * APART_S for a in moved if a.new > a.old]
+    waits = np.diff(tries)
+    assert np.all(waits[:3] > 1.9 * np.array([5.0, *waits[:2]]))
+
+
+def test_pictures_left_out_come_back_as_many_as_there_is_time_for():
+    few = Load(rung=len(rungs(LIVE)) - 1)
+    now, moved, _ = driven(25, 140, few)
+    assert rungs(LIVE)[now.rung][SAMPLING] == 1
+    assert [(a.knob, a.old, a.new) for a in moved] == [(SAMPLING, 4, 1)]
+
+
+@pytest.mark.parametrize(("apart_s", "on"), [(0.0, True), (APART_S, False)])
+def test_nothing_is_shed_where_pictures_wait_or_it_is_turned_off(apart_s, on):
+    settings = with_knobs(LIVE, {"live.shed": on})
+    assert shed(1, Load(), 10.0, apart_s, 0.0, settings) == (Load(), ())

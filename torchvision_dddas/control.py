@@ -1,14 +1,17 @@
 """The feedback rules: how what was found steers the knobs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
+from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, LiveKnobs, Settings, SteeringKnobs, with_knobs
 from torchvision_dddas.targets.gates import Gates, gates_at, pixels_per_metre
 from torchvision_dddas.types import Adjustment, Marks
+
+SAMPLING = "sampling.every"
+"""Of so many frames one is looked at: no knob, but named like one in the record."""
 
 # A change of altitude by this share moves the gates: less is not worth a line in the record.
 _ALTITUDE_STEP = 0.2
@@ -25,6 +28,15 @@ _CALM = 0.8
 _BETTER = 1.25
 # Of more landmarks than this, only so many that lie far apart are tried.
 _TRIED = 12
+
+# Looks that take so many times what they may are made as cheap as can be at once.
+_FAR_OVER = 2.0
+# More is looked at again where it is expected to take this share of what it may at most: else it would flutter.
+_SPARE = 0.9
+# Twice the keypoints, or a wider search, is expected to cost so many times as much.
+_DEARER = 1.4
+# The longest wait before more is looked at again, in calm_s.
+_MOST_PATIENCE = 16.0
 
 
 def interval_from_telemetry(altitude_m: float, speed_m_s: float, rate_hz: float, knobs: IntervalKnobs) -> float:
@@ -97,7 +109,7 @@ def sampled(frame: int, now: int, wanted: float, why: str, knobs: SteeringKnobs)
     new = int(np.clip(round(min(wanted, 1e6)), 1, knobs.maximum_every))
     if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75):
         return now, ()
-    return new, (Adjustment(frame, "sampling.every", now, new, why),)
+    return new, (Adjustment(frame, SAMPLING, now, new, why),)
 
 
 @dataclass(frozen=True)
@@ -246,3 +258,99 @@ def _far_apart(places: np.ndarray, count: int) -> np.ndarray:
         nearest[rows] = -1.0  # where several are in one place, each is taken once
         rows.append(int(nearest.argmax()))
     return np.array(rows)
+
+
+@dataclass(frozen=True)
+class Load:
+    """How much less than everything is looked at, because it takes too long: a rung of `rungs`, 0 is everything.
+
+    spare_s: since when there is time for more; None while there is none. eased_s: when more was last looked at again.
+    patience: by how much longer than calm_s time must be spare, because it was not enough the last time.
+    """
+
+    rung: int = 0
+    spare_s: float | None = None
+    eased_s: float = -np.inf
+    patience: float = 1.0
+
+
+def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
+    """What may be looked at, from everything to the least: knobs by name, the same in each, `sampling.every` the last.
+
+    First keypoints are halved, then, where people are searched for in regions, the whole picture is searched in more
+    turns, both of which make a look cheaper; then only every 2nd, 3rd, ... picture is looked at.
+    """
+    live, search = base.live, base.people
+    rung: dict[str, float] = {"registration.keypoints": base.registration.keypoints}
+    if people and search.search == "regions":
+        rung["people.rescan_frames"] = search.rescan_frames
+        rung["people.region_margin"] = search.region_margin
+    rung[SAMPLING] = 1
+    made = [rung]
+    while (keypoints := made[-1]["registration.keypoints"]) > live.least_keypoints:
+        fewer = max(int(keypoints) // 2, live.least_keypoints)
+        made.append(made[-1] | {"registration.keypoints": fewer})
+    if "people.rescan_frames" in rung:
+        for narrower in (2, 4):
+            rescan = min(search.rescan_frames * narrower, 10_000)
+            margin = search.region_margin / narrower
+            made.append(made[-1] | {"people.rescan_frames": rescan, "people.region_margin": margin})
+    made += [made[-1] | {SAMPLING: every} for every in range(2, live.maximum_every + 1)]
+    return made
+
+
+def shed(
+    frame: int, now: Load, cost_s: float, apart_s: float, now_s: float, base: Settings, people: bool = False
+) -> tuple[Load, tuple[Adjustment, ...]]:
+    """How much is looked at from here on, and the record of what changed.
+
+    cost_s: what a look takes, as things are; apart_s: from picture to picture, 0: they wait. now_s: by any clock.
+    Less: a rung, when looks take more than `live.load` of the time between them, or a picture more than its deadline;
+    all that makes a look cheaper, and as many pictures as it takes, when it is more than twice as much. More: when it
+    is expected to fit for calm_s on end; for twice as long each time that it did not last.
+    """
+    knobs, ladder = base.live, rungs(base, people)
+    at = min(now.rung, len(ladder) - 1)
+    if not knobs.shed or apart_s <= 0:
+        return now, ()
+    shares = [cost_s / (rung[SAMPLING] * apart_s) for rung in ladder]
+    cheapest = next((i for i, rung in enumerate(ladder) if rung[SAMPLING] > 1), len(ladder)) - 1
+    slow = cost_s * 1000 > knobs.deadline_ms and at < cheapest
+    if shares[at] > knobs.load or slow:
+        to = cheapest if shares[at] > _FAR_OVER * knobs.load else min(at + 1, len(ladder) - 1)
+        if shares[at] > knobs.load:
+            while to >= cheapest and shares[to] > knobs.load and to < len(ladder) - 1:
+                to += 1
+        to = max(at, to)
+        undone = now_s - now.eased_s < 2 * now.patience * knobs.calm_s
+        patience = min(2 * now.patience, _MOST_PATIENCE) if undone else 1.0
+        new = replace(now, rung=to, spare_s=None, patience=patience if to != at else now.patience)
+        limit = (
+            f"{knobs.load:.0%} is allowed" if shares[at] > knobs.load else f"its deadline is {knobs.deadline_ms:g} ms"
+        )
+        return new, _moved(frame, ladder[at], ladder[to], _took(cost_s, shares[at], limit))
+    to = _eased(at, shares, cost_s, cheapest, knobs)
+    if to == at:
+        return replace(now, spare_s=None), ()
+    if now.spare_s is None:
+        return replace(now, spare_s=now_s), ()
+    if now_s - now.spare_s < now.patience * knobs.calm_s:
+        return now, ()
+    why = _took(cost_s, shares[at], f"for {now_s - now.spare_s:.1f} s there was time to spare")
+    return replace(now, rung=to, spare_s=None, eased_s=now_s), _moved(frame, ladder[at], ladder[to], why)
+
+
+def _eased(at: int, shares: Sequence[float], cost_s: float, cheapest: int, knobs: LiveKnobs) -> int:
+    """The rung that is expected to fit with time to spare, if lower than `at`."""
+    if at > cheapest:  # how much more often it may be is known
+        return next(i for i in range(cheapest, at + 1) if i == at or shares[i] <= _SPARE * knobs.load)
+    dearer = _DEARER * cost_s * 1000 <= knobs.deadline_ms and _DEARER * shares[at] <= _SPARE * knobs.load
+    return at - 1 if at and dearer else at
+
+
+def _took(cost_s: float, share: float, limit: str) -> str:
+    return f"a look takes {cost_s * 1000:.0f} ms, {share:.0%} of the time until the next; {limit}"
+
+
+def _moved(frame: int, old: dict[str, float], new: dict[str, float], why: str) -> tuple[Adjustment, ...]:
+    return tuple(Adjustment(frame, name, old[name], value, why) for name, value in new.items() if value != old[name])

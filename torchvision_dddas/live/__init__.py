@@ -2,5 +2,6 @@
 
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Event, Health, Snapshot
+from torchvision_dddas.live.shedding import Shedding
 
-__all__ = ["Event", "Health", "LiveSource", "Snapshot"]
+__all__ = ["Event", "Health", "LiveSource", "Shedding", "Snapshot"]
