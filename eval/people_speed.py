@@ -36,7 +36,8 @@ from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.targets import scan
 from torchvision_dddas.types import Part
 from torchvision_dddas.vision import load_recognizer
-from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer, opened
+from torchvision_dddas.vision.graphs import SHIPPED
+from torchvision_dddas.vision.onboard_people import OnboardRecognizer, opened
 
 KNOBS = PeopleKnobs(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
 SVM = read_classifier("opencv", 3780)
@@ -101,7 +102,7 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
 
 def whole_graph(parts: list[Part]) -> Callable[[np.ndarray], object]:
     """people.onnx on every level, shared among as many threads as OpenCV takes."""
-    session, svm = opened(SHIPPED / "people.onnx"), OnboardRecognizer(KNOBS, SVM).svm_feed
+    session, svm = opened(SHIPPED, "people.onnx"), OnboardRecognizer(KNOBS, SVM).svm_feed
     threads = ThreadPoolExecutor(cv2.getNumThreads())
 
     def scored(image: np.ndarray, part: Part) -> np.ndarray:

@@ -75,14 +75,16 @@ FLOORS: dict[str, set[str]] = {
     },
     # A run that keeps up with a camera: capture, load, health, the page that shows it.
     "live": {"numpy", "run", "surveying", "control", "sources", "vision", "types", "settings", "errors"},
-    "sources": {"numpy", "cv2", "av", "simulation", "types", "errors"},
+    # What files of pictures hold, for all that read such.
+    "picture_bytes": {"cv2", "numpy"},
+    "sources": {"numpy", "cv2", "av", "simulation", "picture_bytes", "types", "errors"},
     "sources.telemetry": {"numpy", "av", "pymavlink", "pyulog", "pynmea2", "sources", "types", "errors"},
     "sources.elevation": {"numpy", "rasterio", "types", "errors"},
     "sinks": {"numpy", "cv2", "av", "types", "errors", "__init__"},
     "simulation": {"numpy", "cv2", "types", "targets.geodesy", "errors"},
     # A scenario is knobs: the same machinery reads, checks and describes them.
     "simulation.scenario": {"pydantic", "settings", "errors"},
-    "metrics": {"numpy", "scipy", "cv2", "types", "errors"},
+    "metrics": {"numpy", "scipy", "cv2", "picture_bytes", "types", "errors"},
     "demo": {"numpy", "cv2", "simulation", "sinks", "errors"},
     "evaluate": {"numpy", "cv2", "metrics", "sources", "errors"},
     "tuning": {"torch", "*"},

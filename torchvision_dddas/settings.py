@@ -790,16 +790,24 @@ def config_folder() -> Path:
 
 def _config_file(config: str | Path) -> Path:
     path = Path(config)
-    if path.is_file():
+    if is_file(path):
         return path
     if path.suffix == ".toml" or len(path.parts) > 1:
         raise InputError(f"no such configuration file: {path}")
     shipped = config_folder() / f"{config}.toml"
-    if not shipped.is_file():
+    if not is_file(shipped):
         raise InputError(
             f"no configuration is named '{config}'; give one of {', '.join(config_names())}, or a TOML file"
         )
     return shipped
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that no file can have has none."""
+    try:
+        return path.is_file()
+    except OSError:  # too long, or in a folder that may not be entered
+        return False
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -812,6 +820,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}, line {line}: not valid TOML: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read as text: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: its brackets go too deep") from None
+    except ValueError as error:  # a number of thousands of digits
+        raise InputError(f"{path}: not valid TOML: {str(error).split(';')[0]}") from None
 
 
 def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:
@@ -832,7 +844,7 @@ def parse_override(text: str) -> tuple[str, object]:
         raise InputError(f"'{text}' is no override; wanted group.knob=value, such as registration.keypoints=500")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # the latter for brackets without end, which no knob takes
         return name, value  # a bare word: a choice such as affine
 
 

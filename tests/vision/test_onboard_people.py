@@ -17,8 +17,9 @@ from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.types import Part
 from torchvision_dddas.vision import onboard_gradient, onboard_people
+from torchvision_dddas.vision.graphs import SHIPPED, manifest
 from torchvision_dddas.vision.onboard_gradient import Gradient
-from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
+from torchvision_dddas.vision.onboard_people import OnboardRecognizer
 from torchvision_dddas.vision.scratch import Scratch, spans
 
 SVM = read_classifier("opencv", 3780)
@@ -125,7 +126,7 @@ def test_an_array_is_made_anew_only_where_it_was_too_small():
 
 
 def test_graphs_of_another_layout_are_refused_with_what_makes_them():
-    with pytest.raises(InputError, match=r"people.cell_px = 8, not 4.*export/people_graph.py.*people.cell_px=4"):
+    with pytest.raises(InputError, match=r"people.cell_px = 8, not 4.*dddas export --graph people.*people.cell_px=4"):
         OnboardRecognizer(PeopleKnobs(cell_px=4), read_classifier("opencv", 3780))
 
 
@@ -141,11 +142,11 @@ def test_a_part_that_reaches_out_of_the_picture_sees_it_reflected(x: int, y: int
     np.testing.assert_allclose(found, wanted, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("manifest", [None, "", "[]", '{"graphs": {}}', '{"layout": null}'])
-def test_a_folder_without_graphs_is_refused(tmp_path: Path, manifest: str | None):
-    if manifest is not None:
-        (tmp_path / "manifest.json").write_text(manifest)
-    with pytest.raises(InputError, match=r"people.graphs: .* holds no graphs"):
+@pytest.mark.parametrize("text", [None, "", "[]", '{"graphs": {}}', '{"layout": null}'])
+def test_a_folder_without_graphs_is_refused(tmp_path: Path, text: str | None):
+    if text is not None:
+        (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(InputError, match=r"people.graphs: .*dddas export"):
         OnboardRecognizer(PeopleKnobs(graphs=str(tmp_path)), SVM)
 
 
@@ -157,7 +158,7 @@ def test_a_manifest_without_its_graphs_is_refused(tmp_path: Path):
 
 def test_the_shipped_graphs_are_small_and_fit_the_default_settings():
     assert sum(path.stat().st_size for path in SHIPPED.glob("*.onnx")) < 100_000
-    made_for = json.loads((SHIPPED / "manifest.json").read_text())["layout"]
+    made_for = manifest(SHIPPED)["graphs"]["people_scores.onnx"]["knobs"]
     assert made_for == {name: int(getattr(PeopleKnobs(), name)) for name in onboard_people.BAKED}
 
 

@@ -13,6 +13,7 @@ from torchvision_dddas.cli.confirm import confirm
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
+from torchvision_dddas.cli.export import export
 from torchvision_dddas.cli.locate import locate
 from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.people import people
@@ -28,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, detect, people, track, confirm, calibrate, colours, evaluate, simulate, demo, settings):
+for command in (run, detect, people, track, confirm, calibrate, colours, evaluate, simulate, export, demo, settings):
     app.command()(command)
 app.add_typer(locate, name="locate")
 

@@ -1,10 +1,9 @@
 """Scores of windows by OpenCV and ONNX Runtime, for a small CPU: no torch.
 
-The graphs are made from `ops.hog` by export/people_graph.py. A part goes through them in tiles that stay in the
+The graphs are made from `ops.hog` by `dddas export`. A part goes through them in tiles that stay in the
 cache; parts are shared among threads, each of which runs the graphs on itself alone.
 """
 
-import json
 import math
 import threading
 from collections import defaultdict
@@ -20,10 +19,12 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.types import LinearSvm, Part
+from torchvision_dddas.vision.graphs import SHIPPED, manifest, verified
+from torchvision_dddas.vision.graphs import opened as open_graph
 from torchvision_dddas.vision.onboard_gradient import Gradient
 from torchvision_dddas.vision.scratch import spans
 
-SHIPPED = Path(__file__).parents[1] / "graphs"
+GRAPHS = "people_histograms.onnx", "people_scores.onnx"
 # What the graphs have baked in; their manifest names it.
 BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 
@@ -53,7 +54,7 @@ class OnboardRecognizer:
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
         """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
-        return opened(self.graphs / "people_histograms.onnx"), opened(self.graphs / "people_scores.onnx")
+        return opened(self.graphs, GRAPHS[0]), opened(self.graphs, GRAPHS[1])
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
@@ -149,32 +150,31 @@ class OnboardRecognizer:
 
 
 def graphs(knobs: PeopleKnobs) -> Path:
-    """The folder of the graphs. Raises InputError where there are none, or ones made for another layout."""
+    """The folder of the graphs. Raises InputError where they are not those of the manifest, or of another layout."""
     folder = SHIPPED if knobs.graphs == "shipped" else Path(knobs.graphs)
     wanted = {name: int(getattr(knobs, name)) for name in BAKED}
-    settings = " ".join(f"people.{name}={value}" for name, value in wanted.items())
-    make = f"make such graphs with python export/people_graph.py --out FOLDER --set {settings}"
+    settings = " ".join(f"--set people.{name}={value}" for name, value in wanted.items())
+    make = f"make such graphs with `dddas export --graph people --out FOLDER {settings}`"
     make = f"{make}, and give people.graphs=FOLDER; or take --backend torch"
     try:
-        made_for = dict(json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["layout"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"people.graphs: {folder} holds no graphs with their manifest.json; {make}") from None
-    if missing := [name for name in ("people_histograms.onnx", "people_scores.onnx") if not (folder / name).exists()]:
+        held = manifest(folder)["graphs"]
+    except InputError as error:
+        raise InputError(f"people.graphs: {error}") from None
+    if missing := [name for name in GRAPHS if name not in held]:
         raise InputError(f"people.graphs: {folder} lacks {' and '.join(missing)}; {make}")
+    made_for = held[GRAPHS[0]]["knobs"]
     if wrong := [name for name in BAKED if made_for.get(name) != wanted[name]]:
         differences = ", ".join(f"people.{name} = {made_for.get(name)}, not {wanted[name]}" for name in wrong)
         raise InputError(f"the graphs in {folder} are made for {differences}; {make}")
+    for name in GRAPHS:
+        verified(folder, name)
     return folder
 
 
-def opened(path: Path) -> Any:
-    """An ONNX Runtime session of a graph, on one thread."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.enable_mem_pattern = False  # it keeps a plan for every size of a level, which is no quicker and takes 9 MB
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+def opened(folder: Path, name: str) -> Any:
+    """An ONNX Runtime session of a graph."""
+    # A memory pattern is a plan for every size of a level, which is no quicker and takes 9 MB.
+    return open_graph(folder, name, enable_mem_pattern=False)
 
 
 def fill(planes: np.ndarray, level: np.ndarray, part: Part) -> None:

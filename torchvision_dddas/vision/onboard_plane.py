@@ -1,12 +1,13 @@
-"""Plane homographies by ONNX Runtime, for a small CPU: no torch. The graphs are made by export/homography_graph.py."""
+"""Plane homographies by ONNX Runtime, for a small CPU: no torch. The graphs are made by `dddas export`."""
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-SHIPPED = Path(__file__).parents[1] / "graphs"
+from torchvision_dddas.vision.graphs import SHIPPED
+from torchvision_dddas.vision.graphs import opened as open_graph
+
 LEAST = 4
 
 
@@ -41,12 +42,8 @@ class OnboardSolver:
 
 @cache
 def opened(name: str) -> Any:
-    """An ONNX Runtime session of a shipped graph, on one thread: there is nothing to share."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(str(SHIPPED / f"{name}.onnx"), options, providers=["CPUExecutionProvider"])
+    """An ONNX Runtime session of a shipped graph."""
+    return open_graph(SHIPPED, f"{name}.onnx")
 
 
 def _wide(array: np.ndarray) -> np.ndarray:

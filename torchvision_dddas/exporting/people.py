@@ -1,94 +1,48 @@
-"""Make the ONNX graphs that score windows for people, from the constants of `ops.hog`, and check them against it.
-
-usage: python export/people_graph.py [--config NAME] [--set people.cell_px=4 ...] [--out FOLDER]
-
-It needs the extras `torch` and `export`. Three graphs, in the folder of the package or the one given:
+"""The graphs that score windows for people, from the constants of `ops.hog`.
 
     people.onnx             uint8 picture (H + 2, W + 2, 3 or 1) with a border of one pixel -> `scores` (ny, nx)
     people_histograms.onnx  `polar` (1, 2, H, W), magnitude and magnitude x direction in radians, -> `histograms`
                             (F, ny, nx) of all blocks, not yet normalised
     people_scores.onnx      `histograms` -> `scores`
 
-and manifest.json, which names their inputs and outputs, the versions that made them, and the layout that is baked in.
 The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
 tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
 of the same cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
 
 The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 160 ns a pixel on
 one core at 640x480 where people.onnx takes 110 and people_histograms.onnx 14 (cv2.HOGDescriptor all in all 54), as ONNX
-Runtime has quick convolutions and slow copies. They are written once their scores are torch's to 5e-5; the same
-versions write the same bytes.
-Name a folder of your own to the onboard back end by `--set people.graphs=FOLDER`.
+Runtime has quick convolutions and slow copies.
 """
 
-import argparse
-import hashlib
-import json
 import math
-import os
-from pathlib import Path
-
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
-import onnx
 import onnxruntime
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto
 
+from torchvision_dddas.exporting.building import FAR, Graph
+from torchvision_dddas.exporting.checked import Check, Made
 from torchvision_dddas.ops import hog
-from torchvision_dddas.settings import load
-from torchvision_dddas.sinks.whole import write_whole
-from torchvision_dddas.vision.onboard_people import BAKED, SHIPPED
+from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.vision.onboard_people import BAKED
 from torchvision_dddas.vision.torch_people import layout
 
-OPSET, IR_VERSION, TOLERANCE = 20, 10, 5e-5
+TOLERANCE = 5e-5
 CHANNELS = 16  # ONNX Runtime's quick convolutions take channels by 16, on smaller vectors by 8 or 4
-FAR = 2**31 - 1  # an end of a slice: the last
+ABOUT = {
+    "people.onnx": "scores of all windows of a picture for people (HOG and a linear SVM), for any runtime",
+    "people_histograms.onnx": "the same, first half as the onboard back end runs it: histograms of all blocks",
+    "people_scores.onnx": "the same, second half: scores from histograms",
+}
 
 
-class Graph:
-    """A graph in the making: called with an operation and its inputs, adds a node and gives its output's name."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: dict[bytes, onnx.TensorProto] = {}
-
-    def __call__(self, operation: str, *inputs: str, out: str = "", **attributes: object) -> str:
-        """A node of one output; out: its name, if it matters."""
-        out = out or f"{operation.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operation, list(inputs), [out], name=out, **attributes))
-        return out
-
-    def number(self, *values: float) -> str:
-        """A float32 constant: a number, or a vector."""
-        return self.constant(np.array(values if len(values) > 1 else values[0], np.float32))
-
-    def whole(self, *values: int) -> str:
-        """A vector of int64."""
-        return self.constant(np.array(values, np.int64))
-
-    def constant(self, array: np.ndarray) -> str:
-        """An array, once however often it is asked for."""
-        key = str(array.dtype).encode() + str(array.shape).encode() + array.tobytes()
-        name = f"constant_{len(self.constants)}"
-        return self.constants.setdefault(key, numpy_helper.from_array(array, name)).name
-
-    def cut(self, name: str, axis: int, begin: int, end: int) -> str:
-        """A stretch of one axis."""
-        return self("Slice", name, self.whole(begin), self.whole(end), self.whole(axis))
-
-    def model(self, inputs: dict, outputs: dict, properties: dict[str, str], name: str = "people") -> bytes:
-        """The file's content. inputs, outputs: {name: (type, shape)}."""
-        values = [
-            [helper.make_tensor_value_info(value, kind, shape) for value, (kind, shape) in held.items()]
-            for held in (inputs, outputs)
-        ]
-        graph = helper.make_graph(self.nodes, name, *values, initializer=list(self.constants.values()))
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-        helper.set_model_props(made, properties)
-        onnx.checker.check_model(made, full_check=True)
-        return made.SerializeToString(deterministic=True)
+def made(knobs: PeopleKnobs) -> dict[str, Made]:
+    """The files by their names, compared with torch."""
+    wanted = layout(knobs)
+    files = graphs(wanted)
+    check = Check("score", largest_difference(files, wanted), TOLERANCE)
+    return {name: Made(content, ABOUT[name], "ops.hog", baked(wanted), (check,)) for name, content in files.items()}
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -207,7 +161,7 @@ def scores(graph: Graph, histograms: str, layout: hog.Layout, out: str) -> str:
 def graphs(layout: hog.Layout) -> dict[str, bytes]:
     """Files by their names."""
     size = layout.bins * layout.cells**2
-    number = (TensorProto.FLOAT, [])
+    number: tuple[int, list] = (TensorProto.FLOAT, [])
     svm = {"weights": (TensorProto.FLOAT, ["down", "across", size]), "bias": number, "clip": number}
     image = {"image": (TensorProto.UINT8, ["H + 2", "W + 2", "channels"])}
     made = {"polar": (TensorProto.FLOAT, [1, 2, "H", "W"])}
@@ -232,7 +186,7 @@ def baked(layout: hog.Layout) -> dict[str, int]:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Checking and writing them.
+# Checking them.
 
 
 def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
@@ -281,56 +235,6 @@ def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
         for name in ("people_scores.onnx", "people.onnx"):
             found = run(name, given)
             if found.shape != wanted.shape:
-                raise SystemExit(f"{name} gives {found.shape}, torch {wanted.shape}; nothing was written")
+                return float("inf")
             worst = max(worst, float(np.abs(found - wanted).max()))
     return worst
-
-
-def described(files: dict[str, bytes]) -> dict[str, dict]:
-    """Of each file the hash, inputs and outputs with their shapes."""
-    listed = {}
-    for name, content in files.items():
-        graph = onnx.load_from_string(content).graph
-        listed[name] = {
-            "sha256": hashlib.sha256(content).hexdigest(),
-            **{
-                side: {
-                    value.name: [d.dim_param or d.dim_value for d in value.type.tensor_type.shape.dim] for value in held
-                }
-                for side, held in (("inputs", graph.input), ("outputs", graph.output))
-            },
-        }
-    return listed
-
-
-def manifest(files: dict[str, bytes], layout: hog.Layout) -> bytes:
-    """What the files are, as JSON."""
-    content = {
-        "origin": "made by export/people_graph.py from torchvision_dddas/ops/hog.py",
-        "versions": {"onnx": onnx.__version__, "opset": OPSET},
-        "layout": baked(layout),
-        "graphs": described(files),
-    }
-    return (json.dumps(content, indent=1) + "\n").encode()
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config")
-    parser.add_argument("--set", nargs="*", default=[], dest="overrides", metavar="KNOB=VALUE")
-    parser.add_argument("--out", type=Path, default=SHIPPED)
-    options = parser.parse_args()
-    wanted = layout(load(options.config, options.overrides).people)
-    files = graphs(wanted)
-    difference = largest_difference(files, wanted)
-    if not difference <= TOLERANCE:
-        raise SystemExit(f"the graphs' scores are up to {difference:.1e} off torch's; nothing was written")
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, content in {**files, "manifest.json": manifest(files, wanted)}.items():
-        write_whole(options.out / name, content)
-        print(f"{options.out / name}: {len(content)} bytes")
-    print(f"scores are torch's to {difference:.1e}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,5 @@
-"""The graphs of people's scores: the shipped ones are what the script makes, and compute what `ops.hog` does."""
+"""The graphs of people's scores: the shipped ones are what is made, and compute what `ops.hog` does."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,16 @@ import onnx
 import onnxruntime
 import torch
 
-from export import people_graph as script
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.exporting import manifest, people
+from torchvision_dddas.exporting.checked import refuse_wrong
 from torchvision_dddas.ops import hog
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.sources.classifiers import read_classifier
 from torchvision_dddas.types import LinearSvm, Part
 from torchvision_dddas.vision import load_recognizer
-from torchvision_dddas.vision.onboard_people import SHIPPED, OnboardRecognizer
+from torchvision_dddas.vision.graphs import SHIPPED
+from torchvision_dddas.vision.onboard_people import OnboardRecognizer
 
 NAMES = "people.onnx", "people_histograms.onnx", "people_scores.onnx"
 LAYOUTS = {
@@ -36,18 +38,18 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_graphs_of_any_layout_score_as_torch_does(layout):
-    assert script.largest_difference(script.graphs(layout), layout) < 3e-5
+    assert people.largest_difference(people.graphs(layout), layout) < 3e-5
 
 
 def test_the_same_layout_gives_the_same_bytes():
-    first, again = (script.graphs(hog.Layout()) for _ in range(2))
+    first, again = (people.graphs(hog.Layout()) for _ in range(2))
     assert first == again and tuple(first) == NAMES
-    assert all(first[name] != content for name, content in script.graphs(hog.Layout(bins=8)).items())
+    assert all(first[name] != content for name, content in people.graphs(hog.Layout(bins=8)).items())
 
 
-def test_the_shipped_graphs_are_those_that_the_script_makes():
+def test_the_shipped_graphs_are_those_that_are_made_now():
     """Node by node: the bytes may differ with the versions of onnx."""
-    for name, content in script.graphs(hog.Layout()).items():
+    for name, content in people.graphs(hog.Layout()).items():
         shipped, made = onnx.load(SHIPPED / name), onnx.load_from_string(content)
         assert list(shipped.graph.node) == list(made.graph.node)
         for one, other in zip(shipped.graph.initializer, made.graph.initializer, strict=True):
@@ -87,7 +89,7 @@ def whole_scores(image: np.ndarray, weights: np.ndarray, bias: float) -> np.ndar
 
 
 def test_a_clip_of_one_lets_all_numbers_pass():
-    given = script.example(hog.Layout(), (8, 8), 3, 0)
+    given = people.example(hog.Layout(), (8, 8), 3, 0)
     session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
     clipped, free = (session.run(None, {**given, "clip": np.array(clip, np.float32)})[0] for clip in (0.05, 1.0))
     bordered = torch.from_numpy(given["image"]).permute(2, 0, 1)[None].float()
@@ -97,7 +99,7 @@ def test_a_clip_of_one_lets_all_numbers_pass():
     assert np.abs(clipped - free).max() > 0.01
 
 
-def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path, monkeypatch, capsys):
+def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
     changed: dict[str, Any] = {
         "cell_px": 4,
         "block_px": 8,
@@ -105,12 +107,7 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path, monkeypat
         "window_width_px": 32,
         "window_height_px": 64,
     }
-    chosen = [f"people.{name}={value}" for name, value in changed.items()]
-    monkeypatch.setattr("sys.argv", ["people_graph.py", "--out", str(tmp_path / "own"), "--set", *chosen])
-    script.main()
-    assert "people_scores.onnx" in capsys.readouterr().out
-    manifest = json.loads((tmp_path / "own" / "manifest.json").read_text())
-    assert manifest["layout"]["cell_px"] == 4 and set(manifest["graphs"]) == set(NAMES)
+    manifest.write(tmp_path / "own", people.made(PeopleKnobs(**changed)))
     knobs = PeopleKnobs(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
     image = np.random.default_rng(1).integers(0, 256, (80, 70, 3), np.uint8)
     weights = np.random.default_rng(2).normal(0, 0.05, math.prod((7, 15, 4, 9))).astype(np.float32)
@@ -122,12 +119,10 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path, monkeypat
     np.testing.assert_allclose(onboard, torch_scores, atol=3e-5)
 
 
-def test_graphs_that_are_off_are_not_written(tmp_path: Path, monkeypatch):
-    with monkeypatch.context() as other:
-        other.setattr(hog, "SOFT_FIRST", 0.2)
-        made = script.graphs(hog.Layout())
-    monkeypatch.setattr("sys.argv", ["people_graph.py", "--out", str(tmp_path / "own")])
-    monkeypatch.setattr(script, "graphs", lambda _: made)
-    with pytest.raises(SystemExit, match="off torch's; nothing was written"):
-        script.main()
-    assert not (tmp_path / "own").exists()
+def test_graphs_that_are_off_are_refused(monkeypatch):
+    monkeypatch.setattr(hog, "SOFT_FIRST", 0.2)
+    made = people.graphs(hog.Layout())
+    monkeypatch.undo()
+    monkeypatch.setattr(people, "graphs", lambda _: made)
+    with pytest.raises(InputError, match=r"people.onnx does not agree with ops.hog: .* score where 5e-05"):
+        refuse_wrong(people.made(PeopleKnobs()))

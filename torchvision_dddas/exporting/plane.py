@@ -1,9 +1,4 @@
-"""Make the ONNX graphs that solve plane homographies, and check them against `ops.homography`.
-
-usage: python export/homography_graph.py [--out FOLDER]
-
-It needs the extras `torch` and `export`. Two graphs, in the folder of the package or the one given, with
-homography.json that names their inputs, outputs and versions; all in float64, for any batch B and n landmarks:
+"""The graphs that solve plane homographies; all in float64, for any batch B and n landmarks.
 
     homography.onnx      ground (B, n, 2), image (B, n, 2), weight (B, n) -> matrix (B, 3, 3), valid (B,): `fit`
     homography_raw.onnx  ground, image -> matrix, valid: `fit_raw`, the source's system as printed
@@ -14,18 +9,7 @@ of u and of v have the same 3 x 3 matrix of the ground's moments for their own t
 leaves 2 x 2 equations for the two unknowns that they share. Both blocks are symmetric and positive definite, where
 elimination is as exact in one order of the rows as in any other; so there is no row to exchange. What decides validity
 is the same as in `fit`, measured on the blocks: it differs where landmarks lie on one line but for a thousandth.
-
-The graphs are written once they agree with torch; the same versions write the same bytes.
 """
-
-import argparse
-import json
-import os
-import sys
-from pathlib import Path
-
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # recipes are not installed
 
 import numpy as np
 import onnx
@@ -33,15 +17,25 @@ import onnxruntime
 import torch
 from onnx import TensorProto
 
-from export.people_graph import OPSET, Graph, described
+from torchvision_dddas.exporting.building import Graph
+from torchvision_dddas.exporting.checked import Check, Made
 from torchvision_dddas.ops import homography
-from torchvision_dddas.sinks.whole import write_whole
-from torchvision_dddas.vision.onboard_people import SHIPPED
 
-NAMES = "homography.onnx", "homography_raw.onnx"
+ABOUT = {
+    "homography.onnx": "weighted least-squares homographies of sets of landmarks",
+    "homography_raw.onnx": "the same as the source prints it: no weights, no normalisation",
+}
 TOLERANCE_PX = 1e-6
 SINGULAR = 1e-10  # smallest share of a block's trace, before what x, y, 1 explain, for its smaller eigenvalue
 UNKNOWNS = 8
+
+
+def made() -> dict[str, Made]:
+    """The files by their names, compared with torch."""
+    files = graphs()
+    check = Check("px", largest_difference(files), TOLERANCE_PX)
+    return {name: Made(content, ABOUT[name], "ops.homography", {}, (check,)) for name, content in files.items()}
+
 
 # The nine products of (x, y, 1) with (u, v, 1): of each, which of the first and which of the second.
 MONOMIALS = {"x": (0, 2), "y": (1, 2), "1": (2, 2), "ux": (0, 0), "uy": (1, 0), "vx": (0, 1), "vy": (1, 1)} | {
@@ -227,7 +221,7 @@ def constant(graph: Graph, values: np.ndarray | float) -> str:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Checking and writing them.
+# Checking them.
 
 
 def graphs() -> dict[str, bytes]:
@@ -240,7 +234,7 @@ def graphs() -> dict[str, bytes]:
     raw(fit_raw)
     return dict(
         zip(
-            NAMES,
+            ABOUT,
             (
                 fit.model({**points, **weight}, outputs, {}, "homography"),
                 fit_raw.model(points, outputs, {}, "homography_raw"),
@@ -270,7 +264,7 @@ def example(count: int, sets: int, seed: int, noise_px: float = 1.0) -> dict[str
 
 def largest_difference(files: dict[str, bytes]) -> float:
     """Between the places in the picture by the graphs and by torch, over sets of landmarks of all sizes, in px."""
-    sessions = [onnxruntime.InferenceSession(files[name], providers=["CPUExecutionProvider"]) for name in NAMES]
+    sessions = [onnxruntime.InferenceSession(files[name], providers=["CPUExecutionProvider"]) for name in ABOUT]
     worst = 0.0
     for count in range(4, 17):
         given = example(count, 50, count)
@@ -286,32 +280,3 @@ def largest_difference(files: dict[str, bytes]) -> float:
             there = homography.transfer(torch.from_numpy(matrix), points) - homography.transfer(wanted, points)
             worst = max(worst, unit * there.abs().max().item())
     return worst
-
-
-def manifest(files: dict[str, bytes]) -> bytes:
-    """What the files are, as JSON."""
-    content = {
-        "origin": "made by export/homography_graph.py, checked against torchvision_dddas/ops/homography.py",
-        "versions": {"onnx": onnx.__version__, "opset": OPSET},
-        "graphs": described(files),
-    }
-    return (json.dumps(content, indent=1) + "\n").encode()
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=SHIPPED)
-    options = parser.parse_args()
-    files = graphs()
-    difference = largest_difference(files)
-    if not difference <= TOLERANCE_PX:
-        raise SystemExit(f"the graphs' matrices are up to {difference:.1e} px off torch's; nothing was written")
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, content in {**files, "homography.json": manifest(files)}.items():
-        write_whole(options.out / name, content)
-        print(f"{options.out / name}: {len(content)} bytes")
-    print(f"places are torch's to {difference:.1e} px")
-
-
-if __name__ == "__main__":
-    main()
