@@ -74,8 +74,9 @@ class DatagramOutlet:
 
     def put(self, messages: Sequence[bytes]) -> None:
         """As in Outlet."""
-        self._lose(len(self._kept), self.reason)
-        self._kept = list(messages)
+        if messages:
+            self._lose(len(self._kept), self.reason)
+            self._kept = list(messages)
 
     def flush(self) -> None:
         """As in Outlet."""
@@ -92,7 +93,7 @@ class DatagramOutlet:
 
     def mend(self) -> None:
         """As in Outlet."""
-        self.close()
+        self._shut()
         trouble = OSError(f"{self._to.host} has no address")
         for family, place in self._ways:
             opened = socket.socket(family, socket.SOCK_DGRAM)
@@ -109,11 +110,16 @@ class DatagramOutlet:
                 return
         raise trouble
 
-    def sync(self) -> None:
+    def handle(self) -> None:
         """As in Outlet."""
 
     def close(self) -> None:
         """As in Outlet."""
+        self._lose(len(self._kept), self.reason)
+        self._kept = []
+        self._shut()
+
+    def _shut(self) -> None:
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()

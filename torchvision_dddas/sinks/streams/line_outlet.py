@@ -15,7 +15,7 @@ KEPT_BYTES = 1 << 20
 
 _AT_ONCE = 4096  # Linux: a pipe that is ready takes so much without waiting, and in one piece
 _LAST_S = 1.0  # how long closing may wait for a reader
-_WORDS = {errno.EPIPE: "nobody reads it any more", errno.ENXIO: "nobody reads it"}
+_WORDS = {errno.EPIPE: "nobody reads it", errno.ENXIO: "nobody reads it"}
 
 
 class LineOutlet:
@@ -75,10 +75,9 @@ class LineOutlet:
             self._shut()
             self._open()
 
-    def sync(self) -> None:
+    def handle(self) -> int | None:
         """As in Outlet."""
-        if self._regular:
-            os.fsync(self._file)
+        return os.dup(self._file) if self._regular and self._file >= 0 else None
 
     def close(self) -> None:
         """As in Outlet."""
@@ -90,7 +89,8 @@ class LineOutlet:
             while self._kept and time.monotonic() < until:
                 self._ready(until - time.monotonic())
                 self.flush()
-            self.sync()
+            if self._regular:
+                os.fsync(self._file)
         if self._kept:
             self.lost += len(self._kept)
             self.reason = "it was not taken in time"

@@ -50,12 +50,14 @@ def open_streams(
     places: dict[str, str] = {}
     for text in texts:
         place = text.partition(":")[2]
-        if not _is_address(place):
-            other = places.setdefault(
-                place if place == "-" else os.path.realpath(_path(place, f"{option} {text}")), text
+        if _is_address(place):
+            continue
+        real = place if place == "-" else os.path.realpath(_path(place, f"{option} {text}"))
+        if real in places:
+            raise InputError(
+                f"{option} {places[real]} and {option} {text} go to the same place; choose another for one"
             )
-            if other is not text:
-                raise InputError(f"{option} {other} and {option} {text} go to the same place; choose another for one")
+        places[real] = text
     with ExitStack() as opened:
         streams = []
         for text in texts:

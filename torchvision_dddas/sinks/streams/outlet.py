@@ -23,8 +23,8 @@ class Outlet(Protocol):
     def mend(self) -> None:
         """After trouble: make ready to send again. Raises OSError if it cannot."""
 
-    def sync(self) -> None:
-        """Put what was sent where a loss of power leaves it. Raises OSError if it cannot."""
+    def handle(self) -> int | None:
+        """A new descriptor of the file that was written, for whoever puts it on the disk; None where there is none."""
 
     def close(self) -> None:
         """Send what can be sent soon and count the rest as lost. Never raises."""

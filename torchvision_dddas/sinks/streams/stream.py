@@ -1,6 +1,9 @@
 """A stream: frames in, messages out, and what to do while nobody takes them."""
 
 import math
+import os
+import re
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -11,8 +14,8 @@ from torchvision_dddas.types import Followed, Surveyed
 Tell = Callable[[str, str], object]
 """Called with a kind, `sink`, and words for a person."""
 
-
 _SELDOM_S = 3600.0
+_NUMBER = re.compile(r"\d+")
 
 
 class Encoder(Protocol):
@@ -27,7 +30,7 @@ class Encoder(Protocol):
 class Stream:
     """Feed it frames in order. No trouble of the outlet ends the run: it is told once, and tried again with back-off.
 
-    name: as the user wrote it. sent: messages given to the outlet. lost: messages that nobody will get.
+    name: as the user wrote it. sent: messages that there were to send. One thread writes and closes.
     """
 
     def __init__(
@@ -45,16 +48,18 @@ class Stream:
         self.sent = 0
         self._encode, self._outlet, self._tell, self._clock = encode, outlet, tell, clock
         self._retry_s, self._retry_most_s = retry_s, retry_most_s
+        self._lock = threading.Lock()
         self._trouble = ""
         self._wait_s = self._due_s = 0.0
-        self._told_lost = 0
-        self._told_reason = ""
+        self._mended_s = -math.inf
+        self._untold = self._told_lost = 0
+        self._reason = self._told_reason = ""
         self._lost_wait_s, self._lost_due_s = 0.0, -math.inf
 
     @property
     def lost(self) -> int:
         """Messages that nobody will get."""
-        return self._outlet.lost
+        return self._outlet.lost + self._untold
 
     @property
     def trouble(self) -> str:
@@ -67,25 +72,46 @@ class Stream:
         if followed is None:
             return
         age_s = float("nan") if followed.frame is None else self._clock() - followed.frame.taken_s
-        messages = list(self._encode(surveyed, people, age_s, self._outlet.most_bytes))
-        self.sent += len(messages)
-        self._outlet.put(messages)
-        self._flush()
+        messages: Sequence[bytes] = ()
+        defect = ""
+        try:
+            messages = self._encode(surveyed, people, age_s, self._outlet.most_bytes)
+        except Exception as error:  # a defect of ours: still no reason to end a run
+            defect = f"frame {followed.number} cannot be told, {type(error).__name__}: {error}"
+        with self._lock:
+            if defect:
+                self._untold += 1
+                self._reason = defect
+            lost = self._outlet.lost
+            self.sent += len(messages)
+            self._outlet.put(messages)
+            self._flush()
+            if self._outlet.lost > lost:
+                self._reason = self._outlet.reason
+            if not self._trouble and self.lost > self._told_lost:
+                self._tell_lost(self._reason)
 
     def sync(self) -> None:
-        """Put what was sent where a loss of power leaves it. Never raises."""
-        if self._trouble:
-            return
+        """Put what was sent where a loss of power leaves it. Never raises; another thread may call it: nobody waits."""
+        file = None
         try:
-            self._outlet.sync()
+            with self._lock:
+                file = None if self._trouble else self._outlet.handle()
+            if file is not None:
+                os.fsync(file)
         except OSError as error:
-            self._broke(error)
+            with self._lock:
+                self._broke(error)
+        finally:
+            if file is not None:
+                os.close(file)
 
     def close(self) -> None:
         """Send what can be sent soon, and say what was lost. Never raises."""
-        self._outlet.close()
-        if self.lost > self._told_lost:
-            self._tell("sink", f"{self.name} closed; {self._newly_lost()}")
+        with self._lock:
+            self._outlet.close()
+            if self.lost > self._told_lost:
+                self._tell("sink", f"{self.name} closed; {self._newly_lost()}")
 
     def _flush(self) -> None:
         if self._trouble and self._clock() < self._due_s:
@@ -98,27 +124,27 @@ class Stream:
             self._broke(error)
             return
         if self._trouble:
-            self._trouble = ""
+            self._trouble, self._mended_s = "", self._clock()
             self._tell("sink", f"{self.name} works again; {self._newly_lost()}")
-        elif self.lost > self._told_lost:
-            self._tell_lost()
 
     def _broke(self, error: OSError) -> None:
-        trouble = error.strerror or str(error)
-        self._wait_s = min(2 * self._wait_s, self._retry_most_s) if self._trouble else self._retry_s
-        self._due_s = self._clock() + self._wait_s
+        trouble, now_s = error.strerror or str(error), self._clock()
+        # What works for a moment only is tried no oftener for that.
+        steady = not self._trouble and now_s > self._mended_s + self._retry_most_s
+        self._wait_s = self._retry_s if steady else min(2 * self._wait_s, self._retry_most_s)
+        self._due_s = now_s + self._wait_s
         if trouble != self._trouble:
             self._tell("sink", f"{self.name}: {trouble}; trying again in {self._wait_s:g} s")
         self._trouble = trouble
 
-    def _tell_lost(self) -> None:
+    def _tell_lost(self, reason: str) -> None:
         """Now and then, less and less often while the reason stays the same."""
-        reason, now_s = self._outlet.reason, self._clock()
-        if reason == self._told_reason and now_s < self._lost_due_s:
+        now_s, key = self._clock(), _NUMBER.sub("", reason)
+        if key == self._told_reason and now_s < self._lost_due_s:
             return
-        again = reason == self._told_reason
+        again = key == self._told_reason
         self._lost_wait_s = min(2 * self._lost_wait_s, _SELDOM_S) if again else self._retry_most_s
-        self._lost_due_s, self._told_reason = now_s + self._lost_wait_s, reason
+        self._lost_due_s, self._told_reason = now_s + self._lost_wait_s, key
         self._tell("sink", f"{self.name}: {reason}; {self._newly_lost()}")
 
     def _newly_lost(self) -> str:
