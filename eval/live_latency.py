@@ -1,7 +1,7 @@
 """How late results of `dddas run --live` are, at 10, 25 and 30 pictures a second, on one core and on two.
 
 usage: python eval/live_latency.py [DATA...] [--rates 10 25 30] [--cores 1 2] [--sizes 640x480] [--configs fast]
-       [--seconds 20] [--rounds 3] [--nice 0] [--json FILE]
+       [--seconds 20] [--rounds 3] [--realtime] [--json FILE]
 
 Each run is a process of its own, held to so many cores (sched_setaffinity), which plays a video at its own rate as a
 camera would give it, decoding included; its lines of JSON are read from its standard output. Settings take turns over
@@ -9,14 +9,16 @@ the rounds; a figure is the median over the rounds, with the lowest and highest.
 
 - latency: from the capture of the newest picture read to the results that it settles (50, 95, 99 %), by the run itself;
 - age: from the capture of a picture to its own results, the pictures that it waits for included;
-- growth: how much later results come after a minute than before it, by a line through the ages after the first second;
+- growth: how much later results come after a minute than before it, by a line through the ages but for those of the
+  first and the last second;
 - dropped, left out on purpose, and late pictures (over live.deadline_ms); what was looked at when it ended;
 - processor time a picture, start to first result, peak memory (VmHWM);
-- waited: the share of the time in which it could have worked that others had its core. Where this is more than a few
-  percent the latencies are those of a busy machine.
+- waited: the share of the time in which a thread could have worked that another one had the core, of its own threads
+  too. How much of all cores others took meanwhile is told at the end: where that is much, and nothing was done about
+  it, the latencies are those of a busy machine.
 
-The video is the project's own scene; with DATA (videos, folders of pictures) these too. --nice -10 (root) keeps others
-from the cores as far as that goes, and is told.
+The video is the project's own scene; with DATA (videos, folders of pictures) these too. --realtime (root) puts the
+runs before all others that want their cores, and is told.
 """
 
 import argparse
@@ -93,7 +95,7 @@ class Watched:
             self.look()
 
 
-def one_run(video: Path, case: dict[str, Any], nice: int) -> dict[str, float]:
+def one_run(video: Path, case: dict[str, Any], realtime: bool) -> dict[str, float]:
     """The figures of a run."""
     with tempfile.TemporaryDirectory() as out:
         command = [str(Path(sys.executable).with_name("dddas")), "run", str(video), "--live", "--emit", "json:-"]
@@ -103,7 +105,11 @@ def one_run(video: Path, case: dict[str, Any], nice: int) -> dict[str, float]:
         began = time.time()
         errors = (Path(out) / "errors.txt").open("w+")
         run = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, preexec_fn=partial(_hold, case["cores"], nice), text=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            preexec_fn=partial(_hold, case["cores"], realtime),
+            text=True,
         )
         watched = Watched(run.pid)
         assert run.stdout is not None
@@ -143,11 +149,12 @@ def one_run(video: Path, case: dict[str, Any], nice: int) -> dict[str, float]:
 _PERCENTILES = ("p50", "p95", "p99")
 
 
-def _hold(cores: int, nice: int) -> None:
+def _hold(cores: int, realtime: bool) -> None:
     """In the new process: only so many cores, the last ones; whoever asks for figures keeps the first where he can."""
     allowed = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, allowed[-cores:])
-    os.setpriority(os.PRIO_PROCESS, 0, nice)
+    if realtime:
+        machine.first_in_line()
 
 
 def _rows(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -160,7 +167,8 @@ def from_rows(rows: list[dict[str, Any]]) -> dict[str, float]:
     """Ages and their growth, of the lines of JSON; NaN where too few tell their age."""
     known = [(row["time_s"], row["age_s"]) for row in rows if row.get("age_s") is not None]
     times, ages = (np.array(values, float) for values in (zip(*known, strict=True) if known else ((), ())))
-    settled = times > (times.min(initial=math.inf) + SETTLED_S)
+    # At the end nothing is waited for any more.
+    settled = (times > times.min(initial=math.inf) + SETTLED_S) & (times < times.max(initial=0) - SETTLED_S)
     if np.count_nonzero(settled) < 3:
         return {f"age_{p}_ms": math.nan for p in _PERCENTILES} | {"growth_ms_a_minute": math.nan}
     times, ages = times[settled], ages[settled]
@@ -209,14 +217,14 @@ def main() -> None:
     parser.add_argument("--people", action="store_true", help="search for people too")
     parser.add_argument("--seconds", type=float, default=20, help="of each run; 20")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--nice", type=int, default=0, help="of the runs; below 0 only for root")
+    parser.add_argument("--realtime", action="store_true", help="before all others (SCHED_RR); root")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     there = len(os.sched_getaffinity(0))
     cores = [count for count in options.cores if count <= there]
-    report = {"machine": machine.about(), "seconds": options.seconds, "nice": options.nice, "runs": []}
+    report = {"machine": machine.about(), "seconds": options.seconds, "realtime": options.realtime, "runs": []}
     print(f"{machine.in_words(report['machine'])}; runs of {options.seconds:g} s, {options.rounds} rounds", end="")
-    print(f"; nice {options.nice}" if options.nice else "")
+    print("; before all others" if options.realtime else "")
     others = machine.Others()
     with tempfile.TemporaryDirectory() as folder:
         videos = dict(filmed(options.data, options.sizes, options.rates, options.seconds, Path(folder)))
@@ -229,7 +237,7 @@ def main() -> None:
         for turn in range(options.rounds):
             for k, case in enumerate(cases):
                 video = videos[case["clip"], case["size"], case["rate_hz"]]
-                runs[k].append(one_run(video, case, options.nice))
+                runs[k].append(one_run(video, case, options.realtime))
                 report["runs"] = [
                     {**cases[i], "rounds": len(done), **over_rounds(done)} for i, done in runs.items() if done
                 ]

@@ -1,13 +1,15 @@
 """What a frame costs on the vehicle: whole and stage by stage, against resolution, targets, memory and bandwidth.
 
-usage: python eval/onboard_speed.py [DATA...] [--parts chains targets memory] [--rounds 12] [--json FILE]
+usage: python eval/onboard_speed.py [DATA...] [--parts chains targets memory] [--rounds 12] [--realtime]
+       [--json FILE]
 
 chains: all chains beside the plain OpenCV chain at each of --sizes, the onboard ones at each of --ladder too; each
 size's chains take turns of eight frames through the same clip, so that whatever else the machine does meets them all.
 Figures are medians over the turns with their quartiles; the processor's time is summed over threads and grows less
 than the clock's where other programs want the cores, and a ratio of two in the same turn least of all. How much others
-took is told. The limit is the time in which one core, copying a block far larger than its caches at the speed measured
-between the same turns, would move what each stage must read and write at least once (LEAST_BYTES).
+took is told; --realtime (root) goes before them. The limit is the time in which one core, copying a block far larger
+than its caches at the speed measured between the same turns, would move what each stage must read and write at least
+once (LEAST_BYTES).
 
 targets: 640x480 with so many movers added to the scene, the onboard chains in turns on all of these clips.
 
@@ -126,13 +128,17 @@ def main() -> None:
     parser.add_argument("--chains", nargs="*", help=f"of: {', '.join(CHAINS)}")
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--frames", type=int, default=60, help="of the videos that memory is measured on")
+    parser.add_argument("--realtime", action="store_true", help="go before all others (SCHED_RR); root")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     chains = available(options.chains or CHAINS)
     onboard = [name for name in chains if name in ONBOARD]
     sizes, ladder = list(options.sizes), list(options.ladder)
-    report: dict[str, Any] = {"machine": machine.about(), "rounds": options.rounds, "clips": {}}
-    print(machine.in_words(report["machine"]))
+    report: dict[str, Any] = {"machine": machine.about(), "realtime": options.realtime, "rounds": options.rounds}
+    report["clips"] = {}
+    print(machine.in_words(report["machine"]) + "; before all others" * options.realtime)
+    if options.realtime:
+        machine.first_in_line()
 
     def done(part: str, figures: dict[str, Any]) -> None:
         report[part] = figures
