@@ -15,13 +15,13 @@ ABOUT = About(START, geographic=True, landmarks=NAMES)
 def followed(number=1, targets=2, kind="moving", rate=10.0, **rest):
     """Targets of which the last is a box between two detections; and a detection that has no identity."""
     boxes = np.array([[10.0 * k, 20.0, 30.0, 40.0] for k in range(1, targets + 2)])
-    unknown = np.full(targets + 1, np.nan)
+    seen = targets - 1 if targets > 1 else targets
+    unknown = np.full(seen + 1, np.nan)
     heading, speed = unknown.copy(), unknown.copy()
     heading[0], speed[0] = -np.pi / 2, 1.5
-    found = Detections(boxes, np.full(targets + 1, 0.875), np.full(targets + 1, 64.0), heading, speed, kind)
-    rows = np.arange(targets)
-    if targets > 1:
-        rows[-1] = -1
+    detected = boxes[[*range(seen), targets]]
+    found = Detections(detected, np.full(seen + 1, 0.875), np.full(seen + 1, 64.0), heading, speed, kind)
+    rows = np.array([*range(seen), -1][:targets], np.int64)
     tracks = Tracks(number, np.arange(1, targets + 1), boxes[:targets], np.full(targets, 0.875), rows)
     frame = Frame(number, (number - 1) / rate, np.zeros((4, 4), np.uint8), taken_s=rest.pop("taken_s", float("nan")))
     return Followed(number, frame, found, tracks, **rest)
