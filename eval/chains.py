@@ -1,7 +1,7 @@
 """The chains whose speed and memory are compared, timed in turns and stage by stage.
 
-usage: python eval/chains.py CHAIN VIDEO: takes one chain through a video and ends; for a look at its memory from
-outside. Nothing is imported but what the chain needs.
+usage: python eval/chains.py CHAIN VIDEO [GRAPHS]: takes one chain through a video and ends; for a look at its memory
+from outside. Nothing is imported but what the chain needs. GRAPHS: a folder by `dddas export --graph step`.
 """
 
 import gc
@@ -10,13 +10,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads must not spin through the others' turns
 
 import numpy as np
 import plain_chain
-from films import there_and_back
+from films import Size, there_and_back
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.run import Loop
@@ -30,7 +31,8 @@ STAGES = ("prepare", "register", "foreground", "targets")
 """Grey pictures; the camera's motion; difference to mask; mask to targets, and all that belongs to no other stage."""
 ONBOARD = ("onboard fast", "onboard half", "onboard default")
 TORCH = tuple(f"torch {config} b{batch}" for config in ("fast", "default") for batch in (1, 8))
-CHAINS = (*ONBOARD, *TORCH)
+STEP = "graph step"
+CHAINS = (*ONBOARD, *TORCH, STEP)
 Lanes = Mapping[str, tuple[str, list[np.ndarray]]]
 """By a name, a chain and the frames that it goes through."""
 
@@ -88,12 +90,19 @@ class Clocked:
 class Chain:
     """One of those compared. boxes: how many were found in each frame of the turn; watch: its stages."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, size: Size, graphs: Path | None = None) -> None:
+        """graphs: where the graph is, of `graph step`. Raises InputError where it is not, or not whole."""
         self.watch = Stopwatch()
         self.boxes: list[int] = []
         self.window = 3 if name == "plain" else 1
         if name == "plain":
             self._one = self._plain
+            return
+        if name == STEP:
+            from step_graph import StepGraph
+
+            self.graph = StepGraph(graphs or Path("dddas-graphs"), size)
+            self._one = self._graph
             return
         backend, config, *batch = name.split()
         settings = load(None if config == "default" else config)
@@ -111,18 +120,32 @@ class Chain:
         _, boxes = plain_chain.plain_window(*frames[i : i + 3], self.watch.lap)
         self.boxes.append(len(boxes))
 
+    def _graph(self, frames: list[np.ndarray], i: int) -> None:
+        from step_graph import boxes
+
+        self.watch.start()
+        greys = self.graph.grey(frames[i])
+        self.watch.lap("prepare")
+        if len(greys) < 3:
+            return
+        mask = self.graph.mask(greys)
+        self.watch.lap("foreground")  # registration is in it
+        self.boxes.append(len(boxes(mask)))
+
     def _ours(self, frames: list[np.ndarray], i: int) -> None:
         for scene in self.loop.feed(Frame(i + 1, i / 10.0, frames[i])):
             self.boxes.append(len(scene.detections.box_px))
 
 
-def available(names: Sequence[str] = CHAINS) -> list[str]:
-    """Those that can run here: torch is installed, the configuration is there."""
-    return [name for name in names if _can_run(name)]
+def available(names: Sequence[str] = CHAINS, sizes: Sequence[Size] = (), graphs: Path | None = None) -> list[str]:
+    """Those that can run here: torch is installed, the configuration is there, and graphs of all the sizes."""
+    return [name for name in names if _can_run(name, sizes, graphs)]
 
 
-def _can_run(name: str) -> bool:
+def _can_run(name: str, sizes: Sequence[Size], graphs: Path | None) -> bool:
     backend, config = name.split()[:2]
+    if name == STEP:
+        return graphs is not None and all((graphs / f"step_{w}x{h}.onnx").exists() for w, h in sizes)
     if backend == "torch" and not (find_spec("torch") and find_spec("kornia")):
         return False
     try:
@@ -172,12 +195,14 @@ def lanes_of(frames: list[np.ndarray], chains: Sequence[str], rounds: int) -> La
     return {name: (name, frames) for name in dict.fromkeys(("plain", *chains))}
 
 
-def timed(lanes: Lanes, rounds: int) -> Iterator[dict[str, Timed]]:
+def timed(lanes: Lanes, rounds: int, graphs: Path | None = None) -> Iterator[dict[str, Timed]]:
     """All lanes, a chain on a clip each, in turns of TURN frames. Yields what was added to after each turn that counts.
 
     Other programs meet all lanes alike. The first turns do not count.
     """
-    running = {lane: Chain(name) for lane, (name, _) in lanes.items()}
+    running = {
+        lane: Chain(name, (frames[0].shape[1], frames[0].shape[0]), graphs) for lane, (name, frames) in lanes.items()
+    }
     found = {lane: Timed() for lane in lanes}
     for k in range(rounds + WARM_UP):
         for lane, chain in running.items():
@@ -213,19 +238,20 @@ def quartiles(name: str, values: np.ndarray) -> dict[str, float]:
     return {name: middle, f"{name}_25": low, f"{name}_75": high}
 
 
-def alone(name: str, path: str) -> None:
+def alone(name: str, path: str, graphs: str = "") -> None:
     """One chain through a video, as a process that does nothing else. `nothing`: the video is only read."""
     from torchvision_dddas.sources import open_source
 
-    chain = Chain(name) if name != "nothing" else None
+    source = open_source(path)
+    chain = Chain(name, source.size, Path(graphs)) if name != "nothing" else None
     frames: list[np.ndarray] = []
-    for frame in open_source(path):
+    for frame in source:
         if chain is None:
             continue
         frames = [*frames[1 - chain.window :], frame.image] if chain.window > 1 else [frame.image]
         if len(frames) < chain.window:
             continue
-        if name == "plain":
+        if name in ("plain", STEP):
             chain.turn(frames, 0, 1)
         else:
             for _ in chain.loop.feed(frame):
@@ -233,6 +259,6 @@ def alone(name: str, path: str) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
+    if len(sys.argv) not in (3, 4):
         sys.exit(__doc__)
     alone(*sys.argv[1:])

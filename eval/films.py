@@ -11,6 +11,7 @@ from torchvision_dddas.sources import open_source
 
 Size = tuple[int, int]
 """Width and height, px."""
+SPOT_PX = 4
 
 
 def size_of(text: str) -> Size:
@@ -97,7 +98,7 @@ def peopled(frames: list[np.ndarray], count: int, seed: int = 0) -> list[np.ndar
     columns = int(np.ceil(np.sqrt(count * width / height)))
     rows = int(np.ceil(count / columns))
     cell = np.array([width / columns, height / rows])
-    side = np.minimum([width / 40, height / 40], 0.3 * cell).astype(int).clip(4)
+    side = np.minimum([width / 20, height / 15], 0.45 * cell).astype(int).clip(4)
     corners = [cell * (k % columns, k // columns) for k in range(count)]
     patches = [textured(rng, side) for _ in range(count)]
     phases = rng.uniform(0, 2, count)
@@ -106,7 +107,7 @@ def peopled(frames: list[np.ndarray], count: int, seed: int = 0) -> list[np.ndar
         picture = frame.copy()
         for corner, patch, phase in zip(corners, patches, phases, strict=True):
             room = cell - side - 2
-            # To and fro at an even pace: an eighth of the side a frame and more, at every size.
+            # To and fro at an even pace, the same share of the side at every size.
             gone = phase + number * max(side[0] / 4, 2) / max(room[0], 1)
             x, y = (corner + 1 + room * (abs((gone + 1) % 2 - 1), 0.5)).astype(int)
             picture[y : y + side[1], x : x + side[0]] = patch
@@ -115,6 +116,6 @@ def peopled(frames: list[np.ndarray], count: int, seed: int = 0) -> list[np.ndar
 
 
 def textured(rng: np.random.Generator, side: np.ndarray) -> np.ndarray:
-    """A patch of one colour with some texture, BGR."""
-    colour = rng.choice([40, 215], (1, 1, 3)) + rng.integers(-25, 25, (side[1], side[0], 1))
-    return np.clip(colour, 0, 255).astype(np.uint8)
+    """A patch of coarse spots, BGR: an even one would show at its edges alone."""
+    spots = rng.integers(30, 226, (-(-side[1] // SPOT_PX), -(-side[0] // SPOT_PX), 3), np.uint8)
+    return spots.repeat(SPOT_PX, axis=0).repeat(SPOT_PX, axis=1)[: side[1], : side[0]]

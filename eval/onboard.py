@@ -11,6 +11,7 @@ picture into docs/onboard.png, else they stay in FOLDER. --quick: few turns and 
 import argparse
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -36,6 +37,11 @@ def main() -> None:
         "live.json": ["live_latency.py", *options.data, *live, *short],
         "people.json": ["live_latency.py", "--sizes", "1280x720", "--people", "--rates", "10", *short],
     }
+    graphs = options.out / "graphs"
+    if find_spec("torch") and find_spec("onnxscript") and not options.quick:
+        make_graphs(graphs)
+    if graphs.exists():
+        studies["speed.json"] += ["--graphs", str(graphs)]
     for name, command in studies.items():
         measure(options.out / name, [*command, *first])
     tables = [str(options.out / name) for name in studies]
@@ -46,6 +52,14 @@ def main() -> None:
         places = ["--plot", str(options.out / "onboard.png")]
         subprocess.run([sys.executable, str(HERE / "onboard_tables.py"), *tables], check=True)
     subprocess.run([sys.executable, str(HERE / "onboard_tables.py"), *tables, *places], check=True)
+
+
+def make_graphs(folder: Path) -> None:
+    """The whole step as a graph for 640x480, unless it is there; where it cannot be made the rest goes on without."""
+    if not folder.exists():
+        command = [str(Path(sys.executable).with_name("dddas")), "export", "--graph", "step", "--out", str(folder)]
+        if subprocess.run(command, check=False).returncode:
+            print("no graph of the whole step: not compared", file=sys.stderr)
 
 
 def measure(path: Path, command: list[str]) -> None:

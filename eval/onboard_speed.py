@@ -1,7 +1,7 @@
 """What a frame costs on the vehicle: whole and stage by stage, against resolution, targets, memory and bandwidth.
 
 usage: python eval/onboard_speed.py [DATA...] [--parts chains targets memory] [--rounds 12] [--realtime]
-       [--json FILE]
+       [--graphs FOLDER] [--json FILE]
 
 chains: all chains beside the plain OpenCV chain at each of --sizes, the onboard ones at each of --ladder too; each
 size's chains take turns of eight frames through the same clip, so that whatever else the machine does meets them all.
@@ -29,24 +29,24 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 import machine
 import numpy as np
-from chains import CHAINS, ONBOARD, STAGES, Timed, available, lanes_of, quartiles, row, timed
+from chains import CHAINS, ONBOARD, STAGES, STEP, Timed, available, lanes_of, quartiles, row, timed
 from films import Size, clips, peopled, resized, scene, size_of, write_video
 from memory import measured
 
 SIZES, LADDER = ((640, 480), (1280, 720), (1920, 1080)), ((320, 240), (960, 540))
-TARGETS = (0, 10, 30, 100)
+TARGETS = (0, 10, 30, 60)
 FRAMES = 24
 LEAST_BYTES = {"prepare": 4, "register": 2, "foreground": 4, "targets": 2}
 """A pixel: colour read, grey written; two greys read; three greys read, mask written; mask read, targets written."""
 LARGE_MB, PARTS = 256, ("chains", "targets", "memory")
 
 
-def compared(frames: list[np.ndarray], chains: list[str], rounds: int) -> dict[str, Any]:
+def compared(frames: list[np.ndarray], chains: list[str], rounds: int, graphs: Path | None) -> dict[str, Any]:
     """All chains on one clip: {"chains": {name: figures}, "copy_gb_s": ..., "others": cores}."""
     others, large, held = machine.Others(), [], []
     height, width = frames[0].shape[:2]
     found: dict[str, Timed] = {}
-    for latest in timed(lanes_of(frames, chains, rounds), rounds):
+    for latest in timed(lanes_of(frames, chains, rounds), rounds, graphs):
         found = latest
         large.append(machine.copied_gb_s(LARGE_MB))
         held.append(machine.copied_gb_s(width * height / 1e6))
@@ -103,7 +103,7 @@ def by_targets(counts: list[int], chains: list[str], rounds: int, size: Size = (
     return {"size": list(size), "chains": rows, "others": others.cores()}
 
 
-def by_memory(sizes: list[Size], chains: list[str], count: int) -> dict[str, Any]:
+def by_memory(sizes: list[Size], chains: list[str], count: int, graphs: Path | None) -> dict[str, Any]:
     """{"WxH": {chain: {"peak_mb", "second_half_mb", "seconds"}}}: each chain in a process of its own."""
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -111,8 +111,10 @@ def by_memory(sizes: list[Size], chains: list[str], count: int) -> dict[str, Any
             video = Path(folder) / f"{width}x{height}.mp4"
             write_video(video, scene((width, height), FRAMES), count)
             rows = found[f"{width}x{height}"] = {}
-            for name in ("nothing", "plain", *chains):
-                rows[name] = measured([sys.executable, str(Path(__file__).with_name("chains.py")), name, str(video)])
+            held = [str(graphs)] if graphs is not None else []
+            for name in ("nothing", "plain", *available(chains, [(width, height)], graphs)):
+                command = [sys.executable, str(Path(__file__).with_name("chains.py")), name, str(video), *held]
+                rows[name] = measured(command)
                 print(f"  {width}x{height} {name:17} peak {rows[name]['peak_mb']:6.1f} MB", flush=True)
     return found
 
@@ -126,12 +128,16 @@ def main() -> None:
     parser.add_argument("--ladder", nargs="*", type=size_of, default=LADDER)
     parser.add_argument("--targets", nargs="*", type=int, default=TARGETS)
     parser.add_argument("--chains", nargs="*", help=f"of: {', '.join(CHAINS)}")
+    parser.add_argument(
+        "--graphs", type=Path, help="a folder by `dddas export --graph step`: its sizes are compared too"
+    )
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--frames", type=int, default=60, help="of the videos that memory is measured on")
     parser.add_argument("--realtime", action="store_true", help="go before all others (SCHED_RR); root")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    chains = available(options.chains or CHAINS)
+    graphs, wanted = options.graphs, options.chains or CHAINS
+    chains = [*available(wanted), *(name for name in wanted if name == STEP)]
     onboard = [name for name in chains if name in ONBOARD]
     sizes, ladder = list(options.sizes), list(options.ladder)
     report: dict[str, Any] = {"machine": machine.about(), "realtime": options.realtime, "rounds": options.rounds}
@@ -148,20 +154,22 @@ def main() -> None:
     if "chains" in options.parts:
         for size in sizes + ladder:
             name = f"scene {size[0]}x{size[1]}"
-            found = compared(scene(size, FRAMES), chains if size in sizes else onboard, options.rounds)
+            here = available(chains, [size], graphs) if size in sizes else onboard
+            found = compared(scene(size, FRAMES), here, options.rounds, graphs)
             told("scene", found)
             done("clips", {**report["clips"], name: found})
         for clip, frames in clips(options.data, []) if options.data else ():
             height, width = frames[0].shape[:2]
             for size in (s for s in sizes if s[0] <= width and s[1] <= height):
-                found = compared([resized(frame, size) for frame in frames], chains, options.rounds)
+                here = available(chains, [size], graphs)
+                found = compared([resized(frame, size) for frame in frames], here, options.rounds, graphs)
                 told(clip, found)
                 done("clips", {**report["clips"], f"{clip} {size[0]}x{size[1]}": found})
     if "targets" in options.parts:
         done("targets", by_targets(options.targets, onboard, options.rounds))
     if "memory" in options.parts:
         print("\nmemory, a process each:")
-        done("memory", by_memory(sizes, chains, options.frames))
+        done("memory", by_memory(sizes, chains, options.frames, graphs))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 import machine
 import report
-from chains import STAGES
+from chains import ONBOARD, STAGES
 from sim_runs import pyplot, table
 
 Figures = dict[str, Any]
@@ -26,6 +26,7 @@ COLOURS = {
     "onboard fast": "#448361",
     "onboard half": "#0b6e99",
     "onboard default": "#d9730d",
+    "graph step": "#37352f",
     "torch fast b1": "#b39ddb",
     "torch fast b8": "#6940a5",
     "torch default b1": "#e8a0bf",
@@ -86,7 +87,7 @@ def stages_table(speed: Figures) -> str:
     """Processor time of the stages, and how far they are from what memory allows."""
     rows, rates = [], []
     for clip, found in speed["clips"].items():
-        rates.append(f"{_title(clip)} {found['copy_gb_s']['large']:.1f}")
+        rates.append(f"{_title(clip)}: {found['copy_gb_s']['large']:.1f}")
         for name, figures in found["chains"].items():
             of = figures["stages"]
             cells = [f"{of[s]['processor_ms']:.2f} ({of[s]['processor_ms'] / of[s]['limit_ms']:.0f})" for s in STAGES]
@@ -100,7 +101,8 @@ def stages_table(speed: Figures) -> str:
     about += (
         "bytes that the stage must read and write at least once (4, 2, 4 and 2 a pixel), at the speed with which it "
     )
-    about += f"copied blocks of 256 MB between the turns (GB/s, reading and writing: {'; '.join(rates)}):"
+    about += f"copied blocks of 256 MB between the turns (GB/s, reading and writing: {'; '.join(rates)}); of "
+    about += "`graph step` the registration is in its foreground:"
     return f"{about}\n\n{table(['clip', 'chain', *STAGES, 'whole'], rows, words=2)}"
 
 
@@ -217,7 +219,7 @@ def _draw_ratios(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
 def _draw_sizes(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
     sizes = sorted(scenes, key=lambda s: s[0] * s[1])
     pixels = [w * h / 1e6 for w, h in sizes]
-    for name in (n for n in COLOURS if not n.startswith("torch")):
+    for name in ("plain", *ONBOARD):
         rows = [(p, scenes[s][name]) for p, s in zip(pixels, sizes, strict=True) if name in scenes[s]]
         if rows:
             at, middle = [p for p, _ in rows], [r["processor_ms"] for _, r in rows]
