@@ -30,6 +30,7 @@ class ImageSource:
     flicker. By default nine images spread over the clip are looked at, and it is the top of the smallest sensor (8, 10,
     12, 14 or 16 bits) that holds their brightest pixel. Brighter pixels elsewhere saturate, which is recorded once.
     The first image decides whether the clip is grey or colour; the others follow it.
+    tolerant: an image of another size or depth is left out.
     Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
     """
 
@@ -43,6 +44,7 @@ class ImageSource:
         self.rate_hz = rate_hz
         self.last = 0
         self.problems: list[Problem] = []
+        self.tolerant = False
         first = read_image(self.files[0])
         if first is None:
             raise InputError(f"the first image, {self.files[0]}, cannot be decoded; repair it or leave it out")
@@ -71,7 +73,8 @@ class ImageSource:
                     Problem(number, f"frame {number} ({file.name}) could not be decoded and was left out")
                 )
                 continue
-            self._check(image, file)
+            if not self._fits(image, number, file):
+                continue
             if self._depth == np.uint16:
                 if not saturated and image.max() > self.full_scale:
                     saturated = True
@@ -80,17 +83,19 @@ class ImageSource:
                 image = cv2.convertScaleAbs(image, alpha=255.0 / self.full_scale)
             yield Frame(number, (number - 1) / self.rate_hz, self._as_first(image))
 
-    def _check(self, image: np.ndarray, file: Path) -> None:
+    def _fits(self, image: np.ndarray, number: int, file: Path) -> bool:
+        what, all_must = "", ""
         if (size := (image.shape[1], image.shape[0])) != self.size:
-            raise InputError(
-                f"{file} is {size[0]}x{size[1]} but {self.files[0].name} is {self.size[0]}x{self.size[1]}; "
-                "all frames of a clip must have one size"
-            )
-        if image.dtype != self._depth:
-            raise InputError(
-                f"{file} holds {image.dtype} pixels but {self.files[0].name} {self._depth}; "
-                "all frames of a clip must have one depth"
-            )
+            what = f"{file} is {size[0]}x{size[1]} but {self.files[0].name} is {self.size[0]}x{self.size[1]}"
+            all_must = "all frames of a clip must have one size"
+        elif image.dtype != self._depth:
+            what = f"{file} holds {image.dtype} pixels but {self.files[0].name} {self._depth}"
+            all_must = "all frames of a clip must have one depth"
+        if what and not self.tolerant:
+            raise InputError(f"{what}; {all_must}")
+        if what:
+            self.problems.append(Problem(number, f"{what}: it was left out"))
+        return not what
 
     def _as_first(self, image: np.ndarray) -> np.ndarray:
         if self._grey == (image.ndim == 2):

@@ -31,13 +31,13 @@ class Stream(Protocol):
 
 
 class OpenedStream:
-    """A Stream through OpenCV. limit_s: an opening, or a read, that takes longer fails, where the driver heeds it.
+    """A Stream through OpenCV. limits_s: an opening, or a read, that takes longer fails, where the driver heeds it.
 
     Raises InputError: cannot be opened, is no video.
     """
 
-    def __init__(self, target: str | int, name: str, limit_s: float) -> None:
-        self._capture = open_capture(target, name, limit_s)
+    def __init__(self, target: str | int, name: str, limits_s: tuple[float, float]) -> None:
+        self._capture = open_capture(target, name, limits_s)
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
         self.rate_hz = float(rate_hz) if np.isfinite(rate_hz) and 0 < rate_hz <= 1000 else None
 
@@ -73,3 +73,8 @@ def first_picture(stream: Stream, name: str) -> np.ndarray:
         if (image := stream.retrieve()) is not None:
             return image
     raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection too poor")
+
+
+def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A picture brought to (width, height)."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -33,6 +33,7 @@ class VideoSource:
     gives one. Frames that cannot be decoded leave a gap in the numbers. A clip of constant rate is numbered by its time
     stamps, which stay true when a damaged stretch comes out short or out of order; other clips are numbered by
     counting. Time is the file's, a live stream's is the clock's.
+    tolerant: a frame of another size is left out.
     Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
     """
 
@@ -40,6 +41,7 @@ class VideoSource:
         self.name = name
         self.last = 0
         self.problems: list[Problem] = []
+        self.tolerant = False
         self._target = target
         self._live = isinstance(target, int) or "://" in target
         capture = self._open()
@@ -102,8 +104,8 @@ class VideoSource:
             if not decoded:
                 self.problems.append(Problem(number, _lost_words(number, number)))
                 continue
-            self._check(image, number)
-            yield Frame(number, time_s, image)
+            if self._fits(image, number):
+                yield Frame(number, time_s, image)
         # A count guessed from the duration means something only where the rate is constant.
         exact = self.exact
         if exact and self.count and self.count > number:
@@ -132,8 +134,8 @@ class VideoSource:
             start_s = start_s if number > 1 else time.monotonic()
             if not wanted:
                 continue
-            self._check(image, number)
-            yield Frame(number, time.monotonic() - start_s, image)
+            if self._fits(image, number):
+                yield Frame(number, time.monotonic() - start_s, image)
 
     def _patience(self, number: int) -> int:
         """Failed reads in a row that end the clip: as many as it still owes, and a few where it does not say."""
@@ -153,22 +155,24 @@ class VideoSource:
     def _open(self) -> cv2.VideoCapture:
         return open_capture(self._target, self.name)
 
-    def _check(self, image: np.ndarray, number: int) -> None:
-        if (size := (image.shape[1], image.shape[0])) != self.size:
-            raise InputError(
-                f"frame {number} of {self.name} is {size[0]}x{size[1]} but the first is {self.size[0]}x{self.size[1]}; "
-                "all frames of a clip must have one size"
-            )
+    def _fits(self, image: np.ndarray, number: int) -> bool:
+        if (size := (image.shape[1], image.shape[0])) == self.size:
+            return True
+        what = f"frame {number} of {self.name} is {size[0]}x{size[1]} but the first is {self.size[0]}x{self.size[1]}"
+        if not self.tolerant:
+            raise InputError(f"{what}; all frames of a clip must have one size")
+        self.problems.append(Problem(number, f"{what}: it was left out"))
+        return False
 
 
-def open_capture(target: str | int, name: str, limit_s: float | None = None) -> cv2.VideoCapture:
+def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | None = None) -> cv2.VideoCapture:
     """A file, a camera's index or a stream's address through OpenCV.
 
-    limit_s: opening a file or stream, and later reading from it, fails after so long; None: after FFmpeg's own 30 s.
+    limits_s: after which opening a stream, and later reading from it, fails; None: after FFmpeg's own 30 s.
     Raises InputError: cannot be opened, is no video.
     """
-    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC] if limit_s else []
-    given = [value for limit in limits for value in (limit, int(1000 * (limit_s or 0)))]
+    names = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+    given = [n for name, limit_s in zip(names, limits_s or (), strict=False) for n in (name, int(1000 * limit_s))]
     with quiet_opencv():
         # A camera needs the system's own driver; files and streams go to FFmpeg alone, because other back ends take
         # a numbered image or a text file for a video.

@@ -1,0 +1,116 @@
+"""Cameras that do what a test says, and time that passes as it says."""
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.live.clock import Clock
+
+# Nothing that a test waits for takes this long: a hang becomes a failure.
+PATIENCE_S = 30.0
+
+
+class FakeClock(Clock):
+    """Time that stands still but for the camera's thread, whose sleeps are over at once; `pass_s` moves it on."""
+
+    def __init__(self) -> None:
+        self.now_s, self.utc_ahead_s = 100.0, 1.7e9
+        self.slept_s: list[float] = []
+        self._waited: set[threading.Condition] = set()
+
+    def now(self) -> float:
+        return self.now_s
+
+    def utc(self) -> float:
+        return self.now_s + self.utc_ahead_s
+
+    def wait(self, changed: threading.Condition, seconds: float | None = None) -> None:
+        self._waited.add(changed)
+        if seconds is None or threading.current_thread() is threading.main_thread():
+            assert changed.wait(PATIENCE_S), "nothing happens any more"
+            return
+        self.slept_s.append(seconds)
+        self.now_s += seconds
+
+    def pass_s(self, seconds: float) -> None:
+        """Move on, and wake who waits."""
+        self.now_s += seconds
+        for changed in self._waited:
+            with changed:
+                changed.notify_all()
+
+
+def grey(level: int, width: int = 64, height: int = 48) -> np.ndarray:
+    return np.full((height, width, 3), level, np.uint8)
+
+
+class FakeStream:
+    """Plays a script: a picture, None (cannot be decoded), False (no picture came), or something to call first.
+
+    What is called may wait, move the clock, or raise; it is no read of its own.
+    """
+
+    def __init__(self, script: Iterable[Any], rate_hz: float | None = 25.0) -> None:
+        self.rate_hz = rate_hz
+        self.released = threading.Event()
+        self._script: Iterator[Any] = iter(script)
+        self._image: np.ndarray | None = None
+
+    def grab(self) -> bool:
+        for step in self._script:
+            if callable(step):
+                step()
+                continue
+            self._image = None if step is False else step
+            return step is not False
+        return False
+
+    def retrieve(self) -> np.ndarray | None:
+        return self._image
+
+    def release(self) -> None:
+        self.released.set()
+
+
+class Streams:
+    """An opener: one stream after the other; None is one that cannot be opened."""
+
+    def __init__(self, *streams: FakeStream | None) -> None:
+        self.streams, self.opened = streams, 0
+
+    def __call__(self) -> FakeStream:
+        stream = self.streams[self.opened] if self.opened < len(self.streams) else None
+        self.opened += 1
+        if stream is None:
+            raise InputError("cannot open it; is it there?")
+        return stream
+
+
+class Gate:
+    """Somewhere a camera's thread waits until the test lets it go on. reached: it is there."""
+
+    def __init__(self) -> None:
+        self.reached, self.open = threading.Event(), threading.Event()
+
+    def __call__(self) -> None:
+        self.reached.set()
+        assert self.open.wait(PATIENCE_S), "nobody opened the gate"
+
+
+def taken(frames: Iterator[Any], count: int) -> list[Any]:
+    return [next(frames) for _ in range(count)]
+
+
+def after(gate: Gate, what: Callable[[], object]) -> threading.Thread:
+    """Do something once the gate is reached, in a thread of its own."""
+
+    def act() -> None:
+        assert gate.reached.wait(PATIENCE_S)
+        what()
+
+    thread = threading.Thread(target=act)
+    thread.start()
+    return thread
