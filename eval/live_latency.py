@@ -1,7 +1,7 @@
 """How late results of `dddas run --live` are, at 10, 25 and 30 pictures a second, on one core and on two.
 
 usage: python eval/live_latency.py [DATA...] [--rates 10 25 30] [--cores 1 2] [--sizes 640x480] [--configs fast]
-       [--seconds 20] [--rounds 3] [--realtime] [--json FILE]
+       [--seconds 30] [--rounds 3] [--realtime] [--json FILE]
 
 Each run is a process of its own, held to so many cores (sched_setaffinity), which plays a video at its own rate as a
 camera would give it, decoding included; its lines of JSON are read from its standard output. Settings take turns over
@@ -10,12 +10,12 @@ the rounds; a figure is the median over the rounds, with the lowest and highest.
 - latency: from the capture of the newest picture read to the results that it settles (50, 95, 99 %), by the run itself;
 - age: from the capture of a picture to its own results, the pictures that it waits for included;
 - growth: how much later results come after a minute than before it, by a line through the ages but for those of the
-  first and the last second;
+  first and the last second; where less is looked at in the course of a run, pictures wait longer for the next ones;
 - dropped, left out on purpose, and late pictures (over live.deadline_ms); what was looked at when it ended;
 - processor time a picture, start to first result, peak memory (VmHWM);
-- waited: the share of the time in which a thread could have worked that another one had the core, of its own threads
-  too. How much of all cores others took meanwhile is told at the end: where that is much, and nothing was done about
-  it, the latencies are those of a busy machine.
+- waited: the share of the time in which the thread that looks at pictures could have worked that another one had the
+  core, the capture's too. How much of all cores others took meanwhile is told at the end: where that is much, and
+  nothing was done about it, the latencies are those of a busy machine.
 
 The video is the project's own scene; with DATA (videos, folders of pictures) these too. --realtime (root) puts the
 runs before all others that want their cores, and is told.
@@ -81,9 +81,10 @@ class Watched:
         except OSError:  # it is over
             return
 
-    def spent_s(self) -> tuple[float, float]:
-        """Seconds run and waited so far, of all threads."""
-        return tuple(sum(values) / 1e9 for values in zip(*self.threads.values(), strict=True)) or (0.0, 0.0)  # type: ignore[return-value]
+    def spent_s(self) -> np.ndarray:
+        """Seconds so far that all threads ran, that the main one ran, and that it had no core."""
+        main = self.threads.get(str(self.pid), (0, 0))
+        return np.array([sum(ran for ran, _ in self.threads.values()), *main]) / 1e9
 
     def end(self) -> None:
         """The process is about to be over."""
@@ -113,7 +114,7 @@ def one_run(video: Path, case: dict[str, Any], realtime: bool) -> dict[str, floa
         )
         watched = Watched(run.pid)
         assert run.stdout is not None
-        first_s, start, rows = math.nan, (0.0, 0.0), []
+        first_s, start, rows = math.nan, np.zeros(3), []
         giving_up = threading.Timer(case["seconds"] + PATIENCE_S, run.kill)
         giving_up.start()
         for row in _rows(run.stdout):
@@ -131,16 +132,16 @@ def one_run(video: Path, case: dict[str, Any], realtime: bool) -> dict[str, floa
         if code or not rows:
             raise SystemExit(f"{' '.join(command)} ended with {code}: {errors.read().strip()[-500:]}")
         record = json.loads(next(Path(out).glob("*/run.json")).read_text(encoding="utf-8"))
-    ran, waited = end[0] - start[0], end[1] - start[1]
+    in_all, ran, waited = end - start
     counts, gauges = record["counts"], record["gauges"]
     seconds = {name: record["seconds"].get(name, {}) for name in ("latency", "age")}
     return {
         **{f"{name}_{p}_ms": 1e3 * values.get(p, math.nan) for name, values in seconds.items() for p in _PERCENTILES},
         **from_rows(rows),
-        "processor_ms": 1e3 * ran / max(counts.get("captured", 0), 1),
+        "processor_ms": 1e3 * float(in_all) / max(counts.get("captured", 0), 1),
         "first_result_s": first_s,
         "peak_mb": watched.peak_mb,
-        "waited": waited / max(ran + waited, 1e-9),
+        "waited": float(waited / max(ran + waited, 1e-9)),
         **{name: float(counts.get(name, 0)) for name in ("captured", "dropped", "late", "results")},
         **{name: float(gauges.get(name, math.nan)) for name in ("every", "keypoints")},
     }
@@ -215,7 +216,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", type=size_of, default=[(640, 480)])
     parser.add_argument("--configs", nargs="*", default=["fast"])
     parser.add_argument("--people", action="store_true", help="search for people too")
-    parser.add_argument("--seconds", type=float, default=20, help="of each run; 20")
+    parser.add_argument("--seconds", type=float, default=30, help="of each run; 30")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--realtime", action="store_true", help="before all others (SCHED_RR); root")
     parser.add_argument("--json", type=Path)
