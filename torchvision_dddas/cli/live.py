@@ -47,7 +47,7 @@ def run_live(
     """
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.keeping import Keeping
-    from torchvision_dddas.live.runner import Failing, Feed, results, told
+    from torchvision_dddas.live.runner import Failing, Feed, hand_on, results, told
     from torchvision_dddas.live.serving import Page, Serving, address_of
     from torchvision_dddas.live.stopping import Stopping
     from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
@@ -75,9 +75,11 @@ def run_live(
         streams = (
             _closing(opened, open_streams(own, said, health.event, live.retry_s, live.retry_most_s, "--out")) + streams
         )
+        log = SessionLog(folder, _facts(clip, ready, given, telemetry, source, interval, people))
+        stack.callback(log.close)
         keeping = Keeping(
             health,
-            SessionLog(folder, _facts(clip, ready, given, telemetry, source, interval, people)),
+            log,
             streams,
             live.status_s,
             (lambda event: None) if quiet else _say,
@@ -103,8 +105,7 @@ def run_live(
         try:
             for result in results(begin, feed, health):
                 said.start_utc_s = source.start_utc_s
-                for stream in streams:
-                    stream.write(*result)
+                hand_on(result, streams, health)
                 told(result, feed, health, live.deadline_ms)
             keeping.state = "complete" if stopping.signal is None else "stopped"
         except Failing as error:
@@ -125,6 +126,7 @@ def _path(
     from torchvision_dddas.live.shedding import Shedding
     from torchvision_dddas.settings import with_knobs
     from torchvision_dddas.surveying import survey
+    from torchvision_dddas.vision import load
 
     settings, recognizer = ready.settings, None
     if people:
@@ -136,7 +138,11 @@ def _path(
         Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
     shedding = Shedding(source, settings, health, people)
 
+    visions = iter([ready.vision])
+
     def begin(feed: "Feed") -> "Iterator[Result]":
+        # After an error nothing that remembers a frame is trusted.
+        vision = next(visions, None) or load(backend, shedding.settings)
         spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
         watch = None if ready.watch is None else ready.watch.anew()
 
@@ -147,7 +153,7 @@ def _path(
             return settings, moved
 
         seen = None if spotter is None else spotter.see
-        path = survey(feed, ready.vision, shedding.settings, None, watch, interval, seen=seen, retune=retune)
+        path = survey(feed, vision, shedding.settings, None, watch, interval, seen=seen, retune=retune)
         for surveyed in path:
             yield surveyed, None if spotter is None else spotter.of(surveyed.followed.number, feed.ended)
 

@@ -168,4 +168,13 @@ def trouble_of(now: Snapshot, patience_s: float, hung: str = "") -> str:
 
 def health_json(state: Mapping[str, Any], trouble: str) -> str:
     """The state of the run, and whether it is as it should be."""
-    return json.dumps({"ok": not trouble, "trouble": trouble, **state}, indent=2) + "\n"
+    return json.dumps(_finite({"ok": not trouble, "trouble": trouble, **state}), indent=2) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    """Numbers that JSON does not have are null."""
+    if isinstance(value, Mapping):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -25,7 +25,18 @@ class LiveFrames(Protocol):
     size: tuple[int, int]
     last: int
 
-    def __iter__(self) -> Iterator[Frame]: ...
+    def __iter__(self) -> Iterator[Frame]:
+        """A further iteration goes on where the one before ended."""
+        ...
+
+
+class Stream(Protocol):
+    """Where results go; see sinks.streams."""
+
+    name: str
+
+    def write(self, surveyed: Surveyed | None, people: Followed | None = None) -> None:
+        """Send a frame."""
 
 
 class Failing(Exception):
@@ -43,24 +54,17 @@ class Feed:
     exact = False
 
     def __init__(
-        self,
-        source: LiveFrames,
-        health: Health,
-        watchdog: Watchdog,
-        telemetry: Telemetry | None = None,
-        after: Callable[[Frame, float], object] = lambda frame, spent_s: None,
+        self, source: LiveFrames, health: Health, watchdog: Watchdog, telemetry: Telemetry | None = None
     ) -> None:
-        """after: called with each frame and the seconds that the work on it took."""
+        """telemetry: where its silence is to be told."""
         self.name, self.rate_hz, self.size = source.name, source.rate_hz, source.size
         self.problems: list[object] = []
         self.newest: Frame | None = None
         self.ended = False
         self.telemetry = None if telemetry is None else lambda: telemetry
-        self._source, self._health, self._watchdog, self._after = source, health, watchdog, after
+        self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._log, self._silent = telemetry, False
-        self._began_s = 0.0
-        self._working = False
         self._first = True
 
     @property
@@ -70,12 +74,13 @@ class Feed:
 
     def anew(self) -> None:
         """Whoever iterates next has seen nothing so far."""
-        self._done()
+        self._watchdog.done()
+        self._frames = iter(self._source)  # what broke may have been the source's own iteration
         self._first = True
 
     def __iter__(self) -> Iterator[Frame]:
         while not self.ended:
-            self._done()
+            self._watchdog.done()
             frame = next(self._frames, None)
             if frame is None:
                 self.ended = True
@@ -85,7 +90,6 @@ class Feed:
                 frame, self._first = replace(frame, skipped=frame.number - 1), False
             self._listen(frame)
             self.newest = frame
-            self._began_s, self._working = time.monotonic(), True
             self._watchdog.begin(frame.number)
             yield frame
 
@@ -93,20 +97,12 @@ class Feed:
         """No further frame is taken; what was seen is still settled."""
         self.ended = True
 
-    def _done(self) -> None:
-        if not self._working:
-            return
-        self._working = False
-        self._watchdog.done()
-        spent_s = time.monotonic() - self._began_s
-        assert self.newest is not None
-        self._after(self.newest, spent_s)
-
     def _listen(self, frame: Frame) -> None:
         """Say when the telemetry falls silent, and when it speaks again."""
         if self._log is None:
             return
-        silent = at(self._log, frame.time_s) is None
+        flight = at(self._log, frame.time_s)
+        silent = flight is None or not isfinite(flight.altitude_m)
         if silent != self._silent:
             self._silent = silent
             words = "silent: the altitude is not known any more" if silent else "there again"
@@ -167,6 +163,16 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
             return
         feed.anew()
         renumbered.anew()
+
+
+def hand_on(result: Result, streams: Iterable[Stream], health: Health) -> None:
+    """To all streams; what one of them cannot write is left out of it, and told."""
+    for stream in streams:
+        try:
+            stream.write(*result)
+        except Exception as error:
+            number = result[0].followed.number
+            health.event("sink", f"{stream.name}: left out, {type(error).__name__}: {error} ({_where(error)})", number)
 
 
 def told(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:

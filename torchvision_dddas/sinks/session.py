@@ -4,8 +4,10 @@ results.jsonl grows by a line a frame, events.log by a line an event, run.json i
 """
 
 import json
+import os
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
@@ -54,14 +56,19 @@ class SessionLog:
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         self.folder, self.facts = folder, facts
-        # Line by line: a line is written at once and whole.
-        self._events = (folder / EVENTS).open("ab", buffering=0)
+        self._events = os.open(folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
 
     def tell(self, events: Iterable[Told]) -> None:
         """Append events, a line each: UTC time, frame or -, kind, words."""
         lines = "".join(f"{stamp(e.utc_s)} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n" for e in events)
-        if lines:
-            self._events.write(lines.encode())
+        size, rest = os.fstat(self._events).st_size, lines.encode()
+        try:
+            while rest:
+                rest = rest[os.write(self._events, rest) :]
+        except OSError:
+            with suppress(OSError):  # what a full disk broke off comes again whole
+                os.ftruncate(self._events, size)
+            raise
 
     def state(self, state: str, now: dict[str, Any]) -> None:
         """Replace run.json. state: running, complete, stopped or failed."""
@@ -70,7 +77,7 @@ class SessionLog:
 
     def close(self) -> None:
         """Nothing follows."""
-        self._events.close()
+        os.close(self._events)
 
 
 def stamp(utc_s: float) -> str:

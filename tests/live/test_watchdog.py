@@ -1,0 +1,123 @@
+"""Steps that hang, and what a supervisor hears."""
+
+import socket
+
+import pytest
+
+from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.watchdog import Supervisor, Watchdog
+
+
+class Case:
+    """A watchdog with a clock of its own. ended: with what words the process would have been."""
+
+    def __init__(self, hung_s=10.0, supervisor=None):
+        self.now_s, self.ended, self.health = 0.0, [], Health()
+        self.dog = Watchdog(self.health, hung_s, supervisor, self.ended.append, lambda: self.now_s)
+
+    def at(self, now_s):
+        self.now_s = now_s
+        self.dog.look()
+
+    @property
+    def told(self):
+        return [(event.kind, event.frame) for event in self.health.snapshot().events]
+
+
+def test_a_step_that_hangs_is_told_once_and_ended_after_twice_as_long():
+    case = Case()
+    case.dog.begin(7)
+    case.at(10.0)
+    assert case.told == []
+    case.at(11.0)
+    case.at(19.0)
+    assert case.told == [("watchdog", 7)]
+    assert "frame 7" in case.dog.hung
+    assert not case.ended
+    case.at(20.5)
+    assert len(case.ended) == 1
+    assert "frame 7 has taken 20 s" in case.ended[0]
+
+
+def test_a_step_that_ends_late_is_forgiven_and_the_next_one_told_again():
+    case = Case()
+    case.dog.begin(1)
+    case.at(11.0)
+    case.dog.done()
+    case.at(30.0)
+    assert case.dog.hung == ""
+    case.dog.begin(2)
+    case.at(41.0)
+    assert case.told == [("watchdog", 1), ("watchdog", 2)]
+    assert not case.ended
+
+
+def test_waiting_for_pictures_never_counts_as_hung():
+    case = Case()
+    case.dog.begin(1)
+    case.dog.done()
+    case.at(1e6)
+    assert case.told == []
+    assert not case.ended
+
+
+def test_zero_lets_steps_take_as_long_as_they_want():
+    case = Case(hung_s=0.0)
+    case.dog.begin(1)
+    case.at(1e6)
+    assert case.told == []
+    assert not case.ended
+
+
+@pytest.fixture
+def heard(tmp_path):
+    """A supervisor's socket: heard() gives what was said to it."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
+        way.bind(str(tmp_path / "notify"))
+        way.setblocking(False)
+
+        def words():
+            said = []
+            while True:
+                try:
+                    said.append(way.recv(4096).decode())
+                except BlockingIOError:
+                    return said
+
+        words.path = str(tmp_path / "notify")
+        yield words
+
+
+def test_a_supervisor_hears_that_all_is_well_while_it_is(heard):
+    case = Case(supervisor=Supervisor({"NOTIFY_SOCKET": heard.path, "WATCHDOG_USEC": "8000000"}))
+    case.dog.begin(1)
+    for now_s in (0.0, 1.0, 2.0, 3.0, 4.0):
+        case.at(now_s)
+    assert heard() == ["WATCHDOG=1"] * 3
+    case.at(11.0)
+    case.at(15.0)
+    assert heard() == []
+    case.dog.done()
+    case.at(16.0)
+    assert heard() == ["WATCHDOG=1"]
+
+
+def test_a_supervisor_hears_words(heard):
+    Supervisor({"NOTIFY_SOCKET": heard.path}).say("READY=1", "STATUS=well")
+    assert heard() == ["READY=1\nSTATUS=well"]
+
+
+@pytest.mark.parametrize(
+    "environ",
+    [{}, {"NOTIFY_SOCKET": "/nowhere/at/all"}, {"NOTIFY_SOCKET": "@nobody-is-there"}, {"WATCHDOG_USEC": "1000"}],
+)
+def test_where_nobody_listens_nothing_is_raised(environ):
+    Supervisor(environ).say("READY=1")
+
+
+@pytest.mark.parametrize(
+    ("more", "every_s"), [({}, 1.0), ({"WATCHDOG_PID": "1"}, 0.0), ({"WATCHDOG_USEC": "never"}, 0.0)]
+)
+def test_only_the_process_that_is_meant_answers_the_watchdog(more, every_s):
+    environ = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "2000000", **more}
+    assert Supervisor(environ).every_s == every_s
