@@ -37,7 +37,10 @@ class Clip(Protocol):
 
 
 def _blank(view: View) -> bool:
-    return float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
+    if "blank" not in view.kept:  # asked as the later frame of one step and the earlier of the next
+        view.kept["blank"] = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
+    blank: bool = view.kept["blank"]
+    return blank
 
 
 def _memory(settings: Settings) -> int:
@@ -433,6 +436,8 @@ class Loop:
 
     def _small_targets(self, index: int, found: list[Found]) -> list[Found]:
         """Confirmed small tracks seen in this frame, where no other target covers them."""
+        if not self.settings.small.on:
+            return []
         near = range(max(index - 2, self.first), min(index + 3, self.observed))
         blobs = [len(o.blobs) for i in near if (o := self._at(i).observation) is not None]
         misses = [step.error_px for i in near if (step := self._at(i).step) is not None]

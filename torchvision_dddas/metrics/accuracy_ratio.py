@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Int
 
 
 def accuracy_ratio(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray, "N"]]) -> float:

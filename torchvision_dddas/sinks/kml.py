@@ -1,7 +1,7 @@
 """Tracks and error ellipses as KML 2.2, with times where a clock is known."""
 
+from html import escape
 from itertools import pairwise
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def kml(
 def plain(text: str) -> str:
     """A text as XML holds it: escaped, without the control characters that XML has no way to write."""
     kept = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff" and c < "\ufffe"))
-    return escape(kept, {'"': "&quot;"})
+    return escape(kept, quote=False).replace('"', "&quot;")
 
 
 def _style(name: str, colour: tuple[int, int, int]) -> str:

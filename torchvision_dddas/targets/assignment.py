@@ -1,14 +1,14 @@
 """Who is who between two or three frames: one-to-one assignment of the largest total score (appendix C, eq. 1-3).
 
-Two frames are solved by SciPy. Three frames in which a gate left few triplets: see `columns`. Three frames with the
+Two frames: see `matching`. Three frames in which a gate left few triplets: see `columns`. Three frames with the
 source's dummy targets and any triplet possible: exactly here, to within a gap in `relaxation`.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Float, Int
+from torchvision_dddas.targets.matching import cheapest
 from torchvision_dddas.targets.relaxation import triplets
 
 
@@ -25,7 +25,7 @@ def pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.ndarray
         raise InputError("pairs needs scores below infinity; got NaN or +inf. Forbid a pair with -inf.")
     # Forbidden and useless pairs gain nothing, as staying alone does: so a full matching always exists.
     gain = np.where(score > max(least, 0.0), score, 0.0)
-    row, column = linear_sum_assignment(gain, maximize=True)
+    row, column = cheapest(-gain)
     used = gain[row, column] > 0
     return np.stack([row[used], column[used]], axis=1).astype(np.int64)
 

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.settings import LandmarkKnobs
 from torchvision_dddas.targets.colours import Patches
+from torchvision_dddas.targets.matching import cheapest
 from torchvision_dddas.targets.projective import transfer
 
 # What speaks for a patch, in logarithms of its area: something moves at it; it has travelled over the ground; it is the
@@ -122,7 +122,7 @@ class Candidates:
         apart = np.linalg.norm(before[:, None] - found.centre_px[rows][None], axis=2) / gate[:, None]
         change = np.log(found.area_px[rows][None] / np.array([one.area_px for one in self._all])[:, None])
         cost = np.where(apart <= 1, apart + 0.3 * np.abs(change), 100.0)
-        pairs = zip(*linear_sum_assignment(cost), strict=True)
+        pairs = zip(*cheapest(cost), strict=True)
         return {id(self._all[i]): int(rows[j]) for i, j in pairs if cost[i, j] < 100}
 
     def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:

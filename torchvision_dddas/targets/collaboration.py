@@ -13,9 +13,9 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from torchvision_dddas.settings import ConfirmKnobs, GroundKnobs, PeopleKnobs
+from torchvision_dddas.shapes import Bool, Float
 from torchvision_dddas.targets.boxes import shared_px
 from torchvision_dddas.targets.scan import smallest_body_px
 from torchvision_dddas.types import Camera

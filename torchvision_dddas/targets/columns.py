@@ -5,14 +5,15 @@ others, fall into groups that are solved one by one: small ones by trying, with 
 linear programming, and where that leaves fractions by integer programming (HiGHS).
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csc_array
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Bool, Float, Int
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
 
 # A group with no more columns than this is tried first, and given to HiGHS after so many steps: fewer, and HiGHS, whose
 # call alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
@@ -64,7 +65,7 @@ def fractions(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) ->
 
 
 def _programmed(
-    incidence: csc_array, gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"], most_branches: int | None
+    incidence: "csc_array", gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"], most_branches: int | None
 ) -> tuple[Bool[np.ndarray, "C"], bool]:
     """Linear first: it is integral in most windows; integers only for the groups where it is not."""
     solution, certain = _solve(incidence, gain)
@@ -77,9 +78,11 @@ def _programmed(
 
 
 def _solve(
-    incidence: csc_array, gain: Float[np.ndarray, "C"], integral: bool = False, **options: int
+    incidence: "csc_array", gain: Float[np.ndarray, "C"], integral: bool = False, **options: int
 ) -> tuple[Float[np.ndarray, "C"], bool]:
     """How much of each column the best choice takes, whole ones if `integral`; and whether it is certainly the best."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # here, as it takes half a second and 45 MB
+
     # Presolving costs more than it saves where the linear programme is the whole work.
     settings: Any = {"mip_rel_gap": 0.0, "presolve": integral, **options}
     solved = milp(
@@ -192,8 +195,10 @@ def _prices(held: list[list[int]], gain: list[float]) -> dict[int, float]:
     return dict(zip(price, level.tolist(), strict=True))
 
 
-def _incidence(columns: Int[np.ndarray, "C 3"]) -> csc_array:
+def _incidence(columns: Int[np.ndarray, "C 3"]) -> "csc_array":
     """Which nodes, numbered over all layers, each column holds."""
+    from scipy.sparse import csc_array
+
     there = columns >= 0
     names = (columns * 3 + np.arange(3))[there]
     known, nodes = np.unique(names, return_inverse=True)

@@ -5,8 +5,8 @@ here, not in pixels of a closing kernel, so that it is the same at every altitud
 """
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.types import Detections
 
 

@@ -2,8 +2,8 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
 
+from torchvision_dddas.shapes import Bool, Float
 from torchvision_dddas.targets.blobs import parts_of
 from torchvision_dddas.types import Detections
 

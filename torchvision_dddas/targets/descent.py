@@ -5,8 +5,8 @@ the first layer may be used more than once, or never: it is then too cheap, or t
 """
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.prices import matched
 
 # Steps as a share of Polyak's, shrunk after so many that found no lower bound in a row.

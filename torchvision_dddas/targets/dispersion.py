@@ -3,11 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import squareform
 
 from torchvision_dddas.settings import PaperKnobs
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.jaccard import similarity
 
 
@@ -15,6 +13,9 @@ def clusters(dissimilarity: Float[np.ndarray, "N N"], cut: float) -> Int[np.ndar
     """A number for each target: average linkage, the tree cut at a dissimilarity (eq. 10 and G)."""
     if len(dissimilarity) < 2:
         return np.ones(len(dissimilarity), np.int64)
+    from scipy.cluster.hierarchy import fcluster, linkage  # here, as only the source's association needs them
+    from scipy.spatial.distance import squareform
+
     tree = linkage(squareform(dissimilarity, checks=False), "average")
     return fcluster(tree, cut, "distance").astype(np.int64)
 

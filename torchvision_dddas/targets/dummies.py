@@ -5,9 +5,9 @@ dummy is worth nothing, and the source's problem is to choose triplets that shar
 """
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Float, Int
 
 
 def checked_scores(score: Float[np.ndarray, "N1 M1 L1"]) -> Float[np.ndarray, "N1 M1 L1"]:

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.types import Elevation
 
 

@@ -3,8 +3,8 @@
 from dataclasses import fields, replace
 
 import numpy as np
-from jaxtyping import Bool
 
+from torchvision_dddas.shapes import Bool
 from torchvision_dddas.targets.pose import HEADING, Expected, Solution, fit_pose, moved
 from torchvision_dddas.targets.projection import lifted, rays
 from torchvision_dddas.targets.rotation import turned

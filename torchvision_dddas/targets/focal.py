@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Bool, Float
 
 OUTLIER = 3.5
 """A measurement is an outlier so many robust standard deviations from the median, or SURE of it where that is more."""

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.assignment import pairs
 from torchvision_dddas.types import Sightings
 

@@ -3,7 +3,8 @@
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+
+from torchvision_dddas.shapes import Float
 
 Reading = Literal["one_dummy", "every_dummy", "off"]
 

@@ -7,8 +7,8 @@ the origin: a kilometre from it they are 5 cm above the ground, and less than a 
 from collections.abc import Callable
 
 import numpy as np
-import pymap3d
-from jaxtyping import Float
+
+from torchvision_dddas.shapes import Float
 
 Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
 """Longitude and latitude."""
@@ -23,6 +23,7 @@ _PART = 1 << 14
 
 def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """Metres east and north of an origin, both as (longitude, latitude)."""
+    import pymap3d  # here, as most runs have places in metres, or none
 
     def of_part(lonlat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
@@ -33,6 +34,7 @@ def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, fl
 
 def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """(longitude, latitude) of local metres."""
+    import pymap3d
 
     def of_part(metres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         latitude, longitude, _ = pymap3d.enu2geodetic(

@@ -1,8 +1,8 @@
 """Pixels laid on the ground by the rays of a camera of known pose, with the errors of the pose and of the pixels."""
 
 import numpy as np
-from jaxtyping import Float
 
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets.projection import slopes_of_lift
 from torchvision_dddas.targets.rotation import cross
 from torchvision_dddas.targets.surface import Surface, met_surface

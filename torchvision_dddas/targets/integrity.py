@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Int
-from scipy.optimize import linear_sum_assignment
-from scipy.special import chdtrc, chdtri
 
+from torchvision_dddas.shapes import Bool, Int
+from torchvision_dddas.targets.chi_square import chance_above
 from torchvision_dddas.targets.first_pose import find_pose
+from torchvision_dddas.targets.matching import cheapest
 from torchvision_dddas.targets.pose import Expected, Solution, moved
 from torchvision_dddas.targets.projection import project_with_slopes
 from torchvision_dddas.types import Camera, Marks
@@ -70,7 +70,7 @@ def passes(solution: Solution | None, probability: float) -> bool:
     """Whether a pose explains the landmarks: one that could be no other always does."""
     if solution is None:
         return False
-    return solution.freedom <= 0 or bool(solution.cost <= chdtri(solution.freedom, 1 - probability))
+    return solution.freedom <= 0 or chance_above(solution.freedom, solution.cost) >= 1 - probability
 
 
 def judge(
@@ -104,7 +104,7 @@ def judge(
                 continue
             solution = find_pose(reordered(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
-                tried.append((float(chdtrc(solution.freedom, solution.cost)), solution, order, used))
+                tried.append((chance_above(solution.freedom, solution.cost), solution, order, used))
         if tried:
             _, solution, order, used = max(tried, key=lambda one: one[0])
             return Verdict(solution, order, used, _words(order, used, first, names))
@@ -174,7 +174,7 @@ def _assigned(marks: Marks, camera: Camera, expected: Expected) -> np.ndarray | 
         return None
     apart = marks.image_px - marks.image_px.mean(axis=0), seen - seen.mean(axis=0)
     distance = np.linalg.norm(apart[1][:, None] - apart[0][None], axis=2)
-    return linear_sum_assignment(distance**2)[1]
+    return cheapest(distance**2)[1]
 
 
 def _spread_out(marks: Marks) -> bool:
@@ -219,7 +219,7 @@ def _best_first(hypotheses: list[Hypothesis], marks: Marks, camera: Camera, expe
         cost = missing @ pull
         if len(out):
             cost -= pull[out] @ np.linalg.solve(kept[np.ix_(out, out)], pull[out])
-        score.append(chdtrc(2 * int(used.sum()), max(float(cost), 0.0)) - 1e-9 * float(cost))
+        score.append(chance_above(2 * int(used.sum()), max(float(cost), 0.0)) - 1e-9 * float(cost))
     for row in np.argsort(score)[::-1][:FITTED]:
         yield hypotheses[row]
 

@@ -7,8 +7,8 @@ each axis, of which `dummy` says what it is like.
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.distance import cdist
+
+from torchvision_dddas.shapes import Float
 
 Dummy = Literal["zero", "formula"]
 
@@ -57,6 +57,8 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Σ min and Σ max of each pair: min + max = a + b and max - min = |a - b|."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
+    from scipy.spatial.distance import cdist  # here, as only the source's association needs it
+
     total = a.sum(axis=1)[:, None] + b.sum(axis=1)[None]
     apart = cdist(a, b, "cityblock")
     return np.maximum(total - apart, 0.0) / 2, (total + apart) / 2

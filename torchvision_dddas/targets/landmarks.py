@@ -8,11 +8,11 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.settings import LandmarkKnobs
 from torchvision_dddas.targets.candidates import Candidates
 from torchvision_dddas.targets.colours import patches_of
+from torchvision_dddas.targets.matching import cheapest
 from torchvision_dddas.targets.projective import transfer
 from torchvision_dddas.targets.ranging import touches_border
 from torchvision_dddas.targets.touching import beside, centres_of, covering, inside
@@ -53,7 +53,7 @@ def separate(
         return match
     # One pair more is worth more than any saving of distance.
     missing = 1.0 + knobs.reach_px * (min(distance.shape) + 1)
-    rows, columns = linear_sum_assignment(np.where(within, distance, missing))
+    rows, columns = cheapest(np.where(within, distance, missing))
     good = within[rows, columns]
     match[rows[good]] = columns[good]
     return match

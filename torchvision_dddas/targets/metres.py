@@ -5,7 +5,8 @@ the pixel; what the camera's pose puts on all places of a frame alike moves slow
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+
+from torchvision_dddas.shapes import Float, Int
 
 ACCELERATION_M_S2 = 0.5
 """Of people and vehicles, from second to second."""

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PaperKnobs, Settings
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets import assignment, jaccard, relaxation
 from torchvision_dddas.targets.dispersion import dispersion, location_weight, of_window
 from torchvision_dddas.targets.gating import gate

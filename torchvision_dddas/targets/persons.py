@@ -1,9 +1,9 @@
 """From windows that score to people: one box each, drawn around the body, with a probability."""
 
 import numpy as np
-from jaxtyping import Float
 
 from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets.suppress import group, nms, settled
 from torchvision_dddas.types import People
 

@@ -8,8 +8,8 @@ belongs; here it has its place. With a pose of the camera pixels are laid on the
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float
 
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets.geodesy import lonlat
 from torchvision_dddas.targets.ground_rays import by_rays
 from torchvision_dddas.targets.projection import inverse_2x2, unbent

@@ -9,9 +9,9 @@ of some. Levenberg and Marquardt's steps find the least sum of squares; its inve
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from torchvision_dddas.settings import AerialKnobs
+from torchvision_dddas.shapes import Bool, Float
 from torchvision_dddas.targets.projection import axes_of, project_with_slopes
 from torchvision_dddas.targets.rotation import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import Camera, CameraPose, Flight, Marks

@@ -9,8 +9,8 @@ the targets left alone. So a triplet that loses more than bound - value is in no
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
+
+from torchvision_dddas.shapes import Float, Int
 
 Prices = tuple[Float[np.ndarray, "N1"], Float[np.ndarray, "M1"], Float[np.ndarray, "L1"]]
 # The two layers beside each.
@@ -100,6 +100,8 @@ def matched(
     best: Float[np.ndarray, "A B"],
 ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "A0 B0"], Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
     """What the targets of two layers gain without each other, what pairs gain above that, and the best pairs."""
+    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+
     first, second = np.maximum(best[1:, 0], 0.0), np.maximum(best[0, 1:], 0.0)
     excess = np.maximum(best[1:, 1:] - first[:, None] - second, 0.0)
     row, column = linear_sum_assignment(excess, maximize=True)

@@ -7,8 +7,8 @@ clockwise about forward. The lens bends a radius r to r (1 + k1 r² + k2 r⁴), 
 """
 
 import numpy as np
-from jaxtyping import Float
 
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.types import Camera, CameraPose
 
 NEAREST = 1e-6

@@ -1,6 +1,7 @@
 """Plane homographies on NumPy points, in float64."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -8,7 +9,9 @@ import numpy as np
 def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
     """(N, 2) points through a (3, 3) homography. A point on the horizon goes to infinity, not to an error."""
     points = np.asarray(points_px, np.float64).reshape(-1, 2)
-    mapped = np.c_[points, np.ones(len(points))] @ to_from.T
+    homogeneous = np.ones((len(points), 3))
+    homogeneous[:, :2] = points
+    mapped = homogeneous @ to_from.T
     with np.errstate(divide="ignore", invalid="ignore"):
         return mapped[:, :2] / mapped[:, 2:]
 
@@ -24,10 +27,14 @@ def chain(steps: Sequence[np.ndarray]) -> np.ndarray:
 
 def background_flow(later_from_earlier: np.ndarray, size: tuple[int, int], samples: int = 9) -> float:
     """Median displacement in pixels of a grid of points over a (width, height) image."""
-    width, height = size
-    u, v = np.meshgrid(np.linspace(0, width - 1, samples), np.linspace(0, height - 1, samples))
-    grid = np.c_[u.ravel(), v.ravel()]
+    grid = _grid(size, samples)
     return float(np.median(np.linalg.norm(transfer(later_from_earlier, grid) - grid, axis=1)))
+
+
+@lru_cache(maxsize=4)
+def _grid(size: tuple[int, int], samples: int) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(0, size[0] - 1, samples), np.linspace(0, size[1] - 1, samples))
+    return np.c_[u.ravel(), v.ravel()]
 
 
 def corner_error(a: np.ndarray, b: np.ndarray, size: tuple[int, int]) -> float:

@@ -17,10 +17,10 @@ What the source does not do: D is the depth along the optical axis, and the way 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import GroundKnobs
+from torchvision_dddas.shapes import Bool, Float
 from torchvision_dddas.targets.projection import straight
 from torchvision_dddas.types import Camera, Poses, Sightings
 

@@ -12,8 +12,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.columns import good_columns, least_loss
 from torchvision_dddas.targets.descent import Shortlist
 from torchvision_dddas.targets.dummies import checked_scores, gain_over_alone, with_the_rest_alone

@@ -8,8 +8,8 @@ are carried on, moved together with it, until there are as many blobs again.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.assignment import pairs
 
 # A crowd is this far off where it is expected: at once, by its own radius, and for each second that it was not seen.

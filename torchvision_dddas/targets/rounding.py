@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
+from torchvision_dddas.shapes import Bool, Float, Int
 from torchvision_dddas.targets.columns import fractions
 from torchvision_dddas.targets.prices import OTHERS, Prices
 
@@ -67,6 +66,8 @@ def reassigned(
     gain: Float[np.ndarray, "N1 M1 L1"], pairs: Int[np.ndarray, "P 2"], layer: int
 ) -> Int[np.ndarray, "Z 3"]:
     """The best choice of triplets that holds these pairs of the other two layers, or their targets alone."""
+    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+
     pairs = pairs[(pairs > 0).all(axis=1)]
     rows = []
     for side, other in enumerate(OTHERS[layer]):

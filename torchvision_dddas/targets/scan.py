@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.types import Part
 
 

@@ -8,10 +8,9 @@ the camera's. People of different heights average out; the scale is that of the 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets.ranging import level
 from torchvision_dddas.types import Camera
 
@@ -72,6 +71,8 @@ def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: floa
             f"most feet lie within {high - low:.0f} rows of the picture, which does not tell how the camera stands; "
             "give people near and far"
         )
+
+    from scipy.optimize import least_squares  # here, as it takes half a second and 45 MB
 
     def residual(guess: np.ndarray, here: np.ndarray) -> np.ndarray:
         pitch, height = guess[0], np.exp(guess[1])

@@ -7,8 +7,8 @@ are, so what the shadow adds to a target's middle can be taken off it.
 import math
 
 import numpy as np
-from jaxtyping import Float
 
+from torchvision_dddas.shapes import Float
 from torchvision_dddas.targets.projection import project
 from torchvision_dddas.types import Camera, CameraPose
 

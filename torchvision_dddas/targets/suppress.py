@@ -1,8 +1,8 @@
 """One box a person: many windows around each score, and either the best of them stays, or OpenCV's grouping decides."""
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets.boxes import shared_px
 
 # A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+
+from torchvision_dddas.shapes import Float
 
 Surface = Callable[[np.ndarray], np.ndarray]
 """Height above the plane up = 0 of places (N, 2) in east and north; NaN where it is not known."""

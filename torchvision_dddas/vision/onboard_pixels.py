@@ -26,14 +26,16 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     height, width = picture.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     # The error falls with the square of the number of tiles across: that of a single one tells how many it takes.
-    _, error = _affine_maps(picture_from_reference, np.array([[0, 0, width - 1, height - 1]]))
+    tiles = np.array([[0, 0, width - 1, height - 1]])
+    maps, error = _affine_maps(picture_from_reference, tiles)
     count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
     if not 0 <= count <= _MOST_TILES:
         return cv2.warpPerspective(
             picture, picture_from_reference, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
         )
-    tiles = _tiles(width, height, max(int(count), 1))
-    maps, _ = _affine_maps(picture_from_reference, tiles)
+    if count > 1:
+        tiles = _tiles(width, height, int(count))
+        maps, _ = _affine_maps(picture_from_reference, tiles)
     warped = np.empty_like(picture)
     for (left, top, right, bottom), affine in zip(tiles.tolist(), maps, strict=True):
         tile, size = warped[top : bottom + 1, left : right + 1], (right - left + 1, bottom - top + 1)

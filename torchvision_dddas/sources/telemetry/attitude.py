@@ -5,7 +5,8 @@ north), pitch (positive below the horizon, as in the record) and roll (clockwise
 """
 
 import numpy as np
-from jaxtyping import Float
+
+from torchvision_dddas.shapes import Float
 
 
 def axes(
