@@ -50,7 +50,7 @@ def details(speed: Figures, live: Figures, people: Figures | None) -> str:
 
 def conditions(figures: Figures, others: float) -> str:
     """What was measured where, and how busy it was."""
-    first = ", the runs measured before them" if figures.get("realtime") else ""
+    first = ", and these runs went before them" if figures.get("realtime") else ""
     return f"{machine.in_words(figures['machine'])}; {machine.load_in_words(others)}{first}"
 
 
@@ -208,11 +208,12 @@ def _draw_ratios(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
         axis.axhline(goal, color="#888888", lw=1, ls=":")
     axis.axhline(1, color="#888888", lw=1)
     axis.set_yscale("log")
+    axis.set_ylim(0.05, None)
     axis.set_yticks([0.1, 0.2, 0.3, 0.5, 1, 2, 5], ["0.1", "0.2", "0.3", "0.5", "1", "2", "5"])
     axis.minorticks_off()
     axis.set_xticks(range(len(compared)), [f"{w}×{h}" for w, h in compared])
     axis.set_ylabel("processor time beside the plain chain's")
-    axis.legend(frameon=False, fontsize=8, ncols=2)
+    axis.legend(frameon=False, fontsize=8, ncols=3, loc="lower center")
     axis.set_title("Ratio to plain OpenCV", fontsize=12, weight="bold")
 
 
@@ -233,7 +234,8 @@ def _draw_sizes(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
 
 
 def _draw_latency(axis: Any, runs: list[Figures]) -> None:
-    shown = [r for r in runs if r["clip"] == runs[0]["clip"] and r["latency_p99_ms"]["median"] is not None]
+    first = [r for r in runs if (r["clip"], r["config"]) == (runs[0]["clip"], runs[0]["config"])]
+    shown = [r for r in first if r["latency_p99_ms"]["median"] is not None]
     labels = [f"{r['rate_hz']:g}/s\n{r['cores']} core" + "s" * (r["cores"] > 1) for r in shown]
     for p, marker, colour in (("p50", "o", "#448361"), ("p95", "s", "#d9730d"), ("p99", "^", "#ad1a72")):
         found = [run[f"latency_{p}_ms"] for run in shown]
@@ -242,9 +244,10 @@ def _draw_latency(axis: Any, runs: list[Figures]) -> None:
         axis.errorbar(range(len(shown)), middle, spread, fmt=marker, ms=6, capsize=3, color=colour, label=f"{p[1:]} %")
     axis.axhline(GOAL_MS, color="#888888", lw=1, ls=":")
     axis.set_xticks(range(len(shown)), labels, fontsize=8)
-    axis.set(ylim=(0, None), ylabel="latency, ms")
-    axis.legend(frameon=False, fontsize=9, ncols=3)
-    axis.set_title(f"Live, {_title(runs[0]['clip'])}" if runs else "Live", fontsize=12, weight="bold")
+    axis.set(ylim=(0, 1.4 * max(axis.get_ylim()[1], GOAL_MS)), ylabel="latency, ms")
+    axis.legend(frameon=False, fontsize=9, ncols=3, loc="upper center")
+    about = f"{_title(runs[0]['clip'])}, {runs[0]['config']}" if runs else ""
+    axis.set_title(f"Live, {about}", fontsize=12, weight="bold")
 
 
 def main() -> None:
