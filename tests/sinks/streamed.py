@@ -1,6 +1,7 @@
 """Frames as the streams are given them, and outlets that fail when told to."""
 
 import errno
+import os
 
 import numpy as np
 
@@ -69,13 +70,13 @@ class Told(list):
 
 
 class FlakyOutlet:
-    """Takes messages while `trouble` is None, keeps the last otherwise; counts the attempts."""
+    """Takes messages while `trouble` is None and somebody reads, keeps the last otherwise; counts the attempts."""
 
     def __init__(self, most_bytes=0, kept=1000):
         self.most_bytes, self.most_kept = most_bytes, kept
         self.lost, self.reason, self.trouble = 0, "it is read too slowly", None
         self.kept, self.got, self.attempts = [], [], 0
-        self.closed = False
+        self.closed, self.read, self.path = False, True, None
 
     def put(self, messages):
         self.kept += messages
@@ -86,14 +87,15 @@ class FlakyOutlet:
         self.attempts += 1
         if self.trouble is not None:
             raise OSError(self.trouble, {errno.ENOSPC: "No space left on device"}.get(self.trouble, "broken"))
-        self.got += self.kept
-        self.kept = []
+        if self.read:
+            self.got += self.kept
+            self.kept = []
 
     def mend(self):
         pass
 
     def handle(self):
-        return None
+        return None if self.path is None else os.open(self.path, os.O_CREAT | os.O_WRONLY)
 
     def close(self):
         self.closed = True

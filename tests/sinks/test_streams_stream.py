@@ -62,7 +62,7 @@ def test_what_works_only_for_a_moment_is_not_tried_oftener_for_that():
 
 def test_lost_messages_are_counted_and_told_less_and_less_often():
     bench = Bench(kept=1)
-    bench.outlet.flush = lambda: None  # a reader that never reads
+    bench.outlet.read = False
     for k in range(1, 10_000):
         bench.write(k)
         bench.clock.now_s += 0.1
@@ -95,7 +95,12 @@ def test_a_frame_that_cannot_be_told_is_an_event_and_the_next_one_goes_out():
 
 def test_the_age_of_a_frame_is_counted_from_its_capture():
     ages = []
-    bench = Bench(lambda surveyed, people, age_s, most_bytes: ages.append(age_s) or [])
+
+    def note(surveyed, people, age_s, most_bytes):
+        ages.append(age_s)
+        return []
+
+    bench = Bench(note)
     bench.stream.write(surveyed(1, taken_s=99.75))
     bench.stream.write(None, followed(1, taken_s=99.0))
     bench.stream.write(None, None)  # nothing to tell
@@ -104,7 +109,7 @@ def test_the_age_of_a_frame_is_counted_from_its_capture():
 
 def test_a_disk_that_refuses_to_keep_what_it_took_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path):
     bench = Bench()
-    bench.outlet.handle = lambda: os.open(tmp_path / "x", os.O_CREAT | os.O_WRONLY)
+    bench.outlet.path = tmp_path / "x"
 
     def refuse(file):
         raise OSError(errno.EIO, "Input/output error")

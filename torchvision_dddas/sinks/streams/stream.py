@@ -14,7 +14,7 @@ from torchvision_dddas.types import Followed, Surveyed
 Tell = Callable[[str, str], object]
 """Called with a kind, `sink`, and words for a person."""
 
-_SELDOM_S = 3600.0
+_TELL_S, _SELDOM_S = 30.0, 3600.0  # between two words on the same loss, at first and at last
 _NUMBER = re.compile(r"\d+")
 
 
@@ -143,7 +143,7 @@ class Stream:
         if key == self._told_reason and now_s < self._lost_due_s:
             return
         again = key == self._told_reason
-        self._lost_wait_s = min(2 * self._lost_wait_s, _SELDOM_S) if again else self._retry_most_s
+        self._lost_wait_s = min(2 * self._lost_wait_s, _SELDOM_S) if again else _TELL_S
         self._lost_due_s, self._told_reason = now_s + self._lost_wait_s, key
         self._tell("sink", f"{self.name}: {reason}; {self._newly_lost()}")
 
