@@ -16,7 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 import machine
 import report
-from chains import ONBOARD, STAGES
+from chains import ONBOARD, STAGES, TURN
 from sim_runs import pyplot, table
 
 Figures = dict[str, Any]
@@ -67,7 +67,8 @@ def chains_table(speed: Figures) -> str:
     names = list(dict.fromkeys(name for clip in clips.values() for name in clip["chains"]))
     rows = [[name, *(_cost(clip["chains"].get(name)) for clip in clips.values())] for name in names]
     about = f"{conditions(speed, busiest(speed))}. Milliseconds a frame by the clock, processor milliseconds over all "
-    about += "threads / their ratio to the plain chain's in the same turn (quartiles):"
+    about += "threads / their ratio to the plain chain's in the same turn (quartiles); medians of "
+    about += f"{speed['rounds']} turns of {TURN} frames:"
     return f"{about}\n\n{table(['chain', *map(_title, clips)], rows)}"
 
 
@@ -147,8 +148,8 @@ def live_table(live: Figures, ages: bool = False) -> str:
             row += [f"{_number(run, 'age_p50_ms')} / {_number(run, 'age_p99_ms')}", _number(run, "growth_ms_a_minute")]
             row += [_number(run, "waited", 2), _number(run, "every")]
         rows.append(row)
-    about = f"`dddas run --live`, {conditions(live, live['others'])}; {live['seconds']:g} s each, medians over rounds "
-    about += "(99 %: lowest to highest):"
+    about = f"`dddas run --live`, {conditions(live, live['others'])}; {live['seconds']:g} s each, medians over "
+    about += f"{max((run['rounds'] for run in live['runs']), default=0)} rounds (99 %: lowest to highest):"
     return f"{about}\n\n{table(head, rows, words=2)}"
 
 
