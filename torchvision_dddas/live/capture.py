@@ -11,7 +11,7 @@ from torchvision_dddas.live.playing import Player
 from torchvision_dddas.live.receiving import OPENING, Receiver
 from torchvision_dddas.settings import LiveKnobs
 from torchvision_dddas.sources import Problem, open_source
-from torchvision_dddas.sources.stream import OpenedStream, Stream, target_of
+from torchvision_dddas.sources.stream import OpenedStream, Stream, target_of, without_secrets
 from torchvision_dddas.types import Frame
 
 # How long a thread is waited for that was told to end.
@@ -24,8 +24,9 @@ class LiveSource:
     It begins when it is first iterated. A recording (file, folder, sim:) plays at live.pace times its own speed, and
     ends; with pace 0 it waits for the run. A camera or stream is opened again whenever it is lost, and ends by `stop`.
 
-    number: of frames by the clock at rate_hz, so that it stays in step with time; those that were dropped, not looked
-    at or lost are in the next one's `skipped`. time_s: a recording's own; a camera's by the clock since the first.
+    name: as given, but for a password. number: of frames by the clock at rate_hz, so that it stays in step with time;
+    those that were dropped, not looked at or lost are in the next one's `skipped`. time_s: a recording's own; a
+    camera's by the clock since the first.
     start_utc_s: seconds since 1970 at time_s = 0, NaN before the first picture; follows the machine's clock when set.
     apart_s: from picture to picture by the clock; 0 where they wait for the run. busy_s: what the last look took.
     problems: the latest. Whatever goes wrong while it runs is an event of `health` (kind `stream`), and a problem;
@@ -48,20 +49,21 @@ class LiveSource:
         clock: Clock | None = None,
     ) -> None:
         """spec, rate_hz, full_scale: as `open_source` takes them. opener: opens the stream in place of OpenCV."""
-        self.name, self.last, self.busy_s = str(spec), 0, 0.0
+        text = str(spec)
+        self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
         self.knobs, self.health, self._clock = knobs or LiveKnobs(), health or Health(), clock or Clock()
         self._inbox = Inbox(self.knobs.queue_frames, self.health, self._clock)
         self._diary = Diary(self.health, self._clock)
         told = (self._inbox, self._diary, self.health, self._clock)
-        target = target_of(self.name)
+        target = target_of(text)
         self._feed: Player | Receiver
         if opener is None and target is None:
-            recording = open_source(self.name, rate_hz=rate_hz, full_scale=full_scale)
+            recording = open_source(text, rate_hz=rate_hz, full_scale=full_scale)
             self._feed = Player(recording, self.knobs.pace, *told)
             self.rate_hz, self.size = recording.rate_hz, recording.size
             return
         limit_s = self.knobs.stall_s
-        where = self.name if target is None else target
+        where = text if target is None else target
         opening = opener or (lambda: OpenedStream(where, self.name, (OPENING * limit_s, limit_s)))
         self._feed = Receiver(self.name, opening, rate_hz, self.knobs, *told)
         self.rate_hz, self.size = self._feed.rate_hz, self._feed.size

@@ -199,16 +199,19 @@ class Receiver:
 
     def _read(self, stream: Stream, turn: int) -> str:
         """Read until the stream is lost; returns why it is."""
-        failed, good_s = 0, self._clock.now()
+        failed, came_s = 0, self._clock.now()
+        good_s = came_s
         while not self._inbox.closed:
             with self._driver(turn):
                 came = stream.grab()
             if not came:
                 failed += 1
-                if failed >= _MOST_FAILED:
+                # A driver's own limit may pass again and again: one is enough.
+                if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._knobs.stall_s:
                     return "it sends no more pictures"
                 continue
-            failed, taken_s = 0, self._clock.now()
+            failed, came_s = 0, self._clock.now()
+            taken_s = came_s
             if self._picture(stream, taken_s):
                 good_s = taken_s
             elif taken_s - good_s > self._knobs.stall_s:

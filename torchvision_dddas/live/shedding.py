@@ -66,7 +66,9 @@ class Shedding:
 
     def _change(self, moved: tuple[Adjustment, ...], number: int) -> None:
         rung = control.rungs(self._base, self._people)[self.load.rung]
-        self.settings = with_knobs(self._base, {name: value for name, value in rung.items() if name != control.SAMPLING})
+        self.settings = with_knobs(
+            self._base, {name: value for name, value in rung.items() if name != control.SAMPLING}
+        )
         self._source.look_at(int(rung[control.SAMPLING]))
         self._costs.clear()  # what was measured is no longer so
         self._show(rung)

@@ -1,5 +1,6 @@
 """Cameras and network streams picture by picture, as they come: what is behind them may fall silent at any time."""
 
+import re
 from typing import Protocol
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.video import open_capture
 
+_SECRETS = re.compile(r"(?<=://)[^/\s]*@")
 # Pictures in a row that may fail to be decoded at the start: a stream is joined in the middle.
 _MOST_UNDECODED = 100
 
@@ -38,6 +40,8 @@ class OpenedStream:
 
     def __init__(self, target: str | int, name: str, limits_s: tuple[float, float]) -> None:
         self._capture = open_capture(target, name, limits_s)
+        # What goes wrong from now on is told by who reads; OpenCV would write a line for each time.
+        cv2.utils.logging.setLogLevel(0)
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
         self.rate_hz = float(rate_hz) if np.isfinite(rate_hz) and 0 < rate_hz <= 1000 else None
 
@@ -63,6 +67,11 @@ def target_of(spec: str) -> str | int | None:
             raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
         return int(index)
     return spec if "://" in spec else None
+
+
+def without_secrets(spec: str) -> str:
+    """An address as it may be told to anyone: without a user's name and password."""
+    return _SECRETS.sub("", spec)
 
 
 def first_picture(stream: Stream, name: str) -> np.ndarray:
