@@ -2,6 +2,7 @@
 
 import re
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
@@ -16,7 +17,7 @@ from torchvision_dddas.cli.mistakes import INTERRUPTED
 from torchvision_dddas.cli.prepared import Prepared, prepared
 
 if TYPE_CHECKING:
-    from torchvision_dddas.live import Event, Health, LiveSource
+    from torchvision_dddas.live import Event, Health, LiveSource, Snapshot
     from torchvision_dddas.live.runner import Feed, Result
     from torchvision_dddas.live.serving import Page
     from torchvision_dddas.live.watchdog import Watchdog
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.sinks.streams import Stream
     from torchvision_dddas.types import Adjustment, Frame
 
+_CLEAR = "\r\x1b[K"
+_COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
 _SECRET = re.compile(r"(?<=://)[^/@\s]*@")
 
 
@@ -57,6 +60,8 @@ def run_live(
 
     address = None if serve is None else address_of(serve)
     health, supervisor, live = Health(), Supervisor(), settings.live
+    for name in _COUNTED:  # a count that is there from the start can be told from one that is missing
+        health.count(name, 0)
     with ExitStack() as stack:
         source = stack.enter_context(closing(LiveSource(clip, live, health, rate_hz=rate_hz)))
         ready = prepared(given, telemetry, settings, source, backend, clip)
@@ -83,6 +88,7 @@ def run_live(
             streams,
             live.status_s,
             (lambda event: None) if quiet else _say,
+            _show if sys.stderr.isatty() and not quiet else (lambda now: None),
         )
         try:
             keeping.begin()
@@ -111,7 +117,8 @@ def run_live(
         except Failing as error:
             health.event("run", str(error))
             keeping.state, code = "failed", HUNG
-            _say_line(str(error))
+            if quiet:  # which errors are not
+                _say_line(str(error))
         supervisor.say("STOPPING=1")
         opened.close()
     if not quiet:
@@ -224,7 +231,20 @@ def _say(event: "Event") -> None:
 
 def _say_line(text: str) -> None:
     """To stderr: stdout is for streams."""
-    typer.echo(f"dddas: {' '.join(text.split())}", err=True)
+    clear = _CLEAR if sys.stderr.isatty() else ""
+    typer.echo(f"{clear}dddas: {' '.join(text.split())}", err=True)
+
+
+def _show(now: "Snapshot") -> None:
+    """One line on a terminal, in the place of the one before."""
+    late = f", {1000 * now.seconds['latency'][0]:.0f} ms late" if "latency" in now.seconds else ""
+    counts, gauges = now.counts, now.gauges
+    typer.echo(
+        f"{_CLEAR}{gauges.get('rate_hz', 0.0):.1f} results/s{late}, {gauges.get('targets', 0):g} targets, "
+        f"{counts.get('dropped', 0)} of {counts.get('captured', 0)} pictures dropped",
+        err=True,
+        nl=False,
+    )
 
 
 def _summary(health: "Health", folder: Path) -> str:

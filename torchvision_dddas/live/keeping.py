@@ -46,9 +46,11 @@ class Keeping:
         streams: Sequence[Synced],
         status_s: float,
         say: Callable[[Event], object] = lambda event: None,
+        show: Callable[[Snapshot], object] = lambda now: None,
     ) -> None:
-        """say: called with each event, for a person."""
-        self._health, self._log, self._streams, self._status_s, self._say = health, log, streams, status_s, say
+        """say: called with each event, for a person; show: with how it goes, every status_s."""
+        self._health, self._log, self._streams, self._status_s = health, log, streams, status_s
+        self._say, self._show = say, show
         self.state = "running"
         self._known, self._waiting = 0, list[Event]()
         self._trouble = ""
@@ -91,8 +93,10 @@ class Keeping:
         for stream in self._streams:
             stream.sync()
         self._measure()
+        now = self._health.snapshot()
+        self._show(now)
         try:
-            self._log.state(self.state, now_of(self._health.snapshot()))
+            self._log.state(self.state, now_of(now))
             self._trouble = ""
         except OSError as error:
             self._refused(error)

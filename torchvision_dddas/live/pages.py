@@ -68,7 +68,7 @@ def _tiles(now: Snapshot) -> list[tuple[str, str]]:
     ):
         if name in now.seconds:
             middle, _, most = now.seconds[name]
-            tiles.append((words, f"{1000 * middle:.0f} · {1000 * most:.0f} ms"))
+            tiles += [(f"{words}, median", f"{1000 * middle:.0f} ms"), (f"{words}, 99 %", f"{1000 * most:.0f} ms")]
     for name, words in (
         ("captured", "pictures captured"),
         ("dropped", "dropped"),
