@@ -9,6 +9,9 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.matching import TrackTable
 
+FARTHEST = 1e9
+"""No place, size or mark is larger."""
+
 _COLUMNS = ("frame", "id", "x", "y", "width", "height", "the seventh column")
 
 
@@ -82,6 +85,8 @@ def _row(cells: list[str], where: str) -> list[float]:
             raise InputError(f"{where}: {column} is '{cell}'; wanted a finite number")
         if column in ("frame", "id") and (value != int(value) or abs(value) > 2**53):
             raise InputError(f"{where}: {column} is '{cell}'; wanted a whole number")
+        if column not in ("frame", "id") and abs(value) > FARTHEST:
+            raise InputError(f"{where}: {column} is '{cell}'; wanted {-FARTHEST:g} to {FARTHEST:g}")
         values.append(value)
     if values[0] < 1:
         raise InputError(f"{where}: frame is '{cells[0]}'; frames count from 1")

@@ -10,6 +10,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import mot_text
 from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.picture_bytes import decoded
 
 DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
 
@@ -44,7 +45,7 @@ class Result:
     def mask_at(self, frame: int) -> np.ndarray:
         """(H, W) mask of a frame. Raises InputError if it is not there."""
         path = self.place / "masks" / f"{frame:06d}.png"
-        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        mask = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED) if path.is_file() else None
         if mask is None:
             raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
         return mask if mask.ndim == 2 else mask.max(axis=2)
@@ -73,11 +74,11 @@ def load(place: Path) -> Result:
         tracks = mot_text.with_identities(mot_text.read_rows(place / TRACKS, "tracks"), place / TRACKS)
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
-        looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), record["outputs"]
+        looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), list(record["outputs"])
         # dddas track writes every interval-th frame, from wherever its table begins; dddas detect each.
         counted = max(looks - 1, 0) * int(record.get("interval_frames", 1)) + min(looks, 1)
         frames = int(record.get("last_frame", counted)) if looks else 0
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
         numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
         frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []

@@ -11,6 +11,8 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import mot_text
 from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.metrics.mot_text import FARTHEST
+from torchvision_dddas.picture_bytes import decoded
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,10 @@ def load(place: Path, first_frame: int | None = None) -> Truth:
 
 def read_mask(path: Path) -> np.ndarray:
     """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        image = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+    except OSError:
+        image = None
     if image is None:
         raise InputError(f"{path} is no picture that can be read")
     if image.ndim == 2:
@@ -111,6 +116,8 @@ def _one_target(path: Path, lines: list[list[str]]) -> Truth:
         table = np.array([[float(v) for v in row] for row in lines])
     except ValueError as error:
         raise InputError(f"{path} is no table of boxes: {error}") from error
+    if far := [row for row, far in zip(lines, (np.abs(table) > FARTHEST).any(axis=1), strict=True) if far]:
+        raise InputError(f"{path}: the box {','.join(far[0])} is none; wanted {-FARTHEST:g} to {FARTHEST:g}")
     there = np.flatnonzero(~np.isnan(table).any(axis=1))
     tracks = TrackTable(there + 1, np.ones(len(there), np.int64), table[there])
     return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)}, tracks, None, len(table))

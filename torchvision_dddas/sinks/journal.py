@@ -161,6 +161,7 @@ def read(folder: Path) -> dict[str, Any] | None:
     """The record of an earlier run in a folder; None if there is none, or none of ours."""
     try:
         record = json.loads((folder / NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
-    return record if isinstance(record, dict) and "torchvision_dddas" in record.get("versions", {}) else None
+    versions = record.get("versions") if isinstance(record, dict) else None
+    return record if isinstance(versions, dict) and "torchvision_dddas" in versions else None

@@ -44,6 +44,12 @@ def open_source(
             "sim:SCENARIO"
         )
     path = Path(text)
+    try:
+        path.stat()
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered, a name with a NUL
+        raise InputError(f"{text[:200]} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if path.is_dir():
         return ImageSource(images_of_folder(path), text, rate_hz or 10.0, full_scale)
     if path.is_file():

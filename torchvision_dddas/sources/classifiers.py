@@ -112,11 +112,12 @@ def _text(path: Path) -> tuple[np.ndarray, Layout]:
 
 def _numpy(path: Path) -> tuple[np.ndarray, Layout]:
     try:
-        held = np.load(path, allow_pickle=False)
-        if isinstance(held, np.ndarray):
-            return held, {}
-        with held:
-            content = {name: held[name] for name in held.files}
+        with path.open("rb") as file:  # NumPy leaves one that it opened itself open where an archive is broken
+            held = np.load(file, allow_pickle=False)
+            if isinstance(held, np.ndarray):
+                return held, {}
+            with held:
+                content = {name: held[name] for name in held.files}
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(f"classifier {path} is no array of numbers in NumPy's format: {error}") from None
     except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
@@ -205,7 +206,8 @@ def _support(node: "cv2.FileNode", path: Path) -> np.ndarray:
     if not ((place >= 0) & (place < len(rows))).all():
         raise InputError(f"classifier {path} names support vectors that it does not hold; save it again")
     used = rows[place.astype(int)]
-    return sign * np.append(alpha @ used, -function.getNode("rho").real())
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused with its place
+        return sign * np.append(alpha @ used, -function.getNode("rho").real())
 
 
 def _numbers(node: "cv2.FileNode") -> np.ndarray:

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.source import Problem, looked_at, quiet_opencv
+from torchvision_dddas.picture_bytes import decoded
+from torchvision_dddas.sources.source import Problem, looked_at
 from torchvision_dddas.types import Frame
 
 IMAGE_SUFFIXES = frozenset(
@@ -115,15 +116,7 @@ def read_image(file: Path) -> np.ndarray | None:
         data = file.read_bytes()
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
-    # A JPEG cut short decodes to a picture with a grey bottom: its end marker is missing after the start of the scan.
-    if not data or (data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")):
-        return None
-    with quiet_opencv():
-        try:
-            image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
-        except cv2.error:
-            return None
-    return image
+    return decoded(data, _FLAGS)
 
 
 def natural_order(name: str) -> list[str | int]:
@@ -133,7 +126,10 @@ def natural_order(name: str) -> list[str | int]:
 
 def images_of_folder(folder: Path) -> list[Path]:
     """The folder's images in natural order. Raises InputError when there are none, with a guess at what was meant."""
-    entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    try:
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise InputError(f"folder {folder} cannot be read: {error.strerror}") from None
     files = [entry for entry in entries if entry.suffix.lower() in IMAGE_SUFFIXES and entry.is_file()]
     if not files:
         meant = [

@@ -1,11 +1,9 @@
 """What every source of frames offers, and the record of what went wrong while reading."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, overload
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.types import Frame
@@ -56,14 +54,3 @@ def looked_at(frame: np.ndarray, interval: int) -> np.ndarray: ...
 def looked_at(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
     """Whether a frame, or which of several, is one of 1, 1 + interval, 1 + 2 interval, ..."""
     return (frame - 1) % interval == 0
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own complaints off the terminal: the user gets our one line instead."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sources.source import Problem, looked_at, quiet_opencv
+from torchvision_dddas.picture_bytes import quiet_opencv
+from torchvision_dddas.sources.source import Problem, looked_at
 from torchvision_dddas.types import Frame
 
 # FFmpeg draws any text file as an old terminal would; nobody means that.

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.settings import Settings, is_file, with_knobs
 from torchvision_dddas.simulation.scenario.knobs import Place, Scenario
 
 FEWEST = 4
@@ -38,7 +38,7 @@ def check(scenario: Scenario) -> None:
             f"{1 / scenario.clip.rate_hz:g} s or less at clip.rate_hz = {scenario.clip.rate_hz:g}"
         )
     for key in ("elevation", "photo"):
-        if (file := getattr(scenario.world, key)) and not Path(file).is_file():
+        if (file := getattr(scenario.world, key)) and not is_file(Path(file)):
             raise InputError(f"world.{key}: there is no file {file}")
     with_knobs(Settings(), settings_of(scenario), "settings")
 

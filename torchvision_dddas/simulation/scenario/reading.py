@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import config_folder, parse_override, read_toml
+from torchvision_dddas.settings import config_folder, is_file, parse_override, read_toml
 from torchvision_dddas.simulation.scenario.checks import check
 from torchvision_dddas.simulation.scenario.knobs import Scenario, WorldKnobs
 from torchvision_dddas.simulation.scenario.wording import example, explained, nearest_knob
@@ -49,12 +49,12 @@ def _folder() -> Path:
 
 def _file(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
-    if path.is_file():
+    if is_file(path):
         return path
     if path.suffix == ".toml" or len(path.parts) > 1:
         raise InputError(f"no such scenario file: {path}")
     shipped = _folder() / f"{name_or_path}.toml"
-    if not str(name_or_path) or not shipped.is_file():
+    if not str(name_or_path) or not is_file(shipped):
         raise InputError(f"no scenario is named '{name_or_path}'; there are {', '.join(names())}, or give a TOML file")
     return shipped
 
@@ -62,7 +62,7 @@ def _file(name_or_path: str | Path) -> Path:
 def _beside(world: WorldKnobs, folder: Path) -> WorldKnobs:
     """With the files that lie beside the scenario's own by their whole names."""
     found = {key: str(folder / name) for key in ("elevation", "photo") if (name := getattr(world, key))}
-    return world.model_copy(update={key: name for key, name in found.items() if Path(name).is_file()})
+    return world.model_copy(update={key: name for key, name in found.items() if is_file(Path(name))})
 
 
 def _change(content: dict[str, Any], name: str, value: object) -> None:

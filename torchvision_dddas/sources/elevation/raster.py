@@ -43,6 +43,9 @@ def opened(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
         with raster:
             if raster.crs is None and raster.transform.is_identity:
                 raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
+            t = raster.transform
+            if not (np.isfinite([*t]).all() and 0 < abs(t.a * t.e - t.b * t.d) < math.inf):
+                raise InputError(f"{what} {path} is damaged: its cells have no size")
             if geographic and raster.crs is None:
                 raise InputError(
                     f"{what} {path} has no CRS: where it lies is not known; wanted a georeferenced GeoTIFF"
@@ -134,7 +137,10 @@ def _part(raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: 
     from rasterio.transform import Affine
     from rasterio.windows import Window, from_bounds
 
-    asked = from_bounds(*bounds, transform=raster.transform)
+    with np.errstate(all="ignore"):  # a damaged file may say that its cells are of no size
+        asked = from_bounds(*bounds, transform=raster.transform)
+    if not np.isfinite([asked.col_off, asked.row_off, asked.width, asked.height]).all():
+        return None, None
     first = max(math.floor(asked.col_off) - 2, 0), max(math.floor(asked.row_off) - 2, 0)
     last = (
         min(math.ceil(asked.col_off + asked.width) + 2, raster.width),
