@@ -1,0 +1,157 @@
+"""`dddas run --live`: streams, the session's own folder, and one line for each mistake."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.cli.mistakes import bad
+from torchvision_dddas.simulation.scene import render
+
+FRAMES = 14
+# A machine that is busy with other things is no hung run.
+FAST = ("--live", "--set", "live.pace=0", "--set", "live.watchdog_s=0", "--config", "fast")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    for number, image in enumerate(render(0, FRAMES, (240, 180)).images, 1):
+        cv2.imwrite(str(folder / f"{number:03d}.png"), image)
+    return folder
+
+
+def session(out):
+    """The folder, the record and the results of the one session in it."""
+    (folder,) = out.iterdir()
+    lines = (folder / "results.jsonl").read_text().splitlines()
+    return folder, json.loads((folder / "run.json").read_text()), [json.loads(line) for line in lines]
+
+
+def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, frames, tmp_path, capfd):
+    out, mot = tmp_path / "out", tmp_path / "rows.txt"
+    done = dddas("run", frames, *FAST, "--out", out, "--emit", "json:-", "--emit", f"mot:{mot}", "--people")
+    streamed = capfd.readouterr().out.splitlines()
+    assert done.exit_code == 0, done.output
+    assert done.stdout == ""  # nothing but the stream
+    folder, record, results = session(out)
+    assert sorted(path.name for path in folder.iterdir()) == ["events.log", "results.jsonl", "run.json"]
+    assert [line["frame"] for line in results] == list(range(1, FRAMES + 1))
+    assert [json.loads(line)["frame"] for line in streamed] == list(range(1, FRAMES + 1))
+    assert all(isinstance(line["people"], list) for line in results)
+    assert sum(len(line["targets"]) for line in results) > 0
+    rows = np.loadtxt(mot, delimiter=",", ndmin=2)
+    assert len(rows) == sum(len([t for t in line["targets"] if t["id"]]) for line in results)
+    assert record["state"] == "complete"
+    assert record["counts"]["results"] == FRAMES
+    assert record["counts"]["looked_at"] == FRAMES
+    assert record["seconds"]["latency"]["p50"] > 0
+    assert "results of 14 pictures, 0 dropped" in done.stderr
+
+
+def test_a_second_session_touches_nothing_of_the_first(dddas, frames, tmp_path):
+    assert dddas("run", frames, *FAST, "--out", tmp_path, "--quiet").exit_code == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    done = dddas("run", frames, *FAST, "--out", tmp_path, "--quiet")
+    assert done.exit_code == 0
+    assert done.output == ""
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames, tmp_path, monkeypatch):
+    from torchvision_dddas.vision.onboard_vision import OnboardVision
+
+    prepare, asked = OnboardVision.prepare, []
+
+    def broken(self, image):
+        asked.append(1)
+        if len(asked) == 6:
+            raise cv2.error("the sixth picture")
+        return prepare(self, image)
+
+    monkeypatch.setattr(OnboardVision, "prepare", broken)
+    done = dddas("run", frames, *FAST, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    folder, record, results = session(tmp_path)
+    numbers = [line["frame"] for line in results]
+    assert numbers[-8:] == list(range(7, FRAMES + 1))
+    assert numbers == sorted(set(numbers))
+    assert record["counts"]["begun_anew"] == 1
+    assert "6 run: error: the sixth picture" in (folder / "events.log").read_text()
+
+
+def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frames, tmp_path, monkeypatch):
+    from torchvision_dddas.live import runner
+    from torchvision_dddas.vision.onboard_vision import OnboardVision
+
+    def broken(self, image):
+        raise ValueError("no picture will do")
+
+    monkeypatch.setattr(OnboardVision, "prepare", broken)
+    monkeypatch.setattr(runner, "_IN_VAIN", 5)
+    done = dddas("run", frames, *FAST, "--out", tmp_path)
+    assert done.exit_code == 70
+    assert "5 times in a row" in done.stderr
+    assert session(tmp_path)[1]["state"] == "failed"
+
+
+def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
+    # At a hundredth of its speed the clip would take minutes.
+    main = "from torchvision_dddas.cli import main; main()"
+    words = [sys.executable, "-c", main, "run", str(frames), "--live", "--set", "live.pace=0.01"]
+    ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ready.bind(str(tmp_path / "notify"))
+    ready.settimeout(120)
+    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+    with ready, subprocess.Popen([*words, "--out", str(tmp_path / "out")], env=environ, stderr=subprocess.PIPE) as run:
+        assert ready.recv(100) == b"READY=1"
+        run.send_signal(signal.SIGTERM)
+        assert ready.recv(100) == b"STOPPING=1"
+        run.communicate(timeout=120)
+    assert run.returncode == 0
+    assert session(tmp_path / "out")[1]["state"] == "stopped"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--emit", "json:-"], "--emit is for a run that keeps up with a camera; give --live too"),
+        (["--serve", "1"], "--serve is for a run"),
+        (["--people"], "--people is for a run"),
+        (["--live", "--save", "all"], "--save is of no use with --live"),
+        (["--live", "--serve", "eighty"], "--serve eighty is no address"),
+        (["--live", "--emit", "csv:-"], "csv:-"),
+        (["--live", "--emit", "json:/nowhere/at/all"], "/nowhere/at/all"),
+    ],
+)
+def test_a_mistake_at_the_start_is_one_line_and_leaves_nothing(dddas, frames, tmp_path, words, said):
+    assert said in bad(dddas("run", frames, "--out", tmp_path / "out", *words))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = bad(dddas("run", frames, *FAST, "--serve", port, "--out", tmp_path / "out"))
+    assert f"cannot serve at 127.0.0.1:{port}" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_cannot_be_written_is_one_line(dddas, frames, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert "Choose another folder with --out" in bad(dddas("run", frames, *FAST, "--out", tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_password_in_an_address_is_written_nowhere(tmp_path):
+    from torchvision_dddas.cli.live import _SECRET
+
+    assert _SECRET.sub("", "rtsp://me:secret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
+    assert _SECRET.sub("", "frames/a@b") == "frames/a@b"
