@@ -317,11 +317,11 @@ def shed(
     cheapest = next((i for i, rung in enumerate(ladder) if rung[SAMPLING] > 1), len(ladder)) - 1
     slow = cost_s * 1000 > knobs.deadline_ms and at < cheapest
     if shares[at] > knobs.load or slow:
-        to = cheapest if shares[at] > _FAR_OVER * knobs.load else min(at + 1, len(ladder) - 1)
-        if shares[at] > knobs.load:
-            while to >= cheapest and shares[to] > knobs.load and to < len(ladder) - 1:
-                to += 1
-        to = max(at, to)
+        far = shares[at] > _FAR_OVER * knobs.load
+        to = max(at, cheapest) if far else min(at + 1, len(ladder) - 1)
+        # How many pictures can be had is known, what a cheaper look costs is not.
+        while (far or at >= cheapest) and shares[to] > knobs.load and to < len(ladder) - 1:
+            to += 1
         undone = now_s - now.eased_s < 2 * now.patience * knobs.calm_s
         patience = min(2 * now.patience, _MOST_PATIENCE) if undone else 1.0
         new = replace(now, rung=to, spare_s=None, patience=patience if to != at else now.patience)
