@@ -1,5 +1,6 @@
 """`dddas export` as a user meets it."""
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(dddas, tmp_path: Path):
 
 
 def test_what_is_not_installed_is_named(dddas, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.cli.export.find_spec", lambda name: None if "onnx" in name else object())
+    command = import_module("torchvision_dddas.cli.export")  # the name in the package is the function
+    monkeypatch.setattr(command, "find_spec", lambda name: None if "onnx" in name else object())
     result = dddas("export", "--out", str(tmp_path / "own"))
     assert result.exit_code == 2 and "needs onnx, onnxscript; pip install" in result.output
