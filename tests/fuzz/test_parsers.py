@@ -93,11 +93,14 @@ def test_a_png_that_says_a_chunk_is_longer_than_the_file_is_refused_at_once(tmp_
         ("names of inputs", b"a" * 300),
         ("names of inputs", b"a\0b"),
         ("names of inputs", b"sim:" + b"a" * 300),
+        ("seqinfo.ini", b"[Sequence]\nseqLength=" + b"9" * 60),
+        ("MOT text", b"1,1,0,0,1e200,1e200\n"),
         ("scenario TOML", b'[world]\nphoto = "' + b"a" * 300 + b'"'),
     ],
 )
 def test_what_has_no_end_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
-    assert BY_NAME[name].try_on(tmp_path / "input.toml", content) is not None
+    path = BY_NAME[name].prepare(tmp_path)
+    assert BY_NAME[name].try_on(path, content) is not None
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,9 @@ from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.metrics.mot_text import FARTHEST
 from torchvision_dddas.picture_bytes import decoded
 
+MOST_FRAMES = 10_000_000
+"""No clip is longer."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -130,7 +133,10 @@ def _length(path: Path) -> int:
             ini = configparser.ConfigParser()
             try:
                 ini.read(place, encoding="utf-8")
-                return ini.getint("Sequence", "seqLength")
+                length = ini.getint("Sequence", "seqLength")
             except (configparser.Error, UnicodeDecodeError, ValueError) as error:
                 raise InputError(f"{place} does not tell seqLength under [Sequence]: {error}") from error
+            if not 0 <= length <= MOST_FRAMES:
+                raise InputError(f"{place}: seqLength is {length}; wanted 0 to {MOST_FRAMES}")
+            return length
     return 0
