@@ -25,7 +25,10 @@ def pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.ndarray
         raise InputError("pairs needs scores below infinity; got NaN or +inf. Forbid a pair with -inf.")
     # Forbidden and useless pairs gain nothing, as staying alone does: so a full matching always exists.
     gain = np.where(score > max(least, 0.0), score, 0.0)
-    row, column = cheapest(-gain)
+    # Whom nobody fits is left out, so that he stands in nobody's way.
+    rows, columns = np.flatnonzero((gain > 0).any(axis=1)), np.flatnonzero((gain > 0).any(axis=0))
+    row, column = cheapest(-gain[np.ix_(rows, columns)])
+    row, column = rows[row], columns[column]
     used = gain[row, column] > 0
     return np.stack([row[used], column[used]], axis=1).astype(np.int64)
 

@@ -17,7 +17,6 @@ from itertools import combinations
 import numpy as np
 
 from torchvision_dddas.shapes import Bool, Int
-from torchvision_dddas.targets.chi_square import chance_above
 from torchvision_dddas.targets.first_pose import find_pose
 from torchvision_dddas.targets.matching import cheapest
 from torchvision_dddas.targets.pose import Expected, Solution, moved
@@ -70,7 +69,14 @@ def passes(solution: Solution | None, probability: float) -> bool:
     """Whether a pose explains the landmarks: one that could be no other always does."""
     if solution is None:
         return False
-    return solution.freedom <= 0 or chance_above(solution.freedom, solution.cost) >= 1 - probability
+    return solution.freedom <= 0 or _chance_above(solution.freedom, solution.cost) >= 1 - probability
+
+
+def _chance_above(freedom: int, value: float) -> float:
+    """How likely a chi-squared variable lies above a value."""
+    from scipy.special import chdtrc  # 25 MB that only landmarks need
+
+    return float(chdtrc(freedom, value))
 
 
 def judge(
@@ -104,7 +110,7 @@ def judge(
                 continue
             solution = find_pose(reordered(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
-                tried.append((chance_above(solution.freedom, solution.cost), solution, order, used))
+                tried.append((_chance_above(solution.freedom, solution.cost), solution, order, used))
         if tried:
             _, solution, order, used = max(tried, key=lambda one: one[0])
             return Verdict(solution, order, used, _words(order, used, first, names))
@@ -219,7 +225,7 @@ def _best_first(hypotheses: list[Hypothesis], marks: Marks, camera: Camera, expe
         cost = missing @ pull
         if len(out):
             cost -= pull[out] @ np.linalg.solve(kept[np.ix_(out, out)], pull[out])
-        score.append(chance_above(2 * int(used.sum()), max(float(cost), 0.0)) - 1e-9 * float(cost))
+        score.append(_chance_above(2 * int(used.sum()), max(float(cost), 0.0)) - 1e-9 * float(cost))
     for row in np.argsort(score)[::-1][:FITTED]:
         yield hypotheses[row]
 
