@@ -240,8 +240,8 @@ def classifiers(suffix: str) -> list[bytes]:
             descriptor.save(str(path))
             svm = cv2.ml.SVM.create()
             svm.setKernel(cv2.ml.SVM_LINEAR)
-            rows = np.float32([[k, 1 - k, 0.5] for k in (0, 1, 0.1, 0.9)])
-            svm.train(rows, cv2.ml.ROW_SAMPLE, np.int32([0, 1, 0, 1]))
+            rows = np.array([[k, 1 - k, 0.5] for k in (0, 1, 0.1, 0.9)], np.float32)
+            svm.train(rows, cv2.ml.ROW_SAMPLE, np.array([0, 1, 0, 1], np.int32))
             first = path.read_bytes()
             svm.save(str(path))
             return [first, path.read_bytes()]
