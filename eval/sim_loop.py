@@ -179,6 +179,9 @@ def tables(found: dict[str, list[Case]]) -> str:
 def draw(found: dict[str, list[Case]], path: Path) -> None:
     """Merit against time, all settings in one plot: all time, and the aerial camera's."""
     plt = pyplot()
+    # What all open loops share need not be said of each.
+    appearances = {name.rpartition("appearance ")[2] for name in found if "appearance " in name}
+    shared = appearances.pop() if len(appearances) == 1 else ""
     figure, axes = plt.subplots(1, 2, figsize=(11.5, 5.2), constrained_layout=True, sharey=True)
     for axis, key, title in zip(axes, ("time", "aerial"), ("all", "without people seen from the ground"), strict=True):
         front = []
@@ -191,6 +194,8 @@ def draw(found: dict[str, list[Case]], path: Path) -> None:
                 fmt="*" if name == "closed" else "o", ms=14 if name == "closed" else 6, color=colour, capsize=2,
             )  # fmt: skip
             label = name.replace("appearance ", "app. ").replace("open, ", "").replace("closed, ", "")
+            if shared:
+                label = label.removesuffix(f", app. {shared}")
             axis.annotate(label, (x.mean, y.mean), xytext=(6, 4), textcoords="offset points", fontsize=7, color=colour)
             if not closed:
                 front.append((x.mean, y.mean))
