@@ -91,6 +91,8 @@ def _entry(entries: list[Any], kind: str, number: str, name: str) -> Any:
 def _built(content: dict[str, Any], origin: str) -> Scenario:
     try:
         return Scenario.model_validate(_tuples(content))
+    except RecursionError:
+        raise InputError(f"{origin}: its tables go too deep; wanted such as [clip] and [[crowd]]") from None
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{origin}: {explained(first['loc'], first['type'], first['msg'], first['input'])}") from None

@@ -42,6 +42,11 @@ def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
 
 def sane(log: Log, said: dict[str, np.ndarray]) -> None:
     """What cannot be is unknown."""
+    for name, rows in said.items():
+        if (endless := np.isinf(rows[:, 1])).any():
+            where = int(rows[np.argmax(endless), 2])
+            log.note(f"{log.where} {where}: {name} is infinite, which cannot be; {endless.sum()} left out")
+            rows[endless, 1] = np.nan
     for name, (least, most) in _SANE.items():
         if name in said:
             rows = said[name]

@@ -14,7 +14,7 @@ from torchvision_dddas.sources.telemetry.names import dated, hfov_of_focal, quan
 from torchvision_dddas.sources.telemetry.record import assembled
 from torchvision_dddas.types import Telemetry
 
-_TIMING = re.compile(r"(\d+):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
+_TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
 _MARKUP = re.compile(r"<[^>]*>")
 _NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
 _TUPLE = re.compile(r"([A-Za-z][A-Za-z.]*)\s*:?\s*\(([^)]*)\)?")

@@ -32,6 +32,8 @@ LIMITS = {
     "time_s": (-1e10, 1e10, "seconds since the clip's first frame"),
     # A gimbal that looks straight down reports 90.2 as well as 89.8.
     "pitch_deg": (-180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
+    "east_m": (-1e7, 1e7, "metres from the origin, -1e7 to 1e7"),
+    "north_m": (-1e7, 1e7, "metres from the origin, -1e7 to 1e7"),
     "hfov_deg": (0.0, 180.0, "the width of the field of view, 0 to 180"),
     "speed_m_s": (0.0, math.inf, "the speed over ground, 0 or more"),
     "heading_deg": (-360.0, 360.0, "clockwise from true north, -360 to 360"),
