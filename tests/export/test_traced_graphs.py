@@ -19,6 +19,7 @@ import torch
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.exporting import traced
 from torchvision_dddas.exporting.building import OPSET
+from torchvision_dddas.exporting.checked import Made
 from torchvision_dddas.settings import Settings, load, with_knobs
 
 SIZE = (96, 80)
@@ -30,7 +31,7 @@ def fast() -> Settings:
 
 
 @pytest.fixture(scope="module")
-def made(fast: Settings) -> traced.Made:
+def made(fast: Settings) -> Made:
     (found,) = traced.made("warp_difference", fast, SIZE).values()
     return found
 

@@ -1,26 +1,17 @@
-"""Graphs that torch's exporter traces from `ops`, for one size of picture, compared with torch on pictures made here.
+"""Graphs traced from `ops` (tracing.py) for one size of picture, and compared with torch on pictures made here."""
 
-Kept to what any runtime reads: standard operations only; names of our own for inputs and outputs; nothing of the
-machine or of the source files that the exporter notes beside every node, so that the same versions give the same bytes.
-"""
-
-import contextlib
-import io
-import logging
-import warnings
 from typing import Any
 
 import cv2
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 from torch import Tensor, nn
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.exporting.building import OPSET
 from torchvision_dddas.exporting.checked import Check, Made
 from torchvision_dddas.exporting.step import HYPOTHESES, Register, Step, WarpDifference
+from torchvision_dddas.exporting.tracing import traced
 from torchvision_dddas.ops import consensus
 from torchvision_dddas.settings import Settings
 
@@ -49,7 +40,7 @@ def made(name: str, settings: Settings, size: tuple[int, int]) -> dict[str, Made
     """
     graph = module(name, settings, size)
     given = example(name, settings, size, 0)
-    content = traced(graph, name, given)
+    content = traced(graph, name, tuple(given.values()), INPUTS[name], OUTPUTS[name])
     checks = compared(content, graph, name, [example(name, settings, size, seed) for seed in range(EXAMPLES)])
     file = f"{name}_{size[0]}x{size[1]}.onnx"
     return {file: Made(content, ABOUT[name], "ops", baked(name, settings), checks)}
@@ -87,50 +78,6 @@ def baked(name: str, settings: Settings) -> dict[str, Any]:
         names = "model", "keypoints", "cell_px", "quality", "block_px", "window_px", "levels", "epsilon_px"
         held |= {f"registration.{knob}": getattr(settings.registration, knob) for knob in names}
     return held
-
-
-def traced(graph: nn.Module, name: str, given: dict[str, Tensor]) -> bytes:
-    """The file's content."""
-    silence = contextlib.redirect_stdout(io.StringIO())
-    noisy = logging.getLogger("torch.onnx")
-    level = noisy.level
-    noisy.setLevel(logging.ERROR)
-    try:
-        with silence, warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            program = torch.onnx.export(
-                graph,
-                tuple(given.values()),
-                dynamo=True,
-                opset_version=OPSET,
-                input_names=INPUTS[name],
-                output_names=OUTPUTS[name],
-                verbose=False,
-            )
-    finally:
-        noisy.setLevel(level)
-    assert program is not None
-    return bare(program.model_proto, name)
-
-
-def bare(model: onnx.ModelProto, name: str) -> bytes:
-    """A model without what tells where and how it was made."""
-    model.graph.name, model.doc_string, model.graph.doc_string = name, "", ""
-    model.producer_name, model.producer_version = "", ""
-    del model.metadata_props[:], model.graph.value_info[:], model.functions[:]
-    graph = model.graph
-    for held in (graph, *graph.node, *graph.initializer, *graph.input, *graph.output):
-        held.doc_string = ""
-        del held.metadata_props[:]
-    if strange := {node.domain for node in graph.node} - {""}:
-        raise InputError(
-            f"torch's exporter made {name} of operations of {', '.join(strange)}; another torch may do better"
-        )
-    opsets = [held for held in model.opset_import if held.domain == ""]
-    del model.opset_import[:]
-    model.opset_import.extend(opsets)
-    onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString(deterministic=True)
 
 
 def compared(content: bytes, graph: nn.Module, name: str, examples: list[dict[str, Tensor]]) -> tuple[Check, ...]:
@@ -174,7 +121,8 @@ def example(name: str, settings: Settings, size: tuple[int, int], seed: int) -> 
     """A textured plane from three places, on which two squares move."""
     width, height = size
     rng = np.random.default_rng(seed)
-    wide = cv2.resize(rng.integers(0, 256, (height // 4, width // 4)).astype(np.float32), (2 * width, 2 * height))
+    coarse = rng.integers(0, 256, (height // 4, width // 4)).astype(np.float32)
+    wide: np.ndarray = cv2.resize(coarse, (2 * width, 2 * height))
     wide += cv2.GaussianBlur(rng.normal(0, 60, wide.shape).astype(np.float32), (5, 5), 0)
     plane = wide.clip(0, 255).astype(np.uint8)
     side = max(8, min(size) // 12)

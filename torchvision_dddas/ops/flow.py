@@ -158,7 +158,8 @@ def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float
     grey = _gather(image, corner, window + span - 1)
     batch, count, side = grey.shape[:3]
     # Columns unfolded, rows not: rows of one displacement lie together in memory, so each is one strided product.
-    strips = grey.unfold(-1, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
+    # Dimension 3 and not -1: torch's older ONNX exporter gets a negative one wrong.
+    strips = grey.unfold(3, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
     gradients = patch.gradients.flatten(0, 1)
     area = window * window
     rows = [gradients @ strips[..., shift * window : shift * window + area].mT for shift in range(span)]
@@ -201,4 +202,6 @@ def _halved(gray: Tensor) -> Tensor:
 
 def _all_true(condition: Tensor) -> bool:
     """Whether to stop early: only where asking is cheap and the graph is not being traced; results are the same."""
-    return condition.device.type == "cpu" and not torch.compiler.is_compiling() and bool(condition.all())
+    if condition.device.type != "cpu" or torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[attr-defined]
+        return False
+    return bool(condition.all())
