@@ -122,7 +122,8 @@ def main() -> None:
     )
     loaded = ", ".join(f"{step:.1f}" for step in steps) or "none"
     print(
-        f"RSS from the second quarter to the last: {growth_mb:+.1f} MB, and steps of {loaded} MB; most {table[:, 2].max():.1f} MB; {len(numbers)} lines, "
+        f"RSS from the second quarter to the last: {growth_mb:+.1f} MB, and steps of {loaded} MB; "
+        f"most {table[:, 2].max():.1f} MB; {len(numbers)} lines, "
         + ("all whole and in order" if whole else "NOT whole and in order")
     )
     if asked.json is not None:
