@@ -61,6 +61,7 @@ def observe(
         settings.gates.min_area_px,
         knobs.peak * scale,
         settings.morphology.hull,
+        foreground.scale,
     )
     if settings.persistence.on and _looks_both_ways(window):
         knobs_of = settings.morphology, settings.gates.min_area_px, knobs.peak * scale

@@ -93,3 +93,16 @@ def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted
 
 def test_without_wide_evidence_there_are_no_weak_blobs(painted):
     assert weak_blobs(painted(SIZE), [], 10, MorphologyKnobs(), 1, 0) == []
+
+
+@pytest.mark.parametrize("hull", [False, True])
+def test_blobs_of_maps_at_half_the_size_are_those_of_the_maps_made_whole(hull):
+    half = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (40, 60)).astype(np.uint8), (0, 0), 2)
+    core = cv2.threshold(half, 132, 255, cv2.THRESH_BINARY)[1]
+    whole, evidence = (picture.repeat(2, axis=0).repeat(2, axis=1) for picture in (core, half))
+    wanted, blobs = found(whole, evidence, 135, 60, 137, hull), find_blobs(core, half, 135, 60, 137, hull, scale=2)
+    assert len(blobs) == len(wanted) >= 3
+    for blob, other in zip(blobs, wanted, strict=True):
+        assert blob.box == other.box and blob.peak == other.peak
+        np.testing.assert_array_equal(blob.mask, other.mask)
+        np.testing.assert_array_equal(blob.core, other.core)

@@ -12,9 +12,9 @@ from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.targets.projective import corner_error
 from torchvision_dddas.types import Frame
-from torchvision_dddas.vision import onboard_half
+from torchvision_dddas.vision import onboard_half, onboard_vision
 from torchvision_dddas.vision.onboard_vision import OnboardVision
-from torchvision_dddas.vision.protocol import View
+from torchvision_dddas.vision.protocol import Foreground, View
 
 SIZE = (320, 240)
 
@@ -78,3 +78,27 @@ def test_every_kind_of_difference_and_refinement_can_be_halved(size: tuple[int, 
     frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(render(seed=2, frames=6, size=size).images))
     found = list(scenes(frames, OnboardVision(settings), settings))
     assert len(found) == 6 and all(scene.mask.shape == size[::-1] for scene in found)
+
+
+def test_a_chain_that_only_looks_for_blobs_keeps_half_maps_and_finds_what_whole_maps_show(
+    images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = load("half", ["gates.min_area_px=60"])
+
+    def found() -> list[np.ndarray]:
+        frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
+        return [scene.mask for scene in scenes(frames, OnboardVision(settings), settings)]
+
+    scales = []
+
+    def whole(half: Foreground, **kept: int) -> Foreground:
+        scales.append(kept["scale"])
+        return onboard_half.whole_maps(half, SIZE, False)
+
+    halves = found()
+    monkeypatch.setattr(onboard_vision, "replace", whole)
+    wholes = found()
+    assert scales and set(scales) == {2}
+    assert any(mask.any() for mask in halves)
+    for half, other in zip(halves, wholes, strict=True):
+        np.testing.assert_array_equal(half, other)

@@ -44,12 +44,13 @@ class Blob:
 
 
 def find_blobs(
-    core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool
+    core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool, scale: int = 1
 ) -> list[Blob]:
     """Connected regions (8 neighbours) of `core` with enough area and a high enough peak of evidence.
 
     core, evidence: (H, W) uint8. Evidence above `threshold` makes a pixel of a region certain. A hull that contains
-    another region's hull swallows it.
+    another region's hull swallows it. scale: pixels of the picture to one of the maps', along either side; areas
+    and blobs are in the picture's.
     """
     blobs = []
     for left, top, wide, high in occupied(core, 2):
@@ -57,15 +58,18 @@ def find_blobs(
         count, labels, stats, _ = cv2.connectedComponentsWithStats(core[part], ltype=cv2.CV_32S)
         for label in range(1, count):
             x, y, width, height, area = (int(v) for v in stats[label])
-            if area < min_area_px:
+            if area * scale**2 < min_area_px:
                 continue
             window = np.s_[y : y + height, x : x + width]
             region = labels[window] == label
             seen = evidence[part][window]
             if (highest := float(seen[region].max())) < peak:
                 continue
-            mask = filled_hull(region) if hull else region
-            blobs.append(Blob((left + x, top + y, width, height), mask, region & (seen > threshold), highest))
+            certain, box = region & (seen > threshold), (left + x, top + y, width, height)
+            if scale > 1:
+                region, certain = (kept.repeat(scale, axis=0).repeat(scale, axis=1) for kept in (region, certain))
+                box = box[0] * scale, box[1] * scale, width * scale, height * scale
+            blobs.append(Blob(box, filled_hull(region) if hull else region, certain, highest))
     blobs.sort(key=lambda blob: (blob.box[1], blob.box[0]))
     return _without_swallowed(blobs) if hull else blobs
 

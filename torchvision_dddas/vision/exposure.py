@@ -19,6 +19,8 @@ _DIFFERENCE = 2.0
 # What a gain and an offset must leave at most of the difference; otherwise it is the content that has changed.
 _LEFT = 0.5
 _LEAST_LEVELS = 8
+# Where grey levels begin and end.
+_EDGES = np.arange(257) - 0.5
 
 
 def in_one_light(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:
@@ -71,9 +73,10 @@ def _levels(view: View) -> np.ndarray:
     """
     if "levels at shares" not in view.kept:
         sample = np.ascontiguousarray(view.grey[::5, ::3])
-        below = np.cumsum(cv2.calcHist([sample], [0], None, [256], [0, 256]).ravel()) / sample.size
+        below = np.zeros(257)
+        below[1:] = np.cumsum(cv2.calcHist([sample], [0], None, [256], [0, 256]).ravel()) / sample.size
         # A level's pixels are spread evenly over it, or shares would move in whole levels.
-        view.kept["levels at shares"] = np.interp(_SHARES, np.r_[0.0, below], np.arange(257) - 0.5)
+        view.kept["levels at shares"] = np.interp(_SHARES, below, _EDGES)
     levels: np.ndarray = view.kept["levels at shares"]
     return levels
 
@@ -83,4 +86,5 @@ def _through(grey: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def _median(difference: np.ndarray) -> float:
-    return float(np.median(np.abs(difference)))
+    size = np.sort(np.abs(difference))  # `np.median` takes four times as long for so few
+    return float((size[(len(size) - 1) // 2] + size[len(size) // 2]) / 2)

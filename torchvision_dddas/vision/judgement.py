@@ -6,6 +6,8 @@ from torchvision_dddas.settings import RegistrationKnobs
 from torchvision_dddas.targets.projective import background_flow, transfer
 from torchvision_dddas.types import Registration
 
+_NEXT = [1, 2, 3, 0]
+
 
 def judged(
     later_from_earlier: np.ndarray,
@@ -37,8 +39,9 @@ def plausible(later_from_earlier: np.ndarray, size: tuple[int, int]) -> bool:
     corners = transfer(later_from_earlier, np.array([[0, 0], [width, 0], [width, height], [0, height]], float))
     if not np.isfinite(corners).all():
         return False
-    edges = np.roll(corners, -1, axis=0) - corners
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
-    following = np.roll(corners, -1, axis=0)
+    following = corners[_NEXT]
+    edges = following - corners
+    after = edges[_NEXT]
+    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     area = 0.5 * (corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()
     return bool((turns > 0).all() and 0.5 < area / (width * height) < 2.0)

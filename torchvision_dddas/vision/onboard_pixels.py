@@ -1,5 +1,7 @@
 """Pixel steps of the onboard back end, each in as few passes over 8-bit memory as it takes."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -45,16 +47,9 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
 
 def _tiles(width: int, height: int, count: int) -> np.ndarray:
     """(N, 4) first column, first row, last column, last row of count x count tiles."""
-    across, down = (np.unique(np.arange(count + 1) * side // count) for side in (width, height))
-    rows, columns = len(down) - 1, len(across) - 1
-    return np.stack(
-        [
-            np.tile(across[:-1], rows),
-            np.repeat(down[:-1], columns),
-            np.tile(across[1:] - 1, rows),
-            np.repeat(down[1:] - 1, columns),
-        ],
-        axis=1,
+    across, down = (sorted({i * side // count for i in range(count + 1)}) for side in (width, height))
+    return np.array(
+        [(left, top, right - 1, bottom - 1) for top, bottom in pairwise(down) for left, right in pairwise(across)]
     )
 
 
@@ -64,9 +59,11 @@ def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, fl
     The slopes are the means over opposite sides; the error is shared between the corners and the middle.
     """
     left, top, right, bottom = tiles.T.astype(float)
-    u = np.stack([left, right, left, right, (left + right) / 2])
-    v = np.stack([top, top, bottom, bottom, (top + bottom) / 2])
-    away = to_from @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    from_places = np.empty((3, 5, len(tiles)))
+    from_places[0] = left, right, left, right, (left + right) / 2
+    from_places[1] = top, top, bottom, bottom, (top + bottom) / 2
+    from_places[2] = 1
+    away = to_from @ from_places.reshape(3, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         places = (away[:2] / away[2]).reshape(2, 5, -1)
     first, second, third, fourth, middle = places.transpose(1, 2, 0)
@@ -75,7 +72,9 @@ def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, fl
     twist = (first + fourth - second - third) / 4
     bulge = (middle - (first + second + third + fourth) / 4) / 2
     error = (np.abs(twist) + np.abs(bulge)).max() if (away[2] > 0).all() else np.inf
-    return np.stack([by_u, by_v, first - twist + bulge], axis=2), float(error)
+    maps = np.empty((len(tiles), 2, 3))
+    maps[:, :, 0], maps[:, :, 1], maps[:, :, 2] = by_u, by_v, first - twist + bulge
+    return maps, float(error)
 
 
 def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
@@ -90,7 +89,9 @@ def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: in
         return mask
     corners = np.array([first, (last[0], first[1]), last, (first[0], last[1])], float)
     reference_from_picture = np.linalg.inv(picture_from_reference)
-    depth = np.c_[corners, np.ones(4)] @ (reference_from_picture / reference_from_picture[2, 2])[2]
+    homogeneous = np.ones((4, 3))
+    homogeneous[:, :2] = corners
+    depth = homogeneous @ (reference_from_picture / reference_from_picture[2, 2])[2]
     if (depth > 0.1).all():
         outline = transfer(reference_from_picture, corners)
         cv2.fillConvexPoly(mask, np.round(16 * outline).astype(np.int32), 255, shift=4)

@@ -27,6 +27,8 @@ _LEAST_SHARE = 0.4
 # Keypoints are detected anew below this share of those detected, or of the coarse cells that they covered.
 _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
+# Inliers of the refits, in RANSAC's tolerance. Half pictures do without the other two: corners off by 0.08 px with both.
+_TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,8 @@ def _fit(start: np.ndarray, end: np.ndarray, knobs: RegistrationKnobs) -> np.nda
     if model is None:
         return np.eye(3)
     fitted = np.zeros(0, bool)
-    for tolerance in (1.5 * knobs.ransac_px, knobs.ransac_px, 0.5 * knobs.ransac_px, 0.5 * knobs.ransac_px):
+    for share in _TOLERANCES_HALVED if knobs.halved else _TOLERANCES:
+        tolerance = share * knobs.ransac_px
         near = np.linalg.norm(transfer(model, start) - end, axis=1) < tolerance
         if near.sum() < 12:
             break

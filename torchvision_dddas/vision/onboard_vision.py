@@ -1,6 +1,7 @@
 """The back end for one stream on a small CPU: OpenCV on 8-bit pictures, no torch."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -46,9 +47,11 @@ class OnboardVision:
         """Differences to the warped neighbours, threshold, morphology."""
         if not self.knobs.difference.halved:
             return [_foreground(window, self.knobs) for window in windows]
-        small = half_settings(self.knobs)
+        found = [_foreground(half_window(window), half_settings(self.knobs)) for window in windows]
         flow = self.knobs.persistence.on or self.knobs.refine.on
-        return [whole_maps(_foreground(half_window(window), small), window.reference.size, flow) for window in windows]
+        if not (flow or self.knobs.history.on or self.knobs.small.on):  # blobs are found as well on the half maps
+            return [replace(half, scale=2) for half in found]
+        return [whole_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
 
 
 def _foreground(window: Window, settings: Settings) -> Foreground:

@@ -58,6 +58,8 @@ class Window:
 class Foreground:
     """What differs from the background at the reference frame; all maps (H, W) uint8 in its pixel coordinates.
 
+    scale: pixels of the frame to one of the maps', along either side; above 1 only where nothing but blobs is asked of
+    the maps.
     core: 255 where a target is certain, cleaned by morphology.
     evidence: 16 x the difference in units of the local noise, the largest over the near pairs; `wide` the same for the
     wide pair. texture: mean gradient, 4 x grey levels a pixel.
@@ -72,6 +74,7 @@ class Foreground:
     small: np.ndarray | None
     warped: tuple[np.ndarray, np.ndarray]
     offsets: tuple[int, int]
+    scale: int = 1
 
 
 class Vision(Protocol):
