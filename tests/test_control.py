@@ -27,7 +27,7 @@ from torchvision_dddas.control import (
     steered,
 )
 from torchvision_dddas.settings import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
-from torchvision_dddas.types import Marks
+from torchvision_dddas.types import Adjustment, Marks
 
 KNOBS = IntervalKnobs(minimum_frames=1, maximum_frames=12)
 BASE = with_knobs(
@@ -283,7 +283,8 @@ APART_S = 0.04
 
 def driven(cost_ms, looks, now=None, start_s=0.0, settings=LIVE, people=False):
     """The rule at every look from start_s on, where a look at everything takes cost_ms and half the keypoints 80 %."""
-    now, moved, time_s = now or Load(), [], start_s
+    moved: list[Adjustment] = []
+    now, time_s = now or Load(), start_s
     for k in range(looks):
         rung = rungs(settings, people)[now.rung]
         cheaper = 0.8 ** np.log2(settings.registration.keypoints / rung["registration.keypoints"])

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from torchvision_dddas import following, run
 from torchvision_dddas.geolocating import Locator, Targets, Watch, Watched, gathered, named
 from torchvision_dddas.settings import Settings
-from torchvision_dddas.sources.source import Source
 from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.rollcall import RollCall
 from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
@@ -17,8 +16,17 @@ if TYPE_CHECKING:
     from torchvision_dddas.mission import Mission
 
 
+class Clip(run.Clip, Protocol):
+    """What the whole path needs of a source."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in px, the same for every frame."""
+        ...
+
+
 def survey(
-    source: Source,
+    source: Clip,
     vision: Vision,
     settings: Settings,
     telemetry: Telemetry | None = None,

@@ -236,7 +236,7 @@ def classifiers(suffix: str) -> list[bytes]:
             np.savez(path, weights=np.ones(FEATURES, np.float32), bias=np.float32(1), bins=9, cell=8)
         else:
             descriptor = cv2.HOGDescriptor()
-            descriptor.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+            descriptor.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
             descriptor.save(str(path))
             svm = cv2.ml.SVM.create()
             svm.setKernel(cv2.ml.SVM_LINEAR)

@@ -73,7 +73,7 @@ def test_an_error_costs_its_frame_alone_and_is_told():
 
 
 def test_after_an_error_no_frame_before_counts_as_missing():
-    seen = []
+    seen: list[Frame] = []
     list(results(path(broken=(4,), seen=seen), feed_of(6), Health()))
     assert {frame.number: frame.skipped for frame in seen} == {1: 0, 2: 0, 3: 0, 4: 0, 5: 4, 6: 0}
 
@@ -81,7 +81,8 @@ def test_after_an_error_no_frame_before_counts_as_missing():
 def test_identities_after_an_error_are_new_ones():
     got = list(results(path(broken=(4, 7)), feed_of(), Health()))
     assert [surveyed.followed.tracks.identity.tolist() for surveyed, _ in got] == [[1]] * 3 + [[2]] * 2 + [[3]] * 3
-    assert [people.tracks.identity.tolist() for _, people in got] == [[2]] * 3 + [[4]] * 2 + [[6]] * 3
+    found = [people.tracks.identity.tolist() for _, people in got if people is not None]
+    assert found == [[2]] * 3 + [[4]] * 2 + [[6]] * 3
 
 
 def test_it_fails_where_no_result_comes_any_more():
@@ -123,9 +124,8 @@ def test_what_was_seen_is_still_settled_after_a_stop():
 
 def test_a_run_that_was_stopped_too_early_for_a_window_ends_well():
     def short(feed):
-        list(feed)
+        yield from (result_of(frame) for frame in feed if frame.number > 2)
         raise InputError("the clip has 2 frames that can be read, a window needs 3: 1 missing")
-        yield
 
     health = Health()
     assert list(results(short, feed_of(2), health)) == []

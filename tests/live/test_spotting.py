@@ -81,7 +81,9 @@ def test_a_frame_that_could_not_be_read_has_nobody():
     unread = Scene(scene.frame, scene.mask, scene.detections, 1, False, UNREAD)
     spotter = Spotter(Brightest(), SETTINGS, 1, SIZE)
     spotter.see(unread)
-    assert len(spotter.of(1, True).detections) == 0
+    people = spotter.of(1, True)
+    assert people is not None
+    assert len(people.detections) == 0
 
 
 def test_a_narrower_search_looks_at_less():

@@ -12,7 +12,8 @@ class Case:
     """A watchdog with a clock of its own. ended: with what words the process would have been."""
 
     def __init__(self, hung_s=10.0, supervisor=None):
-        self.now_s, self.ended, self.health = 0.0, [], Health()
+        self.ended: list[str] = []
+        self.now_s, self.health = 0.0, Health()
         self.dog = Watchdog(self.health, hung_s, supervisor, self.ended.append, lambda: self.now_s)
 
     def at(self, now_s):
@@ -69,23 +70,27 @@ def test_zero_lets_steps_take_as_long_as_they_want():
     assert not case.ended
 
 
-@pytest.fixture
-def heard(tmp_path):
-    """A supervisor's socket: heard() gives what was said to it."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
-        way.bind(str(tmp_path / "notify"))
+class Heard:
+    """A supervisor's socket: called, it gives what was said to it."""
+
+    def __init__(self, way: socket.socket, path: str) -> None:
+        self.way, self.path = way, path
+        way.bind(path)
         way.setblocking(False)
 
-        def words():
-            said = []
-            while True:
-                try:
-                    said.append(way.recv(4096).decode())
-                except BlockingIOError:
-                    return said
+    def __call__(self) -> list[str]:
+        said: list[str] = []
+        while True:
+            try:
+                said.append(self.way.recv(4096).decode())
+            except BlockingIOError:
+                return said
 
-        words.path = str(tmp_path / "notify")
-        yield words
+
+@pytest.fixture
+def heard(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
+        yield Heard(way, str(tmp_path / "notify"))
 
 
 def test_a_supervisor_hears_that_all_is_well_while_it_is(heard):

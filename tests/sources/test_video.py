@@ -215,7 +215,7 @@ def test_frames_are_numbered_by_stamps_where_these_can_be_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: list[float | None], numbers: list[int], problems: list[str]
 ) -> None:
     source = open_source(write_video(tmp_path / "clip.avi", "MJPG", frames=8))
-    source.count = None
+    monkeypatch.setattr(source, "count", None)
     monkeypatch.setattr(source, "_open", lambda: ScriptedCapture(script))
     frames = list(source)
     assert [frame.number for frame in frames] == numbers

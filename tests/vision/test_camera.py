@@ -16,7 +16,8 @@ class Counted:
 
     def __init__(self) -> None:
         self.vision, self.count = load("onboard", Settings()), 0
-        self.name, self.prepare, self.foreground = self.vision.name, self.vision.prepare, self.vision.foreground
+        self.name, self.knobs = self.vision.name, self.vision.knobs
+        self.prepare, self.foreground = self.vision.prepare, self.vision.foreground
 
     def register(self, pairs):
         self.count += len(pairs)

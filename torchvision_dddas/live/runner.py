@@ -20,10 +20,25 @@ _IN_VAIN = 25
 class LiveFrames(Protocol):
     """What the run needs of a live source; see live.capture.LiveSource."""
 
-    name: str
-    rate_hz: float
-    size: tuple[int, int]
-    last: int
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
+        ...
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in px."""
+        ...
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame that was handed on."""
+        ...
 
     def __iter__(self) -> Iterator[Frame]:
         """A further iteration goes on where the one before ended."""
@@ -33,7 +48,10 @@ class LiveFrames(Protocol):
 class Stream(Protocol):
     """Where results go; see sinks.streams."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """As the user wrote it."""
+        ...
 
     def write(self, surveyed: Surveyed | None, people: Followed | None = None) -> None:
         """Send a frame."""

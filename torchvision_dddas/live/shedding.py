@@ -19,8 +19,15 @@ _FEWEST = 5
 class Paced(Protocol):
     """What is needed of a live source."""
 
-    apart_s: float
-    busy_s: float
+    @property
+    def apart_s(self) -> float:
+        """Seconds from picture to picture; 0 where they wait for the run."""
+        ...
+
+    @property
+    def busy_s(self) -> float:
+        """What the last look took."""
+        ...
 
     def look_at(self, every: int) -> None:
         """Of so many pictures one is handed on."""

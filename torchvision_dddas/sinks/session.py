@@ -23,10 +23,25 @@ RESULTS, EVENTS = "results.jsonl", "events.log"
 class Told(Protocol):
     """Something that happened, as `live.Event` tells it."""
 
-    utc_s: float
-    frame: int
-    kind: str
-    text: str
+    @property
+    def utc_s(self) -> float:
+        """Seconds since 1970."""
+        ...
+
+    @property
+    def frame(self) -> int:
+        """0 where it belongs to none."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """One word."""
+        ...
+
+    @property
+    def text(self) -> str:
+        """What it was, in words."""
+        ...
 
 
 def claim(out: Path, utc_s: float | None = None) -> Path:

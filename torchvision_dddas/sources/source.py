@@ -23,22 +23,46 @@ class Problem:
 class Source(Protocol):
     """A clip, read one frame at a time.
 
-    name: what to call it in messages and tables. count: frames that it announces, None when unknown (a live stream).
-    exact: whether count is more than a guess from the duration.
-    rate_hz: frames a second. size: (width, height) in px, the same for every frame.
-    last: number of the last frame known to be in the clip, decoded or not, once it has been read to its end; until then
-    that of the last frame read.
-    problems: filled while reading; every new iteration starts from the first frame and empties it.
     Iterating yields frames in order, numbered from 1. A frame that cannot be decoded is left out and keeps its number.
     """
 
-    name: str
-    count: int | None
-    exact: bool
-    rate_hz: float
-    size: tuple[int, int]
-    last: int
-    problems: list[Problem]
+    @property
+    def name(self) -> str:
+        """What to call it in messages and tables."""
+        ...
+
+    @property
+    def count(self) -> int | None:
+        """Frames that it announces; None when unknown (a live stream)."""
+        ...
+
+    @property
+    def exact(self) -> bool:
+        """Whether count is more than a guess from the duration."""
+        ...
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in px, the same for every frame."""
+        ...
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame known to be in the clip, decoded or not, once it has been read to its end.
+
+        Until then that of the last frame read.
+        """
+        ...
+
+    @property
+    def problems(self) -> list[Problem]:
+        """Filled while reading; every new iteration starts from the first frame and empties it."""
+        ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
