@@ -1,0 +1,51 @@
+"""The path of a live run from pictures to results: begun anew after an error, and steered by what it costs."""
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from torchvision_dddas.cli.prepared import Prepared
+
+if TYPE_CHECKING:
+    from torchvision_dddas.live import Health, LiveSource
+    from torchvision_dddas.live.runner import Feed, Result
+    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.types import Adjustment, Frame
+
+
+def path(
+    ready: Prepared, source: "LiveSource", people: bool, interval: int, backend: str, health: "Health"
+) -> "Callable[[Feed], Iterator[Result]]":
+    """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
+    from torchvision_dddas.live.shedding import Shedding
+    from torchvision_dddas.settings import with_knobs
+    from torchvision_dddas.surveying import survey
+    from torchvision_dddas.vision import load
+
+    settings, recognizer = ready.settings, None
+    if people:
+        from torchvision_dddas.recognizing import recognizer_of
+        from torchvision_dddas.spotting import Spotter
+
+        settings = with_knobs(settings, {"people.search": "regions"})
+        recognizer = recognizer_of(settings.people, backend)
+        Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
+    shedding = Shedding(source, settings, health, people)
+    visions = iter([ready.vision])
+
+    def begin(feed: "Feed") -> "Iterator[Result]":
+        # After an error nothing that remembers a frame is trusted.
+        vision = next(visions, None) or load(backend, shedding.settings)
+        spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
+        watch = None if ready.watch is None else ready.watch.anew()
+
+        def retune(frame: "Frame") -> "tuple[Settings, tuple[Adjustment, ...]]":
+            settings, moved = shedding(frame)
+            if spotter is not None and moved:
+                spotter.use(settings)
+            return settings, moved
+
+        seen = None if spotter is None else spotter.see
+        for surveyed in survey(feed, vision, shedding.settings, None, watch, interval, seen=seen, retune=retune):
+            yield surveyed, None if spotter is None else spotter.of(surveyed.followed.number, feed.ended)
+
+    return begin
