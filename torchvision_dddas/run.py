@@ -31,7 +31,10 @@ _BLANK_LEVELS = 1.0
 class Clip(Protocol):
     """What the loop needs of a source."""
 
-    rate_hz: float
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
