@@ -27,7 +27,7 @@ _LEAST_SHARE = 0.4
 # Keypoints are detected anew below this share of those detected, or of the coarse cells that they covered.
 _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
-# Inliers of the refits, in RANSAC's tolerance. Half pictures do without the other two: corners off by 0.08 px with both.
+# Inliers of the refits, in RANSAC's tolerance. On half pictures 0.08 px at the corners with or without the rest.
 _TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
 
 
