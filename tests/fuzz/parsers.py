@@ -238,7 +238,8 @@ def _folder(path: Path) -> None:
 def _names_of_images(path: Path) -> None:
     from torchvision_dddas.sources.images import natural_order
 
-    sorted(path.read_bytes().decode("utf-8", "surrogateescape").splitlines(), key=natural_order)
+    names = path.read_bytes().decode("utf-8", "surrogateescape").splitlines()
+    sorted((name[:4096] for name in names), key=natural_order)  # no path is longer
 
 
 def _mask(path: Path) -> None:

@@ -103,6 +103,11 @@ def test_what_has_no_end_is_refused(tmp_path: Path, name: str, content: bytes) -
     assert BY_NAME[name].try_on(path, content) is not None
 
 
+def test_names_with_digits_of_any_script_are_put_in_order(tmp_path: Path) -> None:
+    names = "frame10.png\nframe\u0663.png\nframe2.png\n\u00b95.png\n7\u00b9.png\n"
+    assert BY_NAME["names of images"].try_on(tmp_path / "names.txt", names.encode()) is None
+
+
 @pytest.mark.parametrize(
     "record", [b'{"frames": {"written": Infinity}, "state": 1, "outputs": 5}', b"[" * 20_000, b"[1]"]
 )

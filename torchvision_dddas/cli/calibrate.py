@@ -175,7 +175,7 @@ def _known(camera: Path | None, size: str | None) -> dict[str, object]:
         known = camera_keys(camera)
     if size is not None:
         width, _, height = size.lower().partition("x")
-        if not all(side.isdecimal() and 0 < int(side[:7]) <= 100_000 for side in (width, height)):
+        if not all(side.isdecimal() and len(side) < 7 and 0 < int(side) <= 100_000 for side in (width, height)):
             raise InputError(f"--size is {size!r}; wanted WIDTHxHEIGHT in pixels, such as 768x576")
         known |= {"width_px": int(width), "height_px": int(height)}
     return known

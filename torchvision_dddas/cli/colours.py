@@ -83,7 +83,7 @@ def _box(text: str) -> tuple[str, Box]:
     cells = numbers.split(",")
     if not name.strip() or len(cells) != 4 or not all(cell.strip().isdecimal() and len(cell) < 8 for cell in cells):
         raise InputError(f"--at is '{text}'; wanted NAME=X,Y,WIDTH,HEIGHT in whole pixels, such as red=410,220,24,16")
-    x, y, width, height = (int(cell) for cell in cells)
+    x, y, width, height = (int(cell.strip()) for cell in cells)
     return name.strip(), (x, y, width, height)
 
 

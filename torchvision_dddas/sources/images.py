@@ -121,7 +121,8 @@ def read_image(file: Path) -> np.ndarray | None:
 
 def natural_order(name: str) -> list[str | int]:
     """Sorting key under which numbers count as numbers: frame2 comes before frame10."""
-    return [int(part) if part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
+    # Texts and numbers by turns; digits of other scripts are text.
+    return [int(part) if k % 2 else part.casefold() for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def images_of_folder(folder: Path) -> list[Path]:

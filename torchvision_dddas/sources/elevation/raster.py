@@ -158,7 +158,8 @@ def _part(raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: 
     holes = np.ma.getmaskarray(values)
     # Of a photo, a band that is white is no hole, though the file's value for holes be 255.
     holes = holes if values.ndim == 2 else np.broadcast_to(holes.all(axis=0), values.shape)
-    return np.where(holes, np.nan, values.data.astype(np.float64)), scaled
+    with np.errstate(invalid="ignore"):  # where a raster is damaged a value may be any bits
+        return np.where(holes, np.nan, values.data.astype(np.float64)), scaled
 
 
 def _resolution_m(raster: Any) -> float:

@@ -30,6 +30,7 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 Topic = dict[str, np.ndarray]
 
 
+@np.errstate(invalid="ignore")  # where a log is damaged a number may be any bits
 def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
     """Places, heights and attitudes of a PX4 log; times since the first of them.
 
@@ -107,8 +108,7 @@ def _valid(topic: Topic, name: str) -> np.ndarray:
     """A flag; true where the log does not have it."""
     if name not in topic:
         return np.ones(len(topic["timestamp"]), bool)
-    with np.errstate(invalid="ignore"):  # where a log is damaged a flag may be anything
-        return topic[name].astype(bool)
+    return topic[name].astype(bool)
 
 
 def _say(log: Log, quantity: str, times: np.ndarray, values: np.ndarray) -> None:
@@ -171,8 +171,7 @@ def _say_local(log: Log, local: Topic, home: Topic | None) -> None:
 def _say_camera(log: Log, topics: dict[str, Topic], yaw: np.ndarray) -> None:
     if (gimbal := topics.get("gimbal_device_attitude_status")) is not None:
         heading, pitch, roll = angles(axes_of_quaternion(_rows(gimbal, "q", 4)))
-        with np.errstate(invalid="ignore"):
-            flags = gimbal.get("device_flags", np.zeros(len(heading), int)).astype(int)
+        flags = gimbal.get("device_flags", np.zeros(len(heading), int)).astype(int)
         turned = (flags & _YAW_IN_EARTH > 0) | ((flags & _YAW_LOCK > 0) & (flags & _YAW_IN_VEHICLE == 0))
         times = _seconds(gimbal)
     elif (mount := topics.get("mount_orientation")) is not None:
