@@ -335,3 +335,17 @@ def test_doubtful_boxes_come_out_smoothed_and_certain_ones_to_the_digit():
         assert len(apart) == 30
         assert (np.abs(apart).max() > 0.5) == moved
         assert np.concatenate([f.tracks.score for f in followed]).tolist() == [score] * 30
+
+
+def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
+    vision = load_vision("onboard", SETTINGS)
+    followed = [
+        list(follow_scenes(run(Clip(12), vision, SETTINGS), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)
+    ]
+    for with_picture, without in zip(*followed, strict=True):
+        assert with_picture.frame.image.any()
+        assert without.frame.image.shape == with_picture.frame.image.shape
+        assert without.frame.image.strides == (0, 0, 0) and without.frame.number == with_picture.frame.number
+        np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
+        np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
+    assert any(len(f.tracks) for f in followed[1])

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 
 
 def follow_scenes(
-    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int]
+    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
 ) -> Iterator[Followed]:
     """A clip's own detections. The registrations from frame to frame are chained over the interval.
 
     Each counts as certain: its score grades its contrast, and it has been confirmed over several frames already.
+    pictures: as `Follower` has it.
     """
-    follower = Follower(_for_own(settings), interval, size, certain=True)
+    follower = Follower(_for_own(settings), interval, size, certain=True, pictures=pictures)
     steps: list[np.ndarray | None] = []
     adjustments: tuple[Adjustment, ...] = ()
     seconds: Counter[str] = Counter()
@@ -145,13 +146,21 @@ class Follower:
     """The tracker, and the frames it was fed that it has not settled yet."""
 
     def __init__(
-        self, settings: Settings, interval: int, size: tuple[float, float] | None, certain: bool = False
+        self,
+        settings: Settings,
+        interval: int,
+        size: tuple[float, float] | None,
+        certain: bool = False,
+        pictures: bool = True,
     ) -> None:
-        """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all."""
+        """size: (width, height) of the pictures, None where there are none. certain: feed the score 1 for all.
+
+        pictures: whether the frames that it yields still have theirs; those that wait are most of a long run's memory.
+        """
         self.interval = interval
         self.tracker = _tracker(settings, interval, size)
         self.likeness = _likeness(settings)
-        self.certain = certain
+        self.certain, self.pictures = certain, pictures
         self.spent = 0.0  # seconds on pictures, this frame's and, where a doubt asks for it later, the one before
         self.waiting: deque[Followed] = deque()
 
@@ -175,6 +184,8 @@ class Follower:
         )
         spent = self.spent - before
         took = {"appearance": spent, "track": time.perf_counter() - start - spent}
+        if frame is not None and not self.pictures:
+            followed = replace(followed, frame=without_picture(frame))
         self.waiting.append(replace(followed, seconds=followed.seconds | took))
         yield from self._settle(settled)
 
@@ -187,6 +198,11 @@ class Follower:
             followed = self.waiting.popleft()
             assert followed.number == tracks.frame, "the tracker settles frames in the order in which they were fed"
             yield replace(followed, tracks=_as_given(tracks, followed.detections))
+
+
+def without_picture(frame: Frame) -> Frame:
+    """The frame with a black picture of the same size in place of its own, which takes no memory."""
+    return replace(frame, image=np.broadcast_to(np.uint8(0), frame.image.shape))
 
 
 def _as_given(tracks: Tracks, given: Detections) -> Tracks:

@@ -29,7 +29,7 @@ class Spotter:
         self._recognizer, self._interval, self._size = recognizer, interval, size
         self._box_px = np.zeros((0, 4))
         self._search = Search(settings.people, lambda number: self._box_px)
-        self._follower = Follower(settings, interval, size)
+        self._follower = Follower(settings, interval, size, pictures=False)
         self._steps: list[np.ndarray] = []
         self._settled: dict[int, Followed] = {}
         scan.everywhere(size, settings.people)

@@ -35,12 +35,13 @@ def survey(
     mission: "Mission | None" = None,
     seen: Callable[[Scene], object] | None = None,
     retune: run.Retune | None = None,
+    pictures: bool = True,
 ) -> Iterator[Surveyed]:
     """Everything of each frame that is followed, in order.
 
     Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
     target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
-    retune: as in run.run.
+    retune: as in run.run. pictures: as `following.Follower` has it.
     """
     waiting: dict[int, Watched] = {}
     roll = RollCall() if settings.crowds.join_m else None
@@ -55,12 +56,12 @@ def survey(
             if mission is not None:
                 mission.refresh(scene)
             watched = gathered(watch.step(scene), watch.locator, source.rate_hz)
-            waiting[scene.frame.number] = watched
+            waiting[scene.frame.number] = watched if pictures else _unpictured(watched)
             if seen is not None:
                 seen(watched.scene)
             yield watched.scene
 
-    for followed in following.follow_scenes(scenes(), settings, interval, source.size):
+    for followed in following.follow_scenes(scenes(), settings, interval, source.size, pictures):
         if watch is None:
             yield Surveyed(followed)
             continue
@@ -69,6 +70,10 @@ def survey(
             followed = named(followed, past[-1].look.fix, watch.locator, roll)
         surveyed = _located(followed, past, watch.locator)
         yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
+
+
+def _unpictured(watched: Watched) -> Watched:
+    return replace(watched, scene=replace(watched.scene, frame=following.without_picture(watched.scene.frame)))
 
 
 def _located(followed: Followed, past: Sequence[Watched], locator: Locator) -> Surveyed:

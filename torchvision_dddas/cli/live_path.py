@@ -45,7 +45,9 @@ def path(
             return settings, moved
 
         seen = None if spotter is None else spotter.see
-        for surveyed in survey(feed, vision, shedding.settings, None, watch, interval, seen=seen, retune=retune):
+        for surveyed in survey(
+            feed, vision, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
+        ):
             yield surveyed, None if spotter is None else spotter.of(surveyed.followed.number, feed.ended)
 
     return begin
