@@ -338,10 +338,7 @@ def test_doubtful_boxes_come_out_smoothed_and_certain_ones_to_the_digit():
 
 
 def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
-    vision = load_vision("onboard", SETTINGS)
-    followed = [
-        list(follow_scenes(run(Clip(12), vision, SETTINGS), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)
-    ]
+    followed = [list(follow_scenes(scenes_of(12), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)]
     for with_picture, without in zip(*followed, strict=True):
         assert with_picture.frame.image.any()
         assert without.frame.image.shape == with_picture.frame.image.shape
