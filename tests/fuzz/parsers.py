@@ -5,6 +5,7 @@ A reader may accept a file or refuse it by an InputError of one line. Anything e
 
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -285,6 +286,31 @@ def _ortho(path: Path) -> None:
     read_ortho(path, np.array([[0.0, 0.0], [10.0, 10.0]]), None, 30.0)
 
 
+def _address(path: Path) -> None:
+    from torchvision_dddas.live.serving import address_of
+
+    _, port = address_of(path.read_bytes().decode("utf-8", "surrogateescape"))
+    assert 0 <= port <= 65535
+
+
+def _camera_word(path: Path) -> None:
+    from torchvision_dddas.sources.stream import target_of, without_secrets
+
+    words = path.read_bytes().decode("utf-8", "surrogateescape")
+    without_secrets(words)
+    target_of(words)
+
+
+def _stream_word(path: Path) -> None:
+    """Files alone: of an address its host would be asked for."""
+    from torchvision_dddas.sinks.streams import About, open_stream
+
+    words = path.read_bytes().decode("utf-8", "surrogateescape")
+    if "udp" not in words.lower() and not words.endswith("-"):
+        with chdir(path.parent):
+            open_stream(words, About(0.0), lambda kind, text: None).close()
+
+
 def _boxes_of_colours(path: Path) -> None:
     from torchvision_dddas.cli.colours import _box, _names
 
@@ -315,7 +341,19 @@ _TOML = (
     "0x7fffffffffffffffff",
     "1e400",
 )
-_GRAPHS = {"people_histograms.onnx": b"x", "people_scores.onnx": b"x"}
+
+
+def _graphs() -> Mapping[str, bytes]:
+    from torchvision_dddas.vision.graphs import SHIPPED
+
+    return {name: (SHIPPED / name).read_bytes() for name in ("people_histograms.onnx", "people_scores.onnx")}
+
+
+def _manifests() -> Sequence[bytes]:
+    from torchvision_dddas.vision.graphs import MANIFEST, SHIPPED
+
+    return [(SHIPPED / MANIFEST).read_bytes()]
+
 
 PARSERS: tuple[Parser, ...] = (
     Parser("MOT text", "gt.txt", _text("mot"), _truth),
@@ -368,7 +406,10 @@ PARSERS: tuple[Parser, ...] = (
     Parser("classifier .yml", "a.yml", partial(seeds.classifiers, ".yml"), _classifier, share=0.3),
     Parser("classifier .xml", "a.xml", partial(seeds.classifiers, ".xml"), _classifier, share=0.3),
     Parser("classifier .json", "a.json", partial(seeds.classifiers, ".json"), _classifier, share=0.3),
-    Parser("manifest of graphs", "manifest.json", _text("manifest"), _manifest, beside=lambda: _GRAPHS),
+    Parser("manifest of graphs", "manifest.json", _manifests, _manifest, beside=_graphs),
+    Parser("addresses to serve at", "address.txt", _text("addresses"), _address, share=0.3),
+    Parser("names of cameras", "camera.txt", _text("cameras"), _camera_word, words=("camera:", "://", "@"), share=0.3),
+    Parser("names of streams", "stream.txt", _text("streams"), _stream_word, words=("json:", "cot:"), share=0.3),
     Parser(
         "folder of PNGs", "clip/frame2.png", partial(seeds.pictures, ".png", True), _folder, text=False,
         beside=lambda: {"clip/frame1.png": seeds.pictures(".png")[0], "clip/frame3.png": seeds.pictures(".png")[1]},

@@ -140,17 +140,9 @@ TEXT: dict[str, tuple[str, ...]] = {
             }
         ),
     ),
-    "manifest": (
-        json.dumps(
-            {
-                "origin": "export",
-                "versions": {"onnx": "1.17", "opset": 20},
-                "layout": {"cell_px": 8, "block_px": 16, "block_stride_px": 8, "bins": 9, "signed": 0, "gamma": 1},
-                "graphs": {"people_scores.onnx": {"sha256": "00", "inputs": {"bias": []}, "outputs": {}}},
-            },
-            indent=1,
-        ),
-    ),
+    "addresses": ("8080", "0.0.0.0:8080", "[::1]:9000"),
+    "cameras": ("camera:0", "camera:12", "rtsp://user:word@host/stream"),
+    "streams": ("json:rows.jsonl", "mot:rows.txt", "json:/dev/null"),
     "input names": (
         "camera:0", "sim:four", "nowhere.mp4", "frames/*.png", "frames/frame[0-9].png", "sim:nowhere.toml", "x/",
         "sim:",

@@ -22,7 +22,7 @@ NOT_WHOLE = {
     # What the seeds of another reader are to this one.
     "MOT text": {3}, "truth of a clip": {3}, "tracks of a result": {1, 3}, "detections as text": {3},
     "tables of other programs": {2}, "folder of PNGs": {2}, "names of inputs": {2, 3, 4, 5, 6, 7},
-    "classifier .yml": {1}, "classifier .xml": {1}, "classifier .json": {1}, "manifest of graphs": {0},
+    "classifier .yml": {1}, "classifier .xml": {1}, "classifier .json": {1},
 }  # fmt: skip
 BY_NAME = {parser.name: parser for parser in PARSERS}
 
@@ -92,6 +92,9 @@ def test_a_png_that_says_a_chunk_is_longer_than_the_file_is_refused_at_once(tmp_
         ("overrides", b"registration.keypoints=" + b"[" * 5000),
         ("names of inputs", b"a" * 300),
         ("names of inputs", b"a\0b"),
+        ("names of cameras", "camera:\u00b2".encode()),
+        ("addresses to serve at", "\u00b2".encode()),
+        ("overrides", b"crowd." + b"1" * 5000 + b".people=3"),
         ("names of inputs", b"sim:" + b"a" * 300),
         ("seqinfo.ini", b"[Sequence]\nseqLength=" + b"9" * 60),
         ("MOT text", b"1,1,0,0,1e200,1e200\n"),

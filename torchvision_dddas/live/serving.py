@@ -20,7 +20,7 @@ _AT_ONCE = 8  # clients; more are turned away, so that they cannot take the run'
 def address_of(spec: str) -> tuple[str, int]:
     """PORT or HOST:PORT; a port alone is this machine's own. Raises InputError for anything else."""
     host, _, port = spec.rpartition(":")
-    if not port.isdigit() or not 0 <= int(port) <= 65535:
+    if not port.isdecimal() or len(port) > 5 or int(port) > 65535:
         raise InputError(f"--serve {spec} is no address; wanted PORT or HOST:PORT, such as 8080 or 0.0.0.0:8080")
     return host.strip("[]") or LOOPBACK, int(port)
 

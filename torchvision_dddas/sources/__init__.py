@@ -33,7 +33,7 @@ def open_source(
         return open_scenario(text.removeprefix("sim:"))
     if text.startswith("camera:"):
         index = text.removeprefix("camera:")
-        if not index.isdigit():
+        if not index.isdecimal() or len(index) > 4:
             raise InputError(f"'{text}' names no camera; wanted camera:0, camera:1, ...")
         return VideoSource(int(index), text, rate_hz)
     if "://" in text:

@@ -63,7 +63,7 @@ def target_of(spec: str) -> str | int | None:
     """What OpenCV is to open for `camera:0` or an address; None for anything else. Raises InputError."""
     if spec.startswith("camera:"):
         index = spec.removeprefix("camera:")
-        if not index.isdigit():
+        if not index.isdecimal() or len(index) > 4:
             raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
         return int(index)
     return spec if "://" in spec else None

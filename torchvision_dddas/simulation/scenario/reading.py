@@ -82,7 +82,7 @@ def _change(content: dict[str, Any], name: str, value: object) -> None:
 
 
 def _entry(entries: list[Any], kind: str, number: str, name: str) -> Any:
-    if not number.isdecimal() or not 1 <= int(number) <= len(entries):
+    if not number.isdecimal() or len(number) > 6 or not 1 <= int(number) <= len(entries):
         one = "is 1" if len(entries) == 1 else f"are {len(entries)}"
         raise InputError(f"'{name}' names no {kind}; wanted {kind}.1, {kind}.2, ..., of which there {one}")
     return entries[int(number) - 1]
