@@ -9,6 +9,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -94,22 +95,21 @@ class OnboardRecognizer:
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
-        channels = 1 if level.ndim == 2 else 3
-        planes = self._gradient.scratch("planes", (channels, part.height + 2, part.width + 2), np.uint8)
-        fill(planes, level, part)
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
         common = math.gcd(stride, knobs.block_stride_px)
         phases, every = knobs.block_stride_px // common, stride // common
         for row in range(min(phases, height)):
             for column in range(min(phases, width)):
-                found = self._scored(planes[:, row * stride :, column * stride :])[::every, ::every]
+                x, y = column * stride, row * stride
+                inner = replace(part, x=part.x + x, y=part.y + y, width=part.width - x, height=part.height - y)
+                found = self._scored(level, inner)[::every, ::every]
                 here = scores[row::phases, column::phases]
                 here[:] = found[: here.shape[0], : here.shape[1]]
         return scores
 
-    def _scored(self, planes: np.ndarray) -> np.ndarray:
-        """Scores of the windows at every block stride. planes: uint8 (C, H + 2, W + 2)."""
-        histograms = self._histograms(planes)
+    def _scored(self, level: np.ndarray, part: Part) -> np.ndarray:
+        """Scores of the windows at every block stride."""
+        histograms = self._histograms(level, part)
         _, ny, nx = histograms.shape
         down, across, _ = self.svm_feed["weights"].shape
         found = np.empty((ny - down + 1, nx - across + 1), np.float32)
@@ -119,16 +119,21 @@ class OnboardRecognizer:
             (found[top:bottom],) = self.sessions[1].run(None, {"histograms": rows, **self.svm_feed})
         return found
 
-    def _histograms(self, planes: np.ndarray) -> np.ndarray:
+    def _histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
         gradient = self._gradient
         block, stride = self.knobs.block_px, self.knobs.block_stride_px
-        down, across = ((length - 2 - block) // stride + 1 for length in planes.shape[1:])
+        down, across = ((length - block) // stride + 1 for length in (part.height, part.width))
+        channels = 1 if level.ndim == 2 else 3
         side = max(1, (_TILE_PX - block) // stride + 1)
         size = self.knobs.bins * (block // self.knobs.cell_px) ** 2
         found = gradient.scratch("histograms", (size, down, across))
-        for first, last in spans(down, max(side, _GRADIENT_PX // planes.shape[2] // stride)):
-            polar = gradient(planes[:, first * stride : (last - 1) * stride + block + 2])
+        for first, last in spans(down, max(side, _GRADIENT_PX // (part.width + 2) // stride)):
+            # The channels of these rows alone: those of the whole would take 6 MB at 1280x720.
+            rows_px = (last - 1 - first) * stride + block
+            planes = gradient.scratch("planes", (channels, rows_px + 2, part.width + 2), np.uint8)
+            fill(planes, level, replace(part, y=part.y + first * stride, height=rows_px))
+            polar = gradient(planes)
             for top, bottom in spans(last - first, side):
                 for left, right in spans(across, side):
                     rows = slice(top * stride, (bottom - 1) * stride + block)
