@@ -1,6 +1,7 @@
 """Graphs traced from `ops`: what torch computes, of standard operations, the same bytes each time.
 
-Tracing takes long: only the smaller graph, at a small size, is traced here, once. eval/step_graph.py compares the step.
+A graph takes time for every node, so the step is traced once, at a small size and with as little flow and morphology
+as there can be; eval/step_graph.py compares the whole of it, on real clips too.
 """
 
 from pathlib import Path
@@ -22,7 +23,16 @@ from torchvision_dddas.exporting.building import OPSET
 from torchvision_dddas.exporting.checked import Made
 from torchvision_dddas.settings import Settings, load, with_knobs
 
-SIZE = (96, 80)
+SIZE, STEP_SIZE = (96, 80), (128, 96)
+LEAST = {
+    "registration.model": "affine",
+    "registration.levels": 1,
+    "registration.iterations": 1,
+    "registration.cell_px": 12,
+    "difference.blur_px": 3,
+    "morphology.erode_px": 1,
+    "morphology.close_px": 3,
+}
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +57,30 @@ def test_the_graph_computes_what_torch_does_on_pictures_it_was_not_traced_with(m
         assert wanted_mask.any() and not wanted_mask.all()
         assert np.mean(difference != wanted) < 1e-3
         assert traced.overlap(mask, wanted_mask) > 0.999
+
+
+def test_the_whole_step_computes_what_torch_does_on_pictures_it_was_not_traced_with(fast):
+    settings = with_knobs(fast, LEAST)
+    (made,) = traced.made("step", settings, STEP_SIZE).values()
+    assert all(check.passed for check in made.checks)
+    graph = traced.module("step", settings, STEP_SIZE)
+    session = onnxruntime.InferenceSession(made.content, providers=["CPUExecutionProvider"])
+    for seed in (1, 2):
+        given = traced.example("step", settings, STEP_SIZE, seed)
+        for tolerance_px in (2.0, 0.5):
+            given["tolerance_px"] = torch.tensor(tolerance_px, dtype=torch.float64)
+            matrix, inliers, tracked, _, mask = session.run(None, {name: v.numpy() for name, v in given.items()})
+            with torch.inference_mode():
+                wanted = [value.numpy() for value in graph(*given.values())]
+            assert traced.corner_error(matrix, wanted[0], mask.shape) < 0.1
+            np.testing.assert_array_equal(tracked, wanted[2])
+            assert np.abs(inliers - wanted[1]).max() <= 1 and (inliers > 8).all()
+            assert traced.overlap(mask, wanted[4]) > 0.98 and mask.any() and not mask.all()
+
+
+def test_the_same_graph_is_the_same_bytes(made, fast):
+    (again,) = traced.made("warp_difference", fast, SIZE).values()
+    assert again.content == made.content
 
 
 def test_the_threshold_is_an_input(made, fast):

@@ -33,7 +33,7 @@ def export(
     """Make the ONNX graphs of our functions, for the onboard back end and for accelerators.
 
     Writes the graphs and manifest.json (inputs, outputs, knobs, SHA-256, versions) under --out, once all agree with
-    torch. `step` takes minutes.
+    torch. `step` takes half a minute, the others seconds.
     """
     from torchvision_dddas import exporting
     from torchvision_dddas.settings import load
