@@ -233,24 +233,36 @@ def test_a_read_that_never_returns_is_given_up_and_its_thread_ends_when_it_does(
     assert some.streams[0].released.wait(PATIENCE_S)
 
 
-def test_no_more_than_four_threads_hang_at_a_time(camera) -> None:
+def test_no_more_than_four_threads_hang_at_a_time(camera, monkeypatch) -> None:
     stuck = [Gate() for _ in range(4)]
     some = camera([grey(1), stuck[0]], *[[gate] for gate in stuck[1:]], [grey(2)])
     frames = taken(some.frames, 1)
-    waking = [after(gate, lambda: some.clock.pass_s(60)) for gate in stuck]
+    feed, given_up, opened = some.source._feed, threading.Event(), list[int]()
+    check = feed.check
+
+    def watched() -> float:
+        until_s = check()
+        if feed._turn == len(stuck):
+            given_up.set()
+        return until_s
+
+    monkeypatch.setattr(feed, "check", watched)
+    for gate in stuck:
+        after(gate, lambda: some.clock.pass_s(60))
 
     def end_one() -> None:
-        for thread in waking:
-            thread.join()
+        assert given_up.wait(PATIENCE_S)
+        opened.append(some.opener.opened)
+        third = feed.threads[2]
         stuck[2].open.set()
-        assert some.streams[2].released.wait(PATIENCE_S)
-        while some.opener.opened < 5:  # asked again as time passes
-            some.clock.pass_s(10)
+        third.join(PATIENCE_S)
+        some.clock.pass_s(10)  # looked after again as time passes
 
     ending = threading.Thread(target=end_one)
     ending.start()
     frames += taken(some.frames, 1)
     ending.join()
+    assert opened == [4]
     assert int(frames[1].image[0, 0, 0]) == 2
     for gate in stuck:
         gate.open.set()

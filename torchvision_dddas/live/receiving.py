@@ -68,6 +68,7 @@ class Receiver:
         self._odd: tuple[tuple[int, ...], float] | None = None  # what does not fit: its shape, since when
         self._off = False  # it was told that the rate is not as announced
         self.threads: list[threading.Thread] = []
+        self._at_work: threading.Thread | None = None  # the one that counts; None where all that there are hang
         self._spawn()
         try:
             self._await_first()
@@ -92,9 +93,9 @@ class Receiver:
                 if now_s < since_s + allowed_s:
                     return since_s + allowed_s
                 self._turn += 1
-                self._call = None
+                self._call = self._at_work = None
                 self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
-            elif self.threads and self.threads[-1].is_alive():
+            elif self._at_work is not None and self._at_work.is_alive():
                 return now_s + self._knobs.stall_s
             self.threads = [thread for thread in self.threads if thread.is_alive()]
             if len(self.threads) < _MOST_HUNG:
@@ -106,6 +107,7 @@ class Receiver:
     def _spawn(self) -> None:
         thread = threading.Thread(target=self._work, args=(self._turn,), name="receiving", daemon=True)
         self.threads.append(thread)
+        self._at_work = thread
         thread.start()
 
     def _await_first(self) -> None:
