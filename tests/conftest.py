@@ -4,6 +4,7 @@ import os
 
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(name, "2")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads that spin take the cores from the other tests
 
 import cv2  # noqa: E402 (after the limits, which the libraries read when they load)
 
