@@ -15,10 +15,10 @@ from torchvision_dddas.vision.cells import cell_side
 from torchvision_dddas.vision.torch_pixels import LEVEL, apart, seen_by_both
 
 LEAST_GRID = 8  # a grid of fewer keypoints than this squared is none
-HYPOTHESES = 64
+HYPOTHESES = 128
 # Keypoints that search the whole pyramid; the others start where these say, in the full resolution alone. 200 of them
-# all searching would take three times the nodes' work.
-SCOUTS, STEPS, REACH_PX = 64, 6, 3
+# all searching would take three times the nodes' work. With 64 scouts, or 3 steps, a motion in some dozens is lost.
+SCOUTS, STEPS, REACH_PX = 96, 6, 3
 REFITS = 1.0, 0.5  # of the tolerance of RANSAC
 
 
