@@ -26,6 +26,7 @@ Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
 
 # A picture whose grey levels spread by less than this shows nothing, not even through fog.
 _BLANK_LEVELS = 1.0
+_FEWEST = 3  # frames that a window needs
 
 
 class Clip(Protocol):
@@ -44,6 +45,13 @@ def _blank(view: View) -> bool:
         view.kept["blank"] = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
     blank: bool = view.kept["blank"]
     return blank
+
+
+def check_length(frames: int) -> None:
+    """Raises InputError where a clip of so many frames is too short for any window."""
+    if frames < _FEWEST:
+        few = "no frame" if frames == 0 else f"{frames} frame" + "s" * (frames > 1)
+        raise InputError(f"the clip has {few} that can be read, a window needs {_FEWEST}: {_FEWEST - frames} missing")
 
 
 def _memory(settings: Settings) -> int:
@@ -168,12 +176,7 @@ class Loop:
 
     def end(self, last: int = 0) -> Iterator[Scene]:
         """The clip is over: settle everything that is left. last: number of the clip's last frame, read or not."""
-        wanted = 3
-        if self.total < wanted:
-            few = "no frame" if self.total == 0 else f"{self.total} frame" + "s" * (self.total > 1)
-            raise InputError(
-                f"the clip has {few} that can be read, a window needs {wanted}: {wanted - self.total} missing"
-            )
+        check_length(self.total)
         self.ended = True
         yield from self._advance()
         yield from self._gap(last + 1)

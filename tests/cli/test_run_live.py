@@ -137,6 +137,15 @@ def test_a_mistake_at_the_start_is_one_line_and_leaves_nothing(dddas, frames, tm
     assert not (tmp_path / "out").exists()
 
 
+def test_a_folder_of_fewer_pictures_than_a_window_needs_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
+    (tmp_path / "clip").mkdir()
+    for number in (1, 2):
+        (tmp_path / "clip" / f"{number}.png").write_bytes((frames / f"{number:03d}.png").read_bytes())
+    said = bad(dddas("run", tmp_path / "clip", *FAST, "--out", tmp_path / "out"))
+    assert "the clip has 2 frames that can be read, a window needs 3: 1 missing" in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -49,6 +49,7 @@ def run_live(
     from torchvision_dddas.live.serving import Page, Serving, address_of
     from torchvision_dddas.live.stopping import Stopping
     from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
+    from torchvision_dddas.run import check_length
     from torchvision_dddas.sinks.session import RESULTS, claim
     from torchvision_dddas.sources.stream import without_secrets
 
@@ -57,6 +58,8 @@ def run_live(
     with ExitStack() as stack:
         # What may be wrong at the start is found before the session has a folder.
         source = stack.enter_context(closing(LiveSource(clip, live, health, rate_hz=rate_hz)))
+        if source.recorded is not None:
+            check_length(source.recorded)
         ready = prepared(given, telemetry, settings, source, backend, clip)
         begin = path(ready, source, people, interval, backend, health)
         said, opened = _about(ready), stack.enter_context(ExitStack())

@@ -27,6 +27,7 @@ class LiveSource:
     name: as given, but for a password. number: of frames by the clock at rate_hz, so that it stays in step with time;
     those that were dropped, not looked at or lost are in the next one's `skipped`. time_s: a recording's own; a
     camera's by the clock since the first.
+    recorded: pictures that a recording says for sure it holds; None where it does not, and of cameras.
     start_utc_s: seconds since 1970 at time_s = 0, NaN before the first picture; follows the machine's clock when set.
     apart_s: from picture to picture by the clock; 0 where they wait for the run. busy_s: what the last look took.
     problems: the latest. Whatever goes wrong while it runs is an event of `health` (kind `stream`), and a problem;
@@ -57,10 +58,12 @@ class LiveSource:
         told = (self._inbox, self._diary, self.health, self._clock)
         target = target_of(text)
         self._feed: Player | Receiver
+        self.recorded: int | None = None
         if opener is None and target is None:
             recording = open_source(text, rate_hz=rate_hz, full_scale=full_scale)
             self._feed = Player(recording, self.knobs.pace, *told)
             self.rate_hz, self.size = recording.rate_hz, recording.size
+            self.recorded = recording.count if recording.exact else None
             return
         limit_s = self.knobs.stall_s
         where = text if target is None else target
