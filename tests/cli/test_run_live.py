@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -54,6 +55,17 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
     assert record["counts"]["looked_at"] == FRAMES
     assert record["seconds"]["latency"]["p50"] > 0
     assert "results of 14 pictures, 0 dropped" in done.stderr
+
+
+def test_what_the_user_should_know_of_his_files_is_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
+    from torchvision_dddas.cli import live
+
+    prepared = live.prepared
+    monkeypatch.setattr(live, "prepared", lambda *given: replace(prepared(*given), notes=["bravo has no colour"]))
+    done = dddas("run", frames, *FAST, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert "dddas: note: bravo has no colour\n" in done.stderr
+    assert session(tmp_path)[1]["notes"] == ["bravo has no colour"]
 
 
 def test_a_second_session_touches_nothing_of_the_first(dddas, frames, tmp_path):

@@ -83,7 +83,7 @@ def run_live(
             stack.enter_context(serving)
         supervisor.say("READY=1")
         if not quiet:
-            _say_start(source, folder, serving)
+            _say_start(source, folder, serving, ready.notes)
         failed = ""
         try:
             _work(begin, feed, source, streams, said, health, live.deadline_ms)
@@ -194,11 +194,13 @@ def _ending(feed: "Feed", source: "LiveSource") -> Callable[[int], None]:
     return end
 
 
-def _say_start(source: "LiveSource", folder: Path, serving: "Serving | None") -> None:
+def _say_start(source: "LiveSource", folder: Path, serving: "Serving | None", notes: Sequence[str]) -> None:
     width, height = source.size
     live_words.say(f"{source.name}, {width}x{height} at {source.rate_hz:g} Hz; into {folder}")
     if serving is not None:
         live_words.say("how it goes: http://{}:{}/".format(*serving.address))
+    for note in notes:
+        live_words.say(f"note: {note}")
 
 
 def _work(
