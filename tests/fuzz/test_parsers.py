@@ -106,6 +106,18 @@ def test_what_has_no_end_is_refused(tmp_path: Path, name: str, content: bytes) -
     assert BY_NAME[name].try_on(path, content) is not None
 
 
+def test_a_px4_log_whose_last_message_says_it_is_longer_than_the_file_comes_to_an_end(tmp_path: Path) -> None:
+    """pyulog 1.3 reads its end for ever."""
+    pytest.importorskip("pyulog")
+    whole = seeds.px4()[0]
+    BY_NAME["PX4 ULog"].try_on(tmp_path / "a.ulg", whole[:16] + struct.pack("<HB", 60_000, 0) + whole[16:300])
+
+
+def test_a_table_with_a_quote_about_several_cells_is_refused(tmp_path: Path) -> None:
+    content = BY_NAME["detections as CSV"].case(2, 492)
+    assert BY_NAME["detections as CSV"].try_on(tmp_path / "a.csv", content) is not None
+
+
 def test_names_with_digits_of_any_script_are_put_in_order(tmp_path: Path) -> None:
     names = "frame10.png\nframe\u0663.png\nframe2.png\n\u00b95.png\n7\u00b9.png\n"
     assert BY_NAME["names of images"].try_on(tmp_path / "names.txt", names.encode()) is None

@@ -29,7 +29,10 @@ def read_rows(path: str | Path, count: int, without: Sequence[str] = ()) -> tupl
     if len(rows) != count:
         raise InputError(f"{path} has cells that go over several lines; wanted a line a row, without quotes")
     frame = header.index("frame")
-    rows.sort(key=lambda row: float(row[frame]))  # a stable sort
+    try:
+        rows.sort(key=lambda row: float(row[frame]))  # a stable sort
+    except ValueError:
+        raise InputError(f"{path} has quotes about more than one cell; wanted a line a row, without quotes") from None
     kept = [place for place, name in enumerate(header) if name not in without]
     return [header[place] for place in kept], [[row[place] for place in kept] for row in rows]
 

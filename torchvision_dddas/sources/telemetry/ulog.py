@@ -51,6 +51,24 @@ def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
     return assembled(log, clock_offset_s, _clock(topics), from_first=True)
 
 
+class _Onwards(io.BufferedReader):
+    """A file in which a step back is no longer than what was read.
+
+    pyulog 1.3 steps back by as much as a damaged message says that it is long; where the file ended before, it would
+    come to the same place for ever.
+    """
+
+    _short = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self._short = max((size or 0) - len(data), 0)
+        return data
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        return super().seek(offset + self._short if whence == io.SEEK_CUR and offset < 0 else offset, whence)
+
+
 def _topics(log: Log) -> dict[str, Topic]:
     try:
         from pyulog import ULog
@@ -60,7 +78,7 @@ def _topics(log: Log) -> dict[str, Topic]:
         ) from None
     try:
         # It prints what it finds damaged.
-        with contextlib.redirect_stdout(io.StringIO()), log.path.open("rb") as file:
+        with contextlib.redirect_stdout(io.StringIO()), _Onwards(io.FileIO(log.path)) as file:
             read = ULog(file, list(_TOPICS))
     except Exception as error:
         raise log.refuse(f"the PX4 log is damaged from its beginning and cannot be read ({error})") from None
