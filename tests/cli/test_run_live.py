@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.cli.mistakes import bad
+from torchvision_dddas.cli.prepared import prepared
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.sources.stream import without_secrets
 
@@ -58,10 +59,10 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
 
 
 def test_what_the_user_should_know_of_his_files_is_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
-    from torchvision_dddas.cli import live
+    def noting(*given):
+        return replace(prepared(*given), notes=["bravo has no colour"])
 
-    prepared = live.prepared
-    monkeypatch.setattr(live, "prepared", lambda *given: replace(prepared(*given), notes=["bravo has no colour"]))
+    monkeypatch.setattr("torchvision_dddas.cli.live.prepared", noting)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert "dddas: note: bravo has no colour\n" in done.stderr
