@@ -14,8 +14,8 @@ import torchvision_dddas
 PACKAGE = Path(torchvision_dddas.__file__).parent
 OWN = "torchvision_dddas"
 
-# Module or folder -> what it may import beside the standard library, itself and names of shapes. The longest name that fits
-# decides. A new module or folder needs a line here. "*" is anything but torch and kornia at module level.
+# Module or folder -> what it may import beside the standard library, itself and names of shapes. The longest name that
+# fits decides. A new module or folder needs a line here. "*" is anything but torch and kornia at module level.
 FLOORS: dict[str, set[str]] = {
     "__init__": set(),
     "types": {"numpy"},
