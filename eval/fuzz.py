@@ -11,6 +11,7 @@ is for inputs with defects. Exit code 1 if there are any.
 
 import argparse
 import json
+import math
 import multiprocessing as mp
 import os
 import resource
@@ -153,7 +154,7 @@ def main() -> None:
     parsers = [p for p in PARSERS if p.there and any(word in p.name for word in asked.only)]
     absent = [p.name for p in PARSERS if not p.there]
     share = asked.inputs / sum(p.share for p in parsers)
-    wanted = {p.name: max(round(p.share * share), 1) for p in parsers}
+    wanted = {p.name: math.ceil(p.share * share) for p in parsers}
     jobs = [(name, k, min(k + CHUNK, n)) for name, n in wanted.items() for k in range(0, n, CHUNK)]
     jobs.reverse()
     counts = {name: Counter[str]() for name in wanted}

@@ -109,8 +109,8 @@ def test_what_has_no_end_is_refused(tmp_path: Path, name: str, content: bytes) -
 def test_a_px4_log_whose_last_message_says_it_is_longer_than_the_file_comes_to_an_end(tmp_path: Path) -> None:
     """pyulog 1.3 reads its end for ever."""
     pytest.importorskip("pyulog")
-    whole = seeds.px4()[0]
-    BY_NAME["PX4 ULog"].try_on(tmp_path / "a.ulg", whole[:16] + struct.pack("<HB", 60_000, 0) + whole[16:300])
+    content = seeds.px4()[0][:16] + bytes(100) + struct.pack("<HB", 60, 0) + bytes(10)
+    assert BY_NAME["PX4 ULog"].try_on(tmp_path / "a.ulg", content) is not None
 
 
 def test_a_table_with_a_quote_about_several_cells_is_refused(tmp_path: Path) -> None:
