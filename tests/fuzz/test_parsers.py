@@ -109,7 +109,9 @@ def test_what_has_no_end_is_refused(tmp_path: Path, name: str, content: bytes) -
 def test_a_px4_log_whose_last_message_says_it_is_longer_than_the_file_comes_to_an_end(tmp_path: Path) -> None:
     """pyulog 1.3 reads its end for ever."""
     pytest.importorskip("pyulog")
-    content = seeds.px4()[0][:16] + bytes(100) + struct.pack("<HB", 60, 0) + bytes(10)
+    whole = seeds.px4()[0]
+    first = whole[: 16 + 3 + int.from_bytes(whole[16:18], "little")]
+    content = first + bytes(40_000) + struct.pack("<HB", 60, 0) + bytes(10)
     assert BY_NAME["PX4 ULog"].try_on(tmp_path / "a.ulg", content) is not None
 
 
