@@ -16,3 +16,9 @@ except ModuleNotFoundError:  # the onboard install
     pass
 else:
     torch.set_num_threads(2)
+
+from hypothesis import settings  # noqa: E402
+
+# On a busy machine an example may take as long as it likes.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
