@@ -34,9 +34,9 @@ class Spotter:
         self._settled: dict[int, Followed] = {}
         scan.everywhere(size, settings.people)
 
-    def use(self, settings: Settings) -> None:
+    def retune(self, settings: Settings) -> None:
         """From now on search as these say."""
-        self._search.use(settings.people)
+        self._search.retune(settings.people)
 
     def see(self, scene: Scene) -> None:
         """The next scene."""

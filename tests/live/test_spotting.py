@@ -92,7 +92,7 @@ def test_a_narrower_search_looks_at_less():
         spotter = Spotter(recognizer, SETTINGS, 1, SIZE)
         for scene in scenes():
             if scene.frame.number == 3:
-                spotter.use(settings)
+                spotter.retune(settings)
             spotter.see(scene)
         return recognizer.windows
 

@@ -41,7 +41,7 @@ def path(
         def retune(frame: "Frame") -> "tuple[Settings, tuple[Adjustment, ...]]":
             settings, moved = shedding(frame)
             if spotter is not None and moved:
-                spotter.use(settings)
+                spotter.retune(settings)
             return settings, moved
 
         seen = None if spotter is None else spotter.see

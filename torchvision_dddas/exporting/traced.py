@@ -66,7 +66,7 @@ def module(name: str, settings: Settings, size: tuple[int, int]) -> nn.Module:
 
 
 def baked(name: str, settings: Settings) -> dict[str, Any]:
-    """The knobs that the graph holds, and what the runner of the graph gives for the others."""
+    """The knobs that the graph holds."""
     difference, morphology = settings.difference, settings.morphology
     held: dict[str, Any] = {
         "difference.blur_px": difference.blur_px,

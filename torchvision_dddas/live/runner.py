@@ -11,28 +11,19 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.sources.telemetry import at
+from torchvision_dddas.surveying import Clip
 from torchvision_dddas.types import Followed, Frame, Surveyed, Telemetry
 
 _IN_VAIN = 25
 """So many new beginnings in a row without any result are enough: it would go on like this for ever."""
 
 
-class LiveFrames(Protocol):
+class LiveFrames(Clip, Protocol):
     """What the run needs of a live source; see live.capture.LiveSource."""
 
     @property
     def name(self) -> str:
         """What to call it in messages."""
-        ...
-
-    @property
-    def rate_hz(self) -> float:
-        """Frames a second."""
-        ...
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) in px."""
         ...
 
     @property

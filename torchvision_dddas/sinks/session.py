@@ -12,7 +12,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.sinks.ground_tracks import iso_utc
 from torchvision_dddas.sinks.journal import NAME as RECORD
 from torchvision_dddas.sinks.journal import finite, versions
 from torchvision_dddas.sinks.whole import write_whole
@@ -75,7 +78,12 @@ class SessionLog:
 
     def tell(self, events: Iterable[Told]) -> None:
         """Append events, a line each: UTC time, frame or -, kind, words."""
-        lines = "".join(f"{stamp(e.utc_s)} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n" for e in events)
+        told = list(events)
+        stamps = iso_utc(np.array([event.utc_s for event in told]))
+        lines = "".join(
+            f"{stamp} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n"
+            for stamp, e in zip(stamps, told, strict=True)
+        )
         size, rest = os.fstat(self._events).st_size, lines.encode()
         try:
             while rest:
@@ -93,8 +101,3 @@ class SessionLog:
     def close(self) -> None:
         """Nothing follows."""
         os.close(self._events)
-
-
-def stamp(utc_s: float) -> str:
-    """ISO 8601 to the millisecond."""
-    return datetime.fromtimestamp(utc_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -160,13 +160,7 @@ class Search:
         self.told = 1.0  # share of windows in the last line of the record
 
     def retune(self, knobs: PeopleKnobs) -> None:
-        """Search more or less widely from the next look on; the kind of search stays."""
-        self.knobs = self.expected.knobs = knobs
-        n = knobs.rescan_frames
-        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
-
-    def use(self, knobs: PeopleKnobs) -> None:
-        """From now on search as these say; whether in regions or everywhere stays as it was."""
+        """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
         self.knobs = self.expected.knobs = knobs
         n = knobs.rescan_frames
         self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
