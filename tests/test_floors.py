@@ -85,6 +85,10 @@ FLOORS: dict[str, set[str]] = {
     # A scenario is knobs: the same machinery reads, checks and describes them.
     "simulation.scenario": {"pydantic", "settings", "errors"},
     "metrics": {"numpy", "scipy", "cv2", "picture_bytes", "types", "errors"},
+    # Data sets as they lie on disk: what is true of their clips, and where their pictures are.
+    "datasets": {"numpy", "cv2", "metrics", "sources", "picture_bytes", "types", "errors"},
+    # Many clips at once: what runs them is loaded in the jobs.
+    "studies": {"*"},
     "demo": {"numpy", "cv2", "simulation", "sinks", "errors"},
     "evaluate": {"numpy", "cv2", "metrics", "sources", "errors"},
     "tuning": {"torch", "*"},

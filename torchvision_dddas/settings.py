@@ -377,6 +377,12 @@ class PeopleKnobs(Group):
     rescan_frames: int = knob(
         10, "frames", 1, 10_000, meaning="regions: in so many frames the whole picture, some of its levels in each"
     )
+    at_once: bool = knob(
+        True,
+        "-",
+        meaning="regions: at first, and when all who were expected are lost, the whole picture in one look; "
+        "false: in turns then too, as --live does",
+    )
     region_margin: float = knob(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
     region_scales: float = knob(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
 

@@ -16,6 +16,11 @@ def test_counts_of_two_small_masks():
     assert segmentation.count(found, truth) == Pixels(tp=2, fp=1, fn=1, tn=2)
 
 
+def test_pixels_of_which_nothing_is_known_do_not_count():
+    found, truth = np.array([[1, 1, 0, 0]]), np.array([[5, -1, -1, 0]])
+    assert segmentation.count(found, truth) == Pixels(tp=1, fp=0, fn=0, tn=1)
+
+
 def test_six_measures_by_hand():
     m = segmentation.measures(Pixels(tp=6, fp=2, fn=4, tn=8))
     assert m["accuracy"] == pytest.approx(14 / 20)

@@ -127,6 +127,18 @@ def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost
     ]
 
 
+def test_without_whole_looks_a_round_shows_every_level_at_first_and_after_all_are_lost():
+    def found(n):
+        return people(walker(n), (400, 200, 40, 110)) if n < 15 else people()
+
+    made = looks(Search(KNOBS.model_copy(update={"at_once": False})), found, 40)
+    everywhere = scan.everywhere(SIZE, KNOBS)
+    assert all(look.regions_px is not None and look.share < 0.5 for look in made.values())
+    for begin in (1, 16):
+        seen = [part for n in range(begin, begin + 10) for part in made[n].parts if part in everywhere]
+        assert sorted(part.level for part in seen) == sorted(part.level for part in everywhere)
+
+
 def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():
     made = looks(Search(KNOBS), lambda n: people(walker(n)), 110)
     lines = [a for look in made.values() for a in look.adjustments]

@@ -26,7 +26,8 @@ def path(
         from torchvision_dddas.recognizing import recognizer_of
         from torchvision_dddas.spotting import Spotter
 
-        settings = with_knobs(settings, {"people.search": "regions"})
+        # A look at the whole picture takes as long as many pictures come.
+        settings = with_knobs(settings, {"people.search": "regions", "people.at_once": False})
         recognizer = recognizer_of(settings.people, backend)
         Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
     shedding = Shedding(source, settings, health, people)

@@ -86,15 +86,16 @@ def _by_masks(truth: Truth, result: Result, frames: list[int]) -> Counts:
     if not result.has_masks:
         raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
     for f in frames:
-        labels, mask = truths.read_mask(truth.masks[f]), result.mask_at(f)
+        labels, mask = truths.labels_of(truth, f), result.mask_at(f)
         if labels.shape != mask.shape:
             raise InputError(
                 f"frame {f}: the truth is {labels.shape[1]}×{labels.shape[0]} pixels ({truth.masks[f]}), "
                 f"the result {mask.shape[1]}×{mask.shape[0]} ({result.place})"
             )
         pixels = pixels.plus(segmentation.count(mask, labels))
-        boxes = boxes.plus(detection.match(result.boxes_at(f), detection.boxes_of(labels)))
-    return {"pixels": pixels, "boxes": boxes}
+        if truth.labels.separate:
+            boxes = boxes.plus(detection.match(result.boxes_at(f), detection.boxes_of(labels)))
+    return {"pixels": pixels, "boxes": boxes} if truth.labels.separate else {"pixels": pixels}
 
 
 def _by_tracks(

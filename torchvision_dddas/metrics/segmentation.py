@@ -20,7 +20,10 @@ class Pixels(NamedTuple):
 
 
 def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
-    """Compare two masks of one shape; anything above 0 is foreground."""
+    """Compare two masks of one shape; anything above 0 is foreground. Where the truth is below 0 nothing counts."""
+    if truth.min(initial=0) < 0:
+        known = truth >= 0
+        found, truth = found[known], truth[known]
     f, t = found > 0, truth > 0
     tp, positives, labelled = (int(np.count_nonzero(x)) for x in (f & t, f, t))
     return Pixels(tp, positives - tp, labelled - tp, f.size - positives - labelled + tp)

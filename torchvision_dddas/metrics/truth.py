@@ -19,11 +19,32 @@ MOST_FRAMES = 10_000_000
 
 
 @dataclass(frozen=True)
+class Labels:
+    """What the values of a mask mean. background: nothing moves there. unscored: nobody knows, or nobody asks.
+
+    Each other value is a mover; separate: each is one target, so that boxes can be scored too.
+    """
+
+    background: tuple[int, ...] = (0,)
+    unscored: tuple[int, ...] = ()
+    separate: bool = True
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres."""
+
+    frame: np.ndarray
+    identity: np.ndarray
+    east_north_m: np.ndarray
+
+
+@dataclass(frozen=True)
 class Truth:
     """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
 
     tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
-    length: frames of the clip, 0 where nothing says how many.
+    length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -33,6 +54,8 @@ class Truth:
     tracks: TrackTable | None = None
     ignored: TrackTable | None = None
     length: int = 0
+    labels: Labels = Labels()
+    positions: Positions | None = None
 
     @property
     def frames(self) -> list[int]:
@@ -82,6 +105,16 @@ def read_mask(path: Path) -> np.ndarray:
         return image.astype(np.int32)
     blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
     return blue + 256 * green + 65536 * red
+
+
+def labels_of(truth: Truth, frame: int) -> np.ndarray:
+    """(H, W) int32 of a frame's mask: 0 background, above it movers, -1 where nothing counts. Raises as `read_mask`."""
+    values, said = read_mask(truth.masks[frame]), truth.labels
+    if said == Labels():
+        return values
+    labels = np.where(np.isin(values, said.background), 0, values)
+    labels[np.isin(values, said.unscored)] = -1
+    return labels
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

@@ -144,9 +144,9 @@ class Search:
     """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
 
     `people.search = everywhere`: the whole picture. `regions`: around those expected, and the whole picture level by
-    level in `rescan_frames` frames; all of it at first, and at once when all who were expected are lost, as after a
-    cut. blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their surroundings are then looked at; with
-    `regions` those too, where no one expected explains them.
+    level in `rescan_frames` frames; with `people.at_once` all of it in one look at first, and when all who were
+    expected are lost, as after a cut. blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their
+    surroundings are then looked at; with `regions` those too, where no one expected explains them.
     """
 
     def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
@@ -170,9 +170,10 @@ class Search:
         everywhere = scan.everywhere(size, self.knobs)
         if not self.steered and self.blobs is None:
             return Look(everywhere, None, 1.0)
-        if self.steered and (not self.looks or frame - self.expected.frame > self.knobs.rescan_frames):
+        anew = not self.looks or frame - self.expected.frame > self.knobs.rescan_frames
+        if self.steered and self.knobs.at_once and anew:
             return Look(everywhere, None, 1.0)
-        if self.lost:
+        if self.lost and self.knobs.at_once:
             return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
         region_px, heights_px = self._regions(frame)
         parts, all_windows = scan.within(region_px, heights_px, size, self.knobs), scan.cost(everywhere, self.knobs)
