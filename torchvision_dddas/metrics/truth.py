@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import mot_text
-from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.metrics.matching import Ignoring, TrackTable
 from torchvision_dddas.metrics.mot_text import FARTHEST
 from torchvision_dddas.picture_bytes import decoded
 
@@ -45,6 +45,9 @@ class Truth:
 
     tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
     length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown.
+    ignoring: what becomes of a found box on an ignored one (see `matching.pair`). others: boxes that are neither true
+    nor ignored but may take a found box in that. regions: where nobody labelled; identities mean nothing there. See
+    `uncounted.counted` for all three.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -56,6 +59,9 @@ class Truth:
     length: int = 0
     labels: Labels = Labels()
     positions: Positions | None = None
+    ignoring: Ignoring = "dropped"
+    others: TrackTable | None = None
+    regions: TrackTable | None = None
 
     @property
     def frames(self) -> list[int]:

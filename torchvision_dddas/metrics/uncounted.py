@@ -1,0 +1,52 @@
+"""Found boxes that neither count as right nor as false: on what a benchmark ignores, or where nobody labelled."""
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from torchvision_dddas.metrics.detection import iou
+from torchvision_dddas.metrics.matching import EPSILON, LEAST, TrackTable
+from torchvision_dddas.metrics.truth import Truth
+
+WITHIN = 0.5
+"""Share of a found box in a region from which on it lies there."""
+
+
+def counted(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """(N,) bool: whether each found box counts. frame: (N,), box_px: (N, 4), in any order.
+
+    Out are boxes whose best match (IoU ≥ 0.5, all labelled boxes of the frame taking part, those of `others` too) is
+    an ignored one, where `truth.ignoring` is "removed"; and of those that match none, boxes that lie by more than half
+    of their area in one of the regions. TrackEval does so for MOTChallenge from 2016 on and for KITTI.
+    """
+    counts = np.ones(len(frame), bool)
+    ignored = truth.ignored if truth.ignoring == "removed" else None
+    if ignored is None and truth.regions is None:
+        return counts
+    for number in np.unique(frame):
+        rows = np.flatnonzero(frame == number)
+        true, other = truth.boxes.get(int(number), np.zeros((0, 4))), _at(truth.others, number)
+        distracting = _at(ignored, number)
+        labelled = np.concatenate([true, other, distracting])
+        overlap = iou(labelled, box_px[rows])
+        overlap[overlap < LEAST - EPSILON] = 0
+        i, j = linear_sum_assignment(overlap, maximize=True)
+        i, j = i[overlap[i, j] > 0], j[overlap[i, j] > 0]
+        counts[rows[j[i >= len(true) + len(other)]]] = False
+        rest = np.setdiff1d(rows, rows[j])
+        counts[rest] &= ~within(box_px[rest], _at(truth.regions, number))
+    return counts
+
+
+def within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
+    """(N,) bool: whether more than half of the area of each box (N, 4) lies in one of the regions (M, 4)."""
+    if not len(region_px) or not len(box_px):
+        return np.zeros(len(box_px), bool)
+    a, b = box_px[:, None], region_px[None]
+    side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    inside = np.prod(np.maximum(side, 0), axis=-1)
+    share: np.ndarray = inside / np.maximum(np.prod(box_px[:, 2:], axis=1), EPSILON)[:, None]
+    return (share > WITHIN + EPSILON).any(axis=1)
+
+
+def _at(table: TrackTable | None, frame: int) -> np.ndarray:
+    return np.zeros((0, 4)) if table is None else table.box_px[table.frame == frame]
