@@ -32,11 +32,15 @@ class Labels:
 
 @dataclass(frozen=True)
 class Positions:
-    """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres."""
+    """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres.
+
+    lonlat_deg: (N, 2), None where unknown; of use where results count their metres from another origin.
+    """
 
     frame: np.ndarray
     identity: np.ndarray
     east_north_m: np.ndarray
+    lonlat_deg: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,8 @@ class Found:
     -1 where none. east_north_m: (N, 2), covariance_m2: (N, 2, 2), NaN where not located. looked: (L,) int64, the frames
     that were looked at. masks: PNG bytes of frames whose truth is a mask, nonzero is foreground. steps: by frame, the
     (3, 3) homography from the frame before it that was read, of reliable ones. more: further columns (N, ...) that a
-    later stage needs, by name. seconds: by stage, over the clip. peak_mb: the most that the process held.
+    later stage needs, by name; of location lonlat_deg (N, 2) and relative_m2 (N, 2, 2), the covariance relative to the
+    team, where they are known. seconds: by stage, over the clip. peak_mb: the most that the process held.
     """
 
     frame: np.ndarray

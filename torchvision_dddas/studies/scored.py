@@ -12,9 +12,10 @@ from torchvision_dddas.metrics.clip import Counts
 class Scored:
     """One case's counts, which add over frames and clips.
 
-    frames: (F,) those scored. counts: by group, over the clip. per_frame: by group and count, (F,) each, for spread,
-    plots and the worst frames. ranked: by group, (M, 2) of each detection its score and whether it is right (1, 0), or
-    does not count (NaN). samples: by name, what is no count, such as errors in metres. notes: what was left out.
+    frames: (F,) those scored. counts: by group, over the clip. per_frame: by group and count, (F,) float64 each, NaN in
+    frames that the group has no use for; for spread, plots and the worst frames. ranked: by group, (M, 3) of each
+    detection its score, whether it is right (1, 0) or does not count (NaN), and its frame. samples: by name, (S,) each,
+    what is no count: frame, identity, error_m and such of every target that was located. notes: what was left out.
     """
 
     frames: np.ndarray
