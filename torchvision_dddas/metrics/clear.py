@@ -33,18 +33,29 @@ class Clear(NamedTuple):
         return Clear._make(a + b for a, b in zip(self, other, strict=True))
 
 
+PER_FRAME = ("tp", "fn", "fp", "switches", "overlap")
+"""The counts that are those of single frames."""
+
+
 def count(clip: Paired, least: float = LEAST) -> Clear:
     """Match each frame's boxes at an IoU of at least `least`: pairs of the frame before are kept, then IoU decides.
 
     The frame before is the last in which there were both true and found boxes, as TrackEval has it; a switch is seen
     over any gap. Source: Bernardin and Stiefelhagen, 2008, with TrackEval's matching.
     """
+    return by_frame(clip, least)[0]
+
+
+def by_frame(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarray]:
+    """The same, and (F, 5) what of it each of the clip's frames adds, in the order of PER_FRAME."""
     targets = len(clip.true_boxes)
     last = np.full(targets, -1)  # the identity that each target was last found under, whenever that was
     before = np.full(targets, -1)  # the same, of the frame before alone
     found_boxes, begun = np.zeros(targets, int), np.zeros(targets, int)
     switches, overlap = 0, 0.0
-    for true, found, score in clip.frames:
+    each = np.zeros((len(clip.frames), len(PER_FRAME)))
+    for row, (true, found, score) in zip(each, clip.frames, strict=True):
+        row[1:3] = len(true), len(found)
         if len(true) == 0 or len(found) == 0:
             continue
         kept = before[true][:, None] == found[None]
@@ -53,17 +64,20 @@ def count(clip: Paired, least: float = LEAST) -> Clear:
         hit = worth[i, j] > EPSILON
         i, j = i[hit], j[hit]
         target, identity = true[i], found[j]
-        switches += int(((last[target] >= 0) & (last[target] != identity)).sum())
+        switched = int(((last[target] >= 0) & (last[target] != identity)).sum())
+        switches += switched
         begun[target] += before[target] < 0
         last[target] = identity
         before[:] = -1
         before[target] = identity
         found_boxes[target] += 1
-        overlap += float(score[i, j].sum())
+        shared = float(score[i, j].sum())
+        overlap += shared
+        row[:] = len(i), len(true) - len(i), len(found) - len(i), switched, shared
     share = found_boxes / clip.true_boxes
     mostly, hardly = int((share > 0.8).sum()), int((share < 0.2).sum())
     tp = int(found_boxes.sum())
-    return Clear(
+    whole = Clear(
         tp=tp,
         fn=int(clip.true_boxes.sum()) - tp,
         fp=int(clip.found_boxes.sum()) - tp,
@@ -74,6 +88,7 @@ def count(clip: Paired, least: float = LEAST) -> Clear:
         mostly_lost=hardly,
         overlap=overlap,
     )
+    return whole, each
 
 
 def measures(counts: Clear) -> dict[str, float]:

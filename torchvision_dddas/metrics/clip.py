@@ -1,6 +1,7 @@
 """Scoring one clip: which measures its truth and its result allow, over which frames."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +12,11 @@ from torchvision_dddas.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.metrics.matching import Ignoring, TrackTable
 from torchvision_dddas.metrics.results import Result
 from torchvision_dddas.metrics.segmentation import Pixels
-from torchvision_dddas.metrics.tracking import TargetTrack, TrackCounts
+from torchvision_dddas.metrics.still import Still
+from torchvision_dddas.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.metrics.truth import Truth
 
-Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack]
+Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still]
 
 
 @dataclass(frozen=True)
@@ -25,12 +27,22 @@ class How:
     ignoring: Ignoring = "dropped"
 
 
-def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> tuple[int, Counts]:
-    """Frames scored and counts by group; what is left out is added to the notes.
+@dataclass(frozen=True)
+class ClipScore:
+    """A clip's counts by group. frames: how many were scored. each: the counts of single frames, by group."""
+
+    frames: int
+    counts: Counts
+    each: dict[str, Each]
+
+
+def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> ClipScore:
+    """Count what a clip's truth and result allow; what is left out is added to the notes.
 
     Raises InputError where truth and result share no frame, or the result lacks what the truth asks for.
     """
     counts: Counts = {}
+    each: dict[str, Each] = {}
     frames: list[int] = []
     followed = truth.tracks is not None and result.tracks is not None
     if truth.kind == "masks" and result.tracks is not None:
@@ -39,17 +51,29 @@ def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> tupl
         raise InputError(f"{result.place} has no masks, which the hit rate needs; run dddas detect with --save masks")
     if truth.kind == "masks" or (truth.kind == "one target" and result.has_masks):
         frames = _labelled(truth, result, how, notes)
-        counts = _by_masks(truth, result, frames) if truth.kind == "masks" else _by_one(truth, result, frames)
+        counts, each = _summed(frames, (_by_masks if truth.kind == "masks" else _by_one)(truth, result, frames))
     elif truth.kind == "boxes" and (result.detected is not None or not followed):
         frames = _labelled(truth, result, how, notes)
-        boxes = Boxes()
-        for f in frames:
-            boxes = boxes.plus(detection.match(result.boxes_at(f), truth.boxes[f]))
-        counts = {"boxes": boxes}
+        boxes: dict[str, list[Any]] = {"boxes": [detection.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
+        counts, each = _summed(frames, boxes)
     if truth.tracks is not None and result.tracks is not None:
-        scored, found = _by_tracks(truth, truth.tracks, result, result.tracks, how, notes)
-        return max(len(frames), scored), {**counts, **found}
-    return len(frames), counts
+        scored, name, found, of_each = _by_tracks(truth, truth.tracks, result, result.tracks, how, notes)
+        return ClipScore(max(len(frames), scored), {**counts, name: found}, {**each, name: of_each})
+    return ClipScore(len(frames), counts, each)
+
+
+def _summed(frames: list[int], groups: dict[str, list[Any]]) -> tuple[Counts, dict[str, Each]]:
+    """The counts of a clip and of its frames, from a group's counts of each of the frames."""
+    counts: Counts = {}
+    each: dict[str, Each] = {}
+    for group, of_frames in groups.items():
+        whole = of_frames[0]
+        for one in of_frames[1:]:
+            whole = whole.plus(one)
+        counts[group] = whole
+        columns = dict(zip(whole._fields, np.array(of_frames, float).T, strict=True))
+        each[group] = {"frame": np.array(frames, np.int64), **columns}
+    return counts, each
 
 
 def _labelled(truth: Truth, result: Result, how: How, notes: list[str]) -> list[int]:
@@ -74,15 +98,13 @@ def _labelled(truth: Truth, result: Result, how: How, notes: list[str]) -> list[
     return frames
 
 
-def _by_one(truth: Truth, result: Result, frames: list[int]) -> Counts:
-    target = OneTarget()
-    for f in frames:
-        target = target.plus(detection.one_target(result.mask_at(f), result.boxes_at(f), truth.boxes[f][0]))
-    return {"target": target}
+def _by_one(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
+    one = detection.one_target
+    return {"target": [one(result.mask_at(f), result.boxes_at(f), truth.boxes[f][0]) for f in frames]}
 
 
-def _by_masks(truth: Truth, result: Result, frames: list[int]) -> Counts:
-    pixels, boxes = Pixels(), Boxes()
+def _by_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
+    pixels, boxes = [], []
     if not result.has_masks:
         raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
     for f in frames:
@@ -92,15 +114,15 @@ def _by_masks(truth: Truth, result: Result, frames: list[int]) -> Counts:
                 f"frame {f}: the truth is {labels.shape[1]}×{labels.shape[0]} pixels ({truth.masks[f]}), "
                 f"the result {mask.shape[1]}×{mask.shape[0]} ({result.place})"
             )
-        pixels = pixels.plus(segmentation.count(mask, labels))
+        pixels.append(segmentation.count(mask, labels))
         if truth.labels.separate:
-            boxes = boxes.plus(detection.match(result.boxes_at(f), detection.boxes_of(labels)))
+            boxes.append(detection.match(result.boxes_at(f), detection.boxes_of(labels)))
     return {"pixels": pixels, "boxes": boxes} if truth.labels.separate else {"pixels": pixels}
 
 
 def _by_tracks(
     truth: Truth, true: TrackTable, result: Result, found: TrackTable, how: How, notes: list[str]
-) -> tuple[int, Counts]:
+) -> tuple[int, str, TrackCounts | TargetTrack, Each]:
     """Tracks are scored on every frame of the clip, labelled or not: a box where nobody is labelled is false."""
     labelled = max(truth.frames[-1], truth.length)
     end = labelled if result.state == "complete" else min(labelled, result.frames)
@@ -125,9 +147,9 @@ def _by_tracks(
         return table.at((table.frame <= end) & ((table.frame - 1) % how.interval == 0))
 
     if truth.kind == "one target":
-        return frames, {"target_track": tracking.count_one_target(cut(true), cut(found))}
+        return frames, "target_track", *tracking.one_target_by_frame(cut(true), cut(found))
     ignored = None if truth.ignored is None else cut(truth.ignored)
-    return frames, {"tracks": tracking.count(cut(true), cut(found), ignored, how.ignoring, how.interval)}
+    return frames, "tracks", *tracking.by_frame(cut(true), cut(found), ignored, how.ignoring, how.interval)
 
 
 def _of(how: How) -> str:

@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from torchvision_dddas.metrics import clear, hota, identity, windows
 from torchvision_dddas.metrics.clear import Clear
 from torchvision_dddas.metrics.hota import Hota
@@ -12,6 +14,10 @@ from torchvision_dddas.metrics.windows import Windows
 
 ONE_TARGET_LEAST = 0.3
 """IoU from which a box counts as the one labelled target: moving-target detections seldom fit as tightly as labels."""
+
+
+Each = dict[str, np.ndarray]
+"""Counts frame by frame, (F,) float64 each, by name; `frame` has the frames."""
 
 
 class TrackCounts(NamedTuple):
@@ -57,10 +63,32 @@ def count(
 
     `matching.pair` tells what becomes of boxes that do not count.
     """
+    return by_frame(truth, found, ignored, ignoring, interval)[0]
+
+
+def by_frame(
+    truth: TrackTable,
+    found: TrackTable,
+    ignored: TrackTable | None = None,
+    ignoring: Ignoring = "dropped",
+    interval: int = 1,
+) -> tuple[TrackCounts, Each]:
+    """The same, and what of it belongs to single frames, of frames with any box.
+
+    Of CLEAR the counts; windows_K: whether a window of K looks ends there, ar_K: its ratio. What HOTA and IDF1 count
+    belongs to whole tracks.
+    """
     clip = pair(truth, found, ignored, ignoring)
     sizes = len(clip.true_boxes), len(clip.found_boxes)
-    links = windows.count(clip, interval, 2), windows.count(clip, interval, 3)
-    return TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip), *sizes, *links)
+    whole, each = clear.by_frame(clip)
+    ratios = {size: windows.by_frame(clip, interval, size) for size in (2, 3)}
+    links = [windows.summed(by) for by in ratios.values()]
+    columns: Each = {"frame": clip.numbers, **dict(zip(clear.PER_FRAME, each.T, strict=True))}
+    for size, by in ratios.items():
+        ends = [by.get(frame) for frame in clip.numbers.tolist()]
+        columns[f"windows_{size}"] = np.array([ratio is not None for ratio in ends], float)
+        columns[f"ar_{size}"] = np.array([ratio or 0.0 for ratio in ends], float)
+    return TrackCounts(whole, identity.count(clip), hota.count(clip), *sizes, *links), columns
 
 
 def measures(counts: TrackCounts) -> dict[str, float]:
@@ -85,9 +113,18 @@ class TargetTrack(NamedTuple):
 
 def count_one_target(truth: TrackTable, found: TrackTable) -> TargetTrack:
     """Follow the one labelled target (IoU ≥ 0.3). Boxes elsewhere say nothing: other targets are not labelled."""
+    return one_target_by_frame(truth, found)[0]
+
+
+def one_target_by_frame(truth: TrackTable, found: TrackTable) -> tuple[TargetTrack, Each]:
+    """The same, and of frames with any box whether the target is there, is found, and is found under a new identity."""
     clip = pair(truth, found)
-    counts, right = clear.count(clip, ONE_TARGET_LEAST), identity.count(clip, ONE_TARGET_LEAST)
-    return TargetTrack(int(clip.true_boxes.sum()), counts.tp, counts.switches, counts.fragmentations, right.idtp)
+    counts, each = clear.by_frame(clip, ONE_TARGET_LEAST)
+    right = identity.count(clip, ONE_TARGET_LEAST)
+    tp, fn, _, switches, _ = each.T
+    columns = {"frame": clip.numbers, "frames": tp + fn, "found": tp, "switches": switches}
+    whole = int(clip.true_boxes.sum()), counts.tp, counts.switches, counts.fragmentations, right.idtp
+    return TargetTrack(*whole), columns
 
 
 def one_target_measures(counts: TargetTrack) -> dict[str, float]:

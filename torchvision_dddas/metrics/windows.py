@@ -27,7 +27,20 @@ class Windows(NamedTuple):
 
 
 def count(clip: Paired, interval: int, size: int) -> Windows:
-    """AR_K over all windows of `size` looks, `interval` frames apart.
+    """AR_K over a clip, as `by_frame` has it."""
+    return summed(by_frame(clip, interval, size))
+
+
+def summed(ratios: dict[int, float]) -> Windows:
+    """The windows of a clip together, in the order of their frames."""
+    total = 0.0
+    for one in ratios.values():
+        total += one
+    return Windows(len(ratios), total)
+
+
+def by_frame(clip: Paired, interval: int, size: int) -> dict[int, float]:
+    """AR_K by the newest frame, in order, of all windows of `size` looks, `interval` frames apart, with a target.
 
     A frame's targets are the true boxes that were found (IoU ≥ 0.5): the ratio is about links, not about boxes. Boxes
     of one found identity are linked; one that is absent from a look within the window is a bridge.
@@ -42,7 +55,7 @@ def count(clip: Paired, interval: int, size: int) -> Windows:
     whole = range(min(looks, default=1) + (size - 1) * interval, max(looks, default=0) + 1, interval)
     # Frame numbers may be any, and far apart: only the windows that hold a look are gone through.
     held = {frame + age * interval for frame in looks for age in range(size)}
-    windows, total = 0, 0.0
+    ratios = {}
     for newest in sorted(frame for frame in held if frame in whole):
         window = [looks.get(newest - age * interval, nobody) for age in range(size)]
         if not any(len(true) for true, _ in window):
@@ -51,5 +64,5 @@ def count(clip: Paired, interval: int, size: int) -> Windows:
         rows = np.zeros((len(names), size), np.int64)
         for column, (_, found) in enumerate(window):
             rows[np.searchsorted(names, found), column] = np.arange(len(found)) + 1
-        windows, total = windows + 1, total + accuracy_ratio(rows, [true for true, _ in window])
-    return Windows(windows, total)
+        ratios[newest] = accuracy_ratio(rows, [true for true, _ in window])
+    return ratios
