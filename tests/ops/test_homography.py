@@ -248,6 +248,16 @@ def test_a_batch_is_the_same_as_one_clip_after_the_other():
         assert torch.equal(together[1][k : k + 1], alone[1])
 
 
+def test_what_a_pair_gives_does_not_depend_on_its_company_to_the_last_digit():
+    p, q, right = (part.repeat(2, *[1] * (part.ndim - 1)) for part in pairs(count=300, noise=0.3, wrong=0.4))
+    p, q = p.double() + torch.arange(4.0)[:, None, None], q.double()
+    samples = homography.draw_samples(torch.Generator().manual_seed(1), 1, 64, 300).expand(4, -1, -1)
+    together = homography.ransac(p, q, right, samples)
+    for k in range(4):
+        alone = homography.ransac(p[k : k + 1], q[k : k + 1], right[k : k + 1], samples[:1])
+        assert torch.equal(together[0][k], alone[0][0]) and torch.equal(together[1][k], alone[1][0])
+
+
 def test_refine_from_a_prediction_a_few_pixels_off_is_as_good_as_ransac():
     p, q, right = pairs(noise=0.2, wrong=0.4)
     guess = TRUE + torch.tensor([[0.0, 0, 4], [0, 0, -4], [0, 0, 0]])

@@ -167,5 +167,6 @@ def _squared_errors(
 
 def _depth(matrix: Float[Tensor, "B 3 3"], p: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N"]:
     """The denominator of the transfer: dividing by it turns the algebraic residual into pixels."""
-    depth = (p @ matrix[:, 2, :2, None])[..., 0] + matrix[:, 2, 2:]
+    # Written out: torch multiplies a matrix and a vector differently in a batch of one, by the last digit.
+    depth = p[..., 0] * matrix[:, 2, :1] + p[..., 1] * matrix[:, 2, 1:2] + matrix[:, 2, 2:]
     return depth.abs().clamp(min=1e-3)

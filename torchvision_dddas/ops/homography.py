@@ -80,7 +80,8 @@ def fit(
     share = weight.to(wide) / weight.to(wide).sum(1, keepdim=True).clamp(min=1e-12)
     normal = rows.mT @ (rows * share.repeat(1, 2)[..., None])
     solution, valid = linear.solve(normal[:, :8, :8], normal[:, :8, 8:], tolerance=1e-10)
-    depth = (p_unit @ solution[:, 6:])[..., 0] + 1
+    # Written out: torch multiplies a matrix and a vector differently in a batch of one, by the last digit.
+    depth = x * solution[:, 6] + y * solution[:, 7] + 1
     valid = valid & ((depth > HORIZON) | ~used).all(1)
     matrix = torch.cat([solution[..., 0], torch.ones_like(solution[:, :1, 0])], 1).reshape(-1, 3, 3)
     matrix = _shifted(matrix, p_mean, p_scale, q_mean, q_scale)
