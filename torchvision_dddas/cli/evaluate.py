@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -62,34 +64,93 @@ class Ignored(StrEnum):
 @explained
 def evaluate(
     truth: Annotated[
-        Path,
+        Path | None,
         typer.Argument(help="Masks (a folder of numbered PNGs), a file of boxes or tracks, or a folder of such clips."),
-    ],
+    ] = None,
     result: Annotated[
-        Path,
+        Path | None,
         typer.Argument(help="What dddas detect or track wrote, MOTChallenge text, or a folder of such by clip name."),
-    ],
+    ] = None,
+    dataset: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="In place of TRUTH RESULT: the TOML of a study, whose clips are run too."),
+    ] = None,
+    clips: Annotated[
+        str | None, typer.Option(metavar="PATTERN,...", help="Of a study: these clips alone, such as 'bms_*'.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", help="Of a study: processes of one thread each. [default: one a core]")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a study: a Dask scheduler, such as tcp://host:8786.")
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Of a study: where results are kept. [default: in the user's cache folder]"),
+    ] = None,
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Annotated[Backend | None, typer.Option(help="Of a study: the engine. [default: as FILE says]")] = None,
     first_frame: Annotated[
         int | None,
         typer.Option(help="Number in a mask's name that is the clip's first frame. [default: 0 if there, else 1]"),
     ] = None,
-    interval: Annotated[int, typer.Option(help="Score frames 1, 1 + INTERVAL, ... alone.")] = 1,
+    interval: Annotated[
+        int | None, typer.Option(help="Score frames 1, 1 + INTERVAL, ... alone. [default: 1, or as FILE says]")
+    ] = None,
     ignored: Annotated[
-        Ignored,
+        Ignored | None,
         typer.Option(
             help="True boxes marked 0: dropped as if not labelled (TrackEval, MOT15), "
-            "or removed together with the tracks' boxes that match them."
+            "or removed together with the tracks' boxes that match them. [default: dropped]"
         ),
-    ] = Ignored.dropped,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for metrics.json. [default: RESULT, or the folder of that file]")
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for metrics.json. [default: RESULT, or that file's folder; of a study dddas-study]"),
+    ] = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean."""
+    """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean.
+
+    With --dataset the clips of whole data sets are run and scored; metrics.json, report.html and run.json are written.
+    """
+    study = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
+    study |= {"--config": config, "--set": set_ or None, "--backend": backend}
+    if dataset is not None:
+        _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
+        from torchvision_dddas.cli import study as whole
+
+        if jobs is not None and jobs < 1:
+            raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
+        if jobs is not None and scheduler is not None:
+            raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
+        folder = out or Path("dddas-study")
+        spec = whole.asked(dataset, config, set_ or [], backend and backend.value, interval)
+        patterns = [text.strip() for text in (clips or "").split(",") if text.strip()]
+        results, measures = whole.study_into(folder, spec, dataset.parent, jobs, scheduler, cache, patterns, quiet)
+        if not quiet:
+            whole.show(results, measures, folder)
+        return
+    _refuse(study, "is for a study; give --dataset FILE too")
+    if truth is None or result is None:
+        raise InputError(
+            "evaluate needs TRUTH and RESULT, or --dataset FILE, the TOML of a study; see dddas evaluate --help"
+        )
     folder = out or (result.parent if result.is_file() else result)
-    report = score(truth, result, first_frame, folder, interval, ignored.value)
-    show(report)
-    typer.echo(f"{folder / 'metrics.json'}: the same with its counts")
+    report = score(
+        truth, result, first_frame, folder, 1 if interval is None else interval, (ignored or Ignored.dropped).value
+    )
+    if not quiet:
+        show(report)
+        typer.echo(f"{folder / 'metrics.json'}: the same with its counts")
+
+
+def _refuse(options: dict[str, object], why: str) -> None:
+    """Raises InputError for the first option that was given."""
+    for option, given in options.items():
+        if given is not None:
+            raise InputError(f"{option} {why}")
 
 
 def score(

@@ -1,0 +1,212 @@
+"""`dddas evaluate --dataset`: a study of whole data sets, its tables, its report and what it cost."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from torchvision_dddas.cli.progress import EVERY_S
+
+if TYPE_CHECKING:
+    from torchvision_dddas.studies.jobs import Event
+    from torchvision_dddas.studies.record import Results, Spec
+    from torchvision_dddas.studies.running import Plan
+
+FILES = ("metrics.json", "report.html", "run.json")
+
+
+def asked(
+    file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None
+) -> "Spec":
+    """A study's file, changed by what the command line says. Raises InputError for bad input."""
+    from torchvision_dddas.studies.spec import read_spec
+
+    spec = read_spec(file)
+    spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
+    return replace(spec, backend=backend or spec.backend, interval=spec.interval if interval is None else interval)
+
+
+def study_into(
+    folder: Path,
+    spec: "Spec",
+    base: Path,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    cache: Path | None = None,
+    clips: Sequence[str] = (),
+    quiet: bool = False,
+) -> tuple["Results", dict[str, Any]]:
+    """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
+    from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.sinks.whole import cannot_write, write_whole
+    from torchvision_dddas.studies.running import cache_folder, run_study
+
+    began, place = time.perf_counter(), cache or cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(folder, "run.json", {"state": "running", "study": spec.name})
+        try:
+            with _shown(quiet) as (begun, tell):
+                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begun)
+        except BaseException:
+            _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
+            raise
+        measures = _measures(results)
+        _write(folder, "metrics.json", measures)
+        if find_spec("torchvision_dddas.sinks.study_report.page") is not None:
+            write_whole(folder / "report.html", _report(finite(measures), results).encode())
+        _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
+    except OSError as error:
+        raise cannot_write(folder / "run.json", error) from error
+    return results, measures
+
+
+def _write(folder: Path, name: str, content: Any) -> None:
+    from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.sinks.whole import write_whole
+
+    write_whole(folder / name, (json.dumps(finite(content), indent=2) + "\n").encode())
+
+
+def _report(measures: dict[str, Any], results: "Results") -> str:
+    from torchvision_dddas.sinks.study_report import report
+
+    return report(measures, results)
+
+
+def _measures(results: "Results") -> dict[str, Any]:
+    if find_spec("torchvision_dddas.studies.summary") is None:
+        return {"cases": [[case.clip.name, case.task, case.cause] for case in results.cases]}
+    from torchvision_dddas.studies.summary import summary
+
+    return summary(results)
+
+
+def _costs(results: "Results") -> Any:
+    if find_spec("torchvision_dddas.studies.costs") is None:
+        return None
+    from torchvision_dddas.studies.costs import costs
+
+    return costs(results)
+
+
+def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
+    """What run.json says of a study."""
+    from torchvision_dddas.sinks.journal import versions
+
+    spec = results.spec
+    return {
+        "state": "complete",
+        "versions": versions(),
+        "study": {
+            "name": spec.name,
+            "tasks": spec.tasks,
+            "config": spec.config,
+            "set": spec.overrides,
+            "backend": spec.backend,
+            "interval": spec.interval,
+        },
+        **results.facts,
+        "left_out": results.left_out,
+        "cache": cache,
+        "settings": results.settings.model_dump(),
+        "seconds": {"wall": round(wall_s, 3)},
+        "costs": _costs(results),
+    }
+
+
+@contextmanager
+def _shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Event], None]]]":
+    """How far a study is, on stderr: a bar on a terminal, elsewhere a line for each clip and every few seconds."""
+    if quiet:
+        yield lambda planned: None, lambda event: None
+        return
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("clips, {task.fields[frames]} frames"),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            yield _on(bar)
+        return
+    yield _in_lines()
+
+
+def _on(bar: Any) -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
+    task, frames = bar.add_task("study", total=None, frames=0), 0
+
+    def begun(planned: "Plan") -> None:
+        bar.update(task, total=len(planned.jobs))
+
+    def tell(event: "Event") -> None:
+        nonlocal frames
+        frames += event.frames
+        bar.update(task, advance=event.done is not None, frames=frames, description=event.job.clip.name)
+        if event.note:
+            bar.console.print(event.note, markup=False, highlight=False)
+
+    return begun, tell
+
+
+def _in_lines() -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
+    total = done = frames = 0
+    start = told = time.monotonic()
+
+    def say(text: str) -> None:
+        nonlocal told
+        told = time.monotonic()
+        print(text, file=sys.stderr, flush=True)
+
+    def begun(planned: "Plan") -> None:
+        nonlocal total
+        total = len(planned.jobs)
+        say(f"{total} clips, {planned.frames} frames to look at over all tasks")
+
+    def tell(event: "Event") -> None:
+        nonlocal done, frames
+        frames += event.frames
+        if event.note:
+            say(event.note)
+        if event.done is not None:
+            done += 1
+            words = [
+                f"{d.task} left out" if d.cause else d.task if d.computed else f"{d.task} kept" for d in event.done
+            ]
+            say(f"{done} of {total}: {event.job.clip.name} ({', '.join(words)})")
+        elif time.monotonic() - told >= EVERY_S:
+            say(f"{done} of {total} clips, {frames} frames, {frames / (time.monotonic() - start):.1f} frames/s")
+
+    return begun, tell
+
+
+def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
+    """Print the measures of each task in short, what was left out, and where the rest is."""
+    from rich.console import Console
+
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    for task in measures.get("tasks", {}):
+        console.print(f"{task}", highlight=False)
+    for line in results.left_out:
+        console.print(f"left out: {line}", markup=False, highlight=False)
+    made = [name for name in FILES if (folder / name).is_file()]
+    typer.echo(f"{folder}: {', '.join(made)}")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, int):
+        return str(value)
+    return "–" if value is None or math.isnan(value) else f"{value:.3f}"
