@@ -10,13 +10,14 @@ from torchvision_dddas.metrics import detection, segmentation, tracking
 from torchvision_dddas.metrics import truth as truths
 from torchvision_dddas.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.metrics.matching import Ignoring, TrackTable
+from torchvision_dddas.metrics.metres import Located
 from torchvision_dddas.metrics.results import Result
 from torchvision_dddas.metrics.segmentation import Pixels
 from torchvision_dddas.metrics.still import Still
 from torchvision_dddas.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.metrics.truth import Truth
 
-Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still]
+Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | Located]
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.metrics import detection, segmentation, still, tracking
+from torchvision_dddas.metrics import detection, metres, segmentation, still, tracking
 from torchvision_dddas.metrics.clip import Counts
 from torchvision_dddas.metrics.detection import Boxes
+from torchvision_dddas.metrics.metres import Located
 from torchvision_dddas.metrics.segmentation import Pixels
 from torchvision_dddas.metrics.still import Still
 from torchvision_dddas.metrics.tracking import TargetTrack, TrackCounts
@@ -37,6 +38,8 @@ def of_group(value: Any) -> dict[str, float]:
         return tracking.one_target_measures(value)
     if isinstance(value, Still):
         return still.measures(value)
+    if isinstance(value, Located):
+        return metres.located_measures(value)
     return detection.one_target_measures(value)
 
 
