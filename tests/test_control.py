@@ -297,12 +297,12 @@ def driven(cost_ms, looks, now=None, start_s=0.0, settings=LIVE, people=False):
 def test_keypoints_are_halved_to_the_least_then_the_search_narrows_then_pictures_are_left_out():
     ladder = rungs(LIVE, people=True)
     assert [rung["registration.keypoints"] for rung in ladder[:3]] == [400, 200, 100]
-    assert [rung["people.rescan_frames"] for rung in ladder[2:5]] == [10, 20, 40]
-    assert [rung[SAMPLING] for rung in ladder[4:]] == [1, 2, 3, 4]
-    assert {rung[SAMPLING] for rung in ladder[:4]} == {1}
+    assert [rung["people.look_share"] for rung in ladder[2:6]] == [1, 0.5, 0.25, 0.125]
+    assert [rung[SAMPLING] for rung in ladder[5:]] == [1, 2, 3, 4]
+    assert {rung[SAMPLING] for rung in ladder[:5]} == {1}
     for before, after in itertools.pairwise(ladder):
-        assert all(before[name] >= after[name] for name in ("registration.keypoints", "people.region_margin"))
-        assert sum(before[name] != after[name] for name in before) <= 2
+        assert all(before[name] >= after[name] for name in ("registration.keypoints", "people.look_share"))
+        assert sum(before[name] != after[name] for name in before) == 1
 
 
 def test_who_keeps_up_looks_at_everything():

@@ -35,6 +35,8 @@ _FAR_OVER = 2.0
 _SPARE = 0.9
 # Twice the keypoints, or a wider search, is expected to cost so many times as much.
 _DEARER = 1.4
+# A look at people takes this share of the windows at the least.
+_LEAST_SHARE = 0.002
 # The longest wait before more is looked at again, in calm_s.
 _MOST_PATIENCE = 16.0
 
@@ -277,24 +279,21 @@ class Load:
 def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
     """What may be looked at, from everything to the least: knobs by name, the same in each, `sampling.every` the last.
 
-    First keypoints are halved, then, where people are searched for in regions, the whole picture is searched in more
-    turns, both of which make a look cheaper; then only every 2nd, 3rd, ... picture is looked at.
+    First keypoints are halved, then, where people are searched for in regions, a look takes a smaller share of the
+    windows, both of which make it cheaper; then only every 2nd, 3rd, ... picture is looked at.
     """
     live, search = base.live, base.people
     rung: dict[str, float] = {"registration.keypoints": base.registration.keypoints}
     if people and search.search == "regions":
-        rung["people.rescan_frames"] = search.rescan_frames
-        rung["people.region_margin"] = search.region_margin
+        rung["people.look_share"] = search.look_share
     rung[SAMPLING] = 1
     made = [rung]
     while (keypoints := made[-1]["registration.keypoints"]) > live.least_keypoints:
         fewer = max(int(keypoints) // 2, live.least_keypoints)
         made.append(made[-1] | {"registration.keypoints": fewer})
-    if "people.rescan_frames" in rung:
-        for narrower in (2, 4):
-            rescan = min(search.rescan_frames * narrower, 10_000)
-            margin = search.region_margin / narrower
-            made.append(made[-1] | {"people.rescan_frames": rescan, "people.region_margin": margin})
+    if "people.look_share" in rung:
+        for narrower in (2, 4, 8):
+            made.append(made[-1] | {"people.look_share": max(search.look_share / narrower, _LEAST_SHARE)})
     made += [made[-1] | {SAMPLING: every} for every in range(2, live.maximum_every + 1)]
     return made
 

@@ -377,11 +377,13 @@ class PeopleKnobs(Group):
     rescan_frames: int = knob(
         10, "frames", 1, 10_000, meaning="regions: in so many frames the whole picture, some of its levels in each"
     )
-    at_once: bool = knob(
-        True,
+    look_share: float = knob(
+        1.0,
         "-",
-        meaning="regions: at first, and when all who were expected are lost, the whole picture in one look; "
-        "false: in turns then too, as --live does",
+        0.001,
+        1,
+        meaning="regions: what a look may cost at most, as a share of one at the whole picture, so that none takes long: "
+        "picture and regions are then searched in turns from the first look on; 1: no bound. --live takes 0.1 at most",
     )
     region_margin: float = knob(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
     region_scales: float = knob(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")

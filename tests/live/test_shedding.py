@@ -80,12 +80,9 @@ def test_people_are_searched_for_less_widely_before_pictures_are_left_out() -> N
     source, clock = Source(), FakeClock()
     shedding = Shedding(source, settings, people=True, clock=clock)
     moved = fed(shedding, source, [0.036] * 22, clock)
-    assert [a.knob for a in moved if a.knob.startswith("people")][:2] == [
-        "people.rescan_frames",
-        "people.region_margin",
-    ]
+    assert [(a.knob, a.new) for a in moved if a.knob.startswith("people")][:1] == [("people.look_share", 0.5)]
     assert source.every == 1
-    assert shedding.settings.people.rescan_frames > settings.people.rescan_frames
+    assert shedding.settings.people.look_share < settings.people.look_share
 
 
 @pytest.mark.parametrize("keypoints", [60, 150])

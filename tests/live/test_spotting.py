@@ -96,7 +96,7 @@ def test_a_narrower_search_looks_at_less():
             spotter.see(scene)
         return recognizer.windows
 
-    narrow = Settings.model_validate({"people": {"search": "regions", "rescan_frames": 80, "region_margin": 0.1}})
+    narrow = Settings.model_validate({"people": {"search": "regions", "look_share": 0.05}})
     assert windows(narrow) < windows(SETTINGS)
 
 

@@ -127,16 +127,29 @@ def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost
     ]
 
 
-def test_without_whole_looks_a_round_shows_every_level_at_first_and_after_all_are_lost():
+@pytest.mark.parametrize("share", [0.2, 0.05, 0.01])
+def test_a_bounded_look_takes_its_share_and_a_round_of_them_searches_every_window(share):
     def found(n):
         return people(walker(n), (400, 200, 40, 110)) if n < 15 else people()
 
-    made = looks(Search(KNOBS.model_copy(update={"at_once": False})), found, 40)
+    search = Search(KNOBS.model_copy(update={"look_share": share}), lambda n: np.array([[100.0, 150, 60, 90]]))
     everywhere = scan.everywhere(SIZE, KNOBS)
-    assert all(look.regions_px is not None and look.share < 0.5 for look in made.values())
-    for begin in (1, 16):
-        seen = [part for n in range(begin, begin + 10) for part in made[n].parts if part in everywhere]
-        assert sorted(part.level for part in seen) == sorted(part.level for part in everywhere)
+    most = share * scan.pixels(everywhere)
+    rounds = max(10, int(np.ceil(scan.pixels(scan.tiles(everywhere, most / 2, KNOBS)) / (most / 2))))
+    made = looks(search, found, 2 * rounds)
+    costs = [scan.pixels(look.parts) for look in made.values()]
+    # However little it may cost, one tile and one level of each region are searched.
+    least = 2 * 190 * 260 + 200 * 300 + 3 * 0.04 * 2.25 * 640 * 480
+    assert max(costs) < 1.5 * most + least
+    assert np.mean(costs) < most + least
+    for begin in (1, rounds):
+        seen = {w for n in range(begin, begin + rounds) for part in made[n].parts for w in windows_of(part)}
+        assert seen >= {w for part in everywhere for w in windows_of(part)}
+
+
+def windows_of(part):
+    across, down = (part.width - 64) // 8 + 1, (part.height - 128) // 8 + 1
+    return {(part.level, part.x + 8 * column, part.y + 8 * row) for row in range(down) for column in range(across)}
 
 
 def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():

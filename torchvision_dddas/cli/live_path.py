@@ -26,8 +26,9 @@ def path(
         from torchvision_dddas.recognizing import recognizer_of
         from torchvision_dddas.spotting import Spotter
 
-        # A look at the whole picture takes as long as many pictures come.
-        settings = with_knobs(settings, {"people.search": "regions", "people.at_once": False})
+        # A look at the whole picture takes as long as many pictures do to come.
+        share = min(settings.people.look_share, 0.1)
+        settings = with_knobs(settings, {"people.search": "regions", "people.look_share": share})
         recognizer = recognizer_of(settings.people, backend)
         Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
     shedding = Shedding(source, settings, health, people)

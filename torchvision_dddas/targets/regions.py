@@ -140,13 +140,18 @@ def _covered(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     return shared_px(box_px[:, None], other_px).sum(axis=1) / box_px[:, 2:].prod(axis=1)
 
 
+def _both(some: Regions, others: Regions) -> Regions:
+    return np.concatenate([some[0], others[0]]), np.concatenate([some[1], others[1]])
+
+
 class Search:
     """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
 
     `people.search = everywhere`: the whole picture. `regions`: around those expected, and the whole picture level by
-    level in `rescan_frames` frames; with `people.at_once` all of it in one look at first, and when all who were
-    expected are lost, as after a cut. blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their
-    surroundings are then looked at; with `regions` those too, where no one expected explains them.
+    level in `rescan_frames` frames; all of it in one look at first, and when all who were expected are lost, as after
+    a cut. With `people.look_share` below 1 no look takes more windows: then also these come in turns, levels in bands.
+    blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their surroundings are then looked at; with
+    `regions` those too, where no one expected explains them.
     """
 
     def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
@@ -162,30 +167,61 @@ class Search:
     def retune(self, knobs: PeopleKnobs) -> None:
         """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
         self.knobs = self.expected.knobs = knobs
-        n = knobs.rescan_frames
-        self.step = min((k for k in range(1, n + 1) if math.gcd(k, n) == 1), key=lambda k: abs(k - _TURN * n))
+        self.bound = knobs.look_share < 1
 
     def look(self, frame: int, size: tuple[int, int]) -> Look:
         """Where to search a frame of (width, height)."""
         everywhere = scan.everywhere(size, self.knobs)
         if not self.steered and self.blobs is None:
             return Look(everywhere, None, 1.0)
-        anew = not self.looks or frame - self.expected.frame > self.knobs.rescan_frames
-        if self.steered and self.knobs.at_once and anew:
-            return Look(everywhere, None, 1.0)
-        if self.lost and self.knobs.at_once:
-            return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
-        region_px, heights_px = self._regions(frame)
-        parts, all_windows = scan.within(region_px, heights_px, size, self.knobs), scan.cost(everywhere, self.knobs)
+        all_windows = scan.cost(everywhere, self.knobs)
+        if self.steered and not self.bound:
+            if not self.looks or frame - self.expected.frame > self.knobs.rescan_frames:
+                return Look(everywhere, None, 1.0)
+            if self.lost:
+                return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
+        known, moving = self._regions(frame)
+        if self.steered and self.bound:
+            return self._bounded(frame, known, moving, everywhere, size)
+        region_px, heights_px = _both(known, moving)
+        parts = scan.within(region_px, heights_px, size, self.knobs)
         around = scan.cost(parts, self.knobs) / all_windows
         if not self.steered:
             return Look(parts, region_px, around)
         if around > _DEAR:
             return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
-        due = everywhere[self._turn() :: self.knobs.rescan_frames]
+        due = self._due(everywhere, self.knobs.rescan_frames)
         levels = {part.level for part in due}
         parts = due + [part for part in parts if part.level not in levels]
         return Look(parts, region_px, scan.cost(parts, self.knobs) / all_windows, self._told(frame, around))
+
+    def _bounded(
+        self, frame: int, known: Regions, moving: Regions, everywhere: list[Part], size: tuple[int, int]
+    ) -> Look:
+        """A look that costs `people.look_share` of one at all: what is due, around those expected, around movers."""
+        whole = scan.pixels(everywhere)
+        most = self.knobs.look_share * whole
+        tiles = scan.tiles(everywhere, most / 2, self.knobs)
+        # Half of what a look may take is for the rest of the picture.
+        parts = self._due(tiles, max(self.knobs.rescan_frames, math.ceil(scan.pixels(tiles) / (most / 2))))
+        around = 0.0
+        for regions in (known, moving):
+            wanted = scan.within(*regions, size, self.knobs)
+            around += scan.pixels(wanted)
+            parts += self._thinned(wanted, most - scan.pixels(parts))
+        region_px, _ = _both(known, moving)
+        share = scan.cost(parts, self.knobs) / scan.cost(everywhere, self.knobs)
+        return Look(parts, region_px, share, self._told(frame, min(around / whole, self.knobs.look_share)))
+
+    def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
+        """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.
+
+        A body scores at several levels that lie together.
+        """
+        levels = sorted({part.level for part in parts})
+        every = min(math.ceil(scan.pixels(parts) / max(most_px, 1)), len(levels))
+        due = set(levels[self.looks % every :: every]) if every else set()
+        return [part for part in parts if part.level in due]
 
     def learn(self, frame: int, people: People, look: Look) -> None:
         """Take in what a look found."""
@@ -197,18 +233,22 @@ class Search:
         self.lost = self.there if self.there > 1 and not again and look.regions_px is not None else 0
         self.there = len(people)
 
-    def _turn(self) -> int:
-        """The first of the levels whose turn it is: each comes once in a round, far from the one before."""
-        return self.looks * self.step % self.knobs.rescan_frames
+    def _due(self, parts: list[Part], rounds: int) -> list[Part]:
+        """Those whose turn it is: each comes once in so many looks, far from those before."""
+        step = min((k for k in range(1, rounds + 1) if math.gcd(k, rounds) == 1), key=lambda k: abs(k - _TURN * rounds))
+        return parts[self.looks * step % rounds :: rounds]
 
-    def _regions(self, frame: int) -> Regions:
-        found = [self.expected.regions(frame)] if self.steered else []
+    def _regions(self, frame: int) -> tuple[Regions, Regions]:
+        """Around those expected, and around what moves."""
+        known = moving = np.zeros((0, 4)), np.zeros((0, 2))
+        if self.steered:
+            known = self.expected.regions(frame)
         if self.blobs is not None:
             box_px = self.blobs(frame)
             if self.steered:
                 box_px = box_px[_covered(box_px, self.expected.box_px(frame)) < _EXPLAINED]
-            found.append(around_blobs(box_px))
-        return np.concatenate([region for region, _ in found]), np.concatenate([heights for _, heights in found])
+            moving = around_blobs(box_px)
+        return known, moving
 
     def _whole(self, frame: int, everywhere: list[Part], why: str) -> Look:
         """A look at all, which the record explains."""
