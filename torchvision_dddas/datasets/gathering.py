@@ -36,3 +36,10 @@ def folders_in(folder: Path) -> list[str]:
         return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
     except OSError as error:
         raise InputError(f"{folder} cannot be read: {error.strerror}") from None
+
+
+def there(folder: Path, what: str) -> None:
+    """Raises InputError where a folder is not there. what: what belongs there."""
+    if not folder.is_dir():
+        found = "is a file" if folder.exists() else "is not there"
+        raise InputError(f"{folder} {found}; there belongs {what}")

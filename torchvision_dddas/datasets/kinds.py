@@ -14,6 +14,11 @@ from torchvision_dddas.errors import InputError
 KINDS: Mapping[str, str] = {
     "folder": "your own: a folder a clip, with frames/ or a video, and masks/, boxes_xywh.txt or gt/gt.txt",
     "bms": "Berkeley motion segmentation: BMS-26 and FBMS-59, as published or as frames/ and masks/",
+    "davis": "DAVIS 2016 or 2017: JPEGImages/, Annotations/ and ImageSets/",
+    "cdnet": "CDnet 2012 or 2014: a folder a category, in it one a video with input/ and groundtruth/",
+    "uav123": "UAV123, UAV20L or UAV123 at 10 frames a second: anno/, data_seq/ and configSeqs.m",
+    "vivid": "VIVID of PETS 2005: egtest01/ and its like, with boxes or masks of every tenth frame",
+    "simulated": "what dddas simulate writes: a folder a run",
 }
 """Kind -> what it is, in a line. The adapter of `some-kind` is the module `some_kind`.
 

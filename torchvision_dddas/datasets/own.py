@@ -1,6 +1,5 @@
 """A clip as a folder of the plain convention (see `folder`), which other kinds share once they are unpacked."""
 
-import configparser
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from torchvision_dddas.datasets.pictures import frames_of, images_in, videos_in
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import truth as truths
+from torchvision_dddas.metrics.seqinfo import SeqInfo, read_seqinfo
 from torchvision_dddas.metrics.truth import Labels, Positions, Truth
 
 FRAMES = ("frames", "img1")
@@ -40,12 +40,13 @@ def clip_at(
     if truth is not None and positions is not None:
         truth = replace(truth, positions=positions_at(positions))
     counted = frames_of(pictures)
+    said = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
     return Clip(
         name,
         place,
         pictures,
-        rate_hz or _rate(place),
-        counted or (truth.length if truth is not None else 0),
+        rate_hz or said.rate_hz,
+        counted or said.length,
         truth,
         still,
         shows,
@@ -87,22 +88,8 @@ def positions_at(path: Path) -> Positions:
     from torchvision_dddas.sources.positions import read_positions
 
     said = read_positions(path)
-    return Positions(said.frame, said.target, said.east_north_m)
+    return Positions(said.frame, said.target, said.east_north_m, said.lonlat_deg)
 
 
 def _first(place: Path, *patterns: str) -> Path | None:
     return next((path for pattern in patterns for path in sorted(place.glob(pattern)) if path.is_file()), None)
-
-
-def _rate(place: Path) -> float | None:
-    """Frames a second by seqinfo.ini. Raises InputError where it is damaged."""
-    path = place / "seqinfo.ini"
-    if not path.is_file():
-        return None
-    ini = configparser.ConfigParser()
-    try:
-        ini.read(path, encoding="utf-8")
-        rate = ini.getfloat("Sequence", "frameRate", fallback=0.0)
-    except (configparser.Error, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path} does not tell frameRate under [Sequence]: {error}") from error
-    return rate if 0 < rate <= 1000 else None

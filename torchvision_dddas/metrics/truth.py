@@ -1,6 +1,5 @@
 """Reading what is true of a clip: masks, one labelled box a frame, or MOTChallenge boxes."""
 
-import configparser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,22 +11,25 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import mot_text
 from torchvision_dddas.metrics.matching import Ignoring, TrackTable
 from torchvision_dddas.metrics.mot_text import FARTHEST
+from torchvision_dddas.metrics.seqinfo import read_seqinfo
 from torchvision_dddas.picture_bytes import decoded
 
-MOST_FRAMES = 10_000_000
-"""No clip is longer."""
+UNNAMED = 1 << 24
+"""The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
 
 
 @dataclass(frozen=True)
 class Labels:
     """What the values of a mask mean. background: nothing moves there. unscored: nobody knows, or nobody asks.
 
-    Each other value is a mover; separate: each is one target, so that boxes can be scored too.
+    Each other value is a mover; movers: where given, only these are, and any other value is unscored. separate: each is
+    one target, so that boxes can be scored too.
     """
 
     background: tuple[int, ...] = (0,)
     unscored: tuple[int, ...] = ()
     separate: bool = True
+    movers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,10 @@ def labels_of(truth: Truth, frame: int) -> np.ndarray:
     values, said = read_mask(truth.masks[frame]), truth.labels
     if said == Labels():
         return values
-    labels = np.where(np.isin(values, said.background), 0, values)
+    labels = np.where(np.isin(values, said.background), 0, np.where(values == 0, UNNAMED, values))
     labels[np.isin(values, said.unscored)] = -1
+    if said.movers:
+        labels[~np.isin(values, said.movers + said.background)] = -1
     return labels
 
 
@@ -173,13 +177,5 @@ def _length(path: Path) -> int:
     """Frames of the clip by MOTChallenge's seqinfo.ini, beside the truth or above its folder; 0 where there is none."""
     for place in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini"):
         if place.is_file():
-            ini = configparser.ConfigParser()
-            try:
-                ini.read(place, encoding="utf-8")
-                length = ini.getint("Sequence", "seqLength")
-            except (configparser.Error, UnicodeDecodeError, ValueError) as error:
-                raise InputError(f"{place} does not tell seqLength under [Sequence]: {error}") from error
-            if not 0 <= length <= MOST_FRAMES:
-                raise InputError(f"{place}: seqLength is {length}; wanted 0 to {MOST_FRAMES}")
-            return length
+            return read_seqinfo(place).length
     return 0
