@@ -1,15 +1,21 @@
 """Clips that go through a back end together: each gives what it gives alone, to the last digit."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import Settings, load, with_knobs
 from torchvision_dddas.simulation.scene import render
-from torchvision_dddas.studies.batches import scenes_together
+from torchvision_dddas.studies.batches import find_motion_together, scenes_together
+from torchvision_dddas.studies.record import Found
+from torchvision_dddas.studies.stages import find
 from torchvision_dddas.types import Frame, Scene
 from torchvision_dddas.vision import load as load_vision
 
@@ -113,3 +119,33 @@ def test_what_the_back_end_took_is_shared_out_among_the_clips(films, backend) ->
 
 def test_no_clip_gives_nothing(backend) -> None:
     assert list(scenes_together({}, load_vision(backend, load()), load())) == []
+
+
+def on_disk(place: Path, images: Sequence[np.ndarray]) -> Clip:
+    """A clip as a data set has it, with a mask as the truth of its third and fourth frame."""
+    place.mkdir()
+    for i, image in enumerate(images, 1):
+        cv2.imwrite(str(place / f"{i:06d}.png"), image)
+    masks = {frame: place / f"{frame:06d}.png" for frame in (3, 4)}
+    return Clip(place.name, place, tuple(sorted(place.glob("*.png"))), truth=Truth("masks", place, masks, {}))
+
+
+def test_clips_of_a_study_are_found_together_as_each_alone(films, backend, tmp_path) -> None:
+    clips = [on_disk(tmp_path / name.replace(" ", "_"), images) for name, images in films.items()]
+    together = find_motion_together(clips, load("fast"), backend)
+    assert list(together) == [clip.name for clip in clips]
+    for clip in clips:
+        one, other = find(clip, "motion", load("fast"), backend), together[clip.name]
+        assert isinstance(other, Found)
+        for name in ("frame", "box_px", "score", "looked"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        assert set(one.masks) == {3, 4} and one.masks == other.masks and one.notes == other.notes
+        assert {k: v.tobytes() for k, v in one.steps.items()} == {k: v.tobytes() for k, v in other.steps.items()}
+        assert {k: v.tobytes() for k, v in one.more.items()} == {k: v.tobytes() for k, v in other.more.items()}
+        assert set(one.seconds) == set(other.seconds)
+
+
+def test_of_a_clip_without_pictures_the_cause_is_told_and_the_others_are_found(films, backend, tmp_path) -> None:
+    clips = [Clip("none", tmp_path / "none"), on_disk(tmp_path / "some", films["small"])]
+    found = find_motion_together(clips, load("fast"), backend)
+    assert "no pictures" in str(found["none"]) and isinstance(found["some"], Found)

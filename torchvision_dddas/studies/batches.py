@@ -5,21 +5,63 @@ else is in a batch, nor on their order.
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
+from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.run import Ask, Clip, Steps, running
+from torchvision_dddas.run import Ask, Steps, running
+from torchvision_dddas.run import Clip as Frames
 from torchvision_dddas.settings import Settings
+from torchvision_dddas.studies.memory import Peak
+from torchvision_dddas.studies.record import Found
+from torchvision_dddas.studies.stages import Kept, Tick, labelled, narrowed, opened
 from torchvision_dddas.types import Scene, Telemetry
+from torchvision_dddas.vision import load
 from torchvision_dddas.vision.protocol import Vision
 
 BATCH = 8  # windows at once, over all clips: as many as `run.run` gives to torch of one
 
 
+def find_motion_together(
+    clips: Sequence[Clip], settings: Settings, backend: str = "torch", tick: Tick = lambda: None
+) -> dict[str, Found | InputError]:
+    """What moves in each of the clips, by name; of a clip that will not do, why. As `stages.find` finds it in each.
+
+    seconds and peak_mb are shares of the time and the peak of all of them.
+    """
+    settings, peak, start = narrowed(settings, "motion"), Peak(), time.perf_counter()
+    found: dict[str, Found | InputError] = {}
+    sources = {}
+    for clip in clips:
+        try:
+            sources[clip.name] = opened(clip)
+        except InputError as error:
+            found[clip.name] = error
+    kept = {clip.name: Kept(labelled(clip), tick) for clip in clips if clip.name in sources}
+    frames = dict.fromkeys(kept, 0)
+    ended = dict[str, InputError | None]()
+    for name, said in scenes_together(sources, load(backend, settings), settings):
+        if isinstance(said, Scene):
+            kept[name].add(said)
+            frames[name] += 1
+        else:
+            ended[name] = said
+    rows = {name: one.rows() for name, one in kept.items()}
+    other = time.perf_counter() - start - sum(sum(one.seconds.values()) for one in rows.values())
+    for name, end in ended.items():
+        if end is not None:
+            found[name] = end
+            continue
+        rows[name].notes += map(str, sources[name].problems)
+        rows[name].seconds["other"] = other * frames[name] / max(sum(frames.values()), 1)
+        found[name] = rows[name].found(peak.mb())
+    return {clip.name: found[clip.name] for clip in clips}
+
+
 def scenes_together(
-    clips: Mapping[str, Clip],
+    clips: Mapping[str, Frames],
     vision: Vision,
     settings: Settings,
     telemetry: Mapping[str, Telemetry] | None = None,

@@ -181,27 +181,44 @@ def motion(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
     return rows
 
 
-def scenes_kept(scenes: Iterator[Scene], wanted: set[int], tick: Tick) -> Rows:
-    """What of a clip's scenes later stages and measures need. wanted: the frames whose masks are kept."""
-    rows, causes = Rows(), {}
-    for scene in scenes:
-        number, found = scene.frame.number, scene.detections
+class Kept:
+    """What of a clip's scenes later stages and measures need, scene by scene."""
+
+    def __init__(self, wanted: set[int], tick: Tick) -> None:
+        """wanted: the frames whose masks are kept."""
+        self._wanted, self._tick = wanted, tick
+        self._rows, self._causes = Rows(), dict[int, str]()
+
+    def add(self, scene: Scene) -> None:
+        """The next scene."""
+        number, found, rows = scene.frame.number, scene.detections, self._rows
         more = {"area_px": found.area_px, "heading_rad": found.heading_rad, "speed_px": found.speed_px}
         rows.add(number, scene.seconds, box_px=found.box_px, score=found.score, middle_px=found.middle_px, **more)
-        if number in wanted:
+        if number in self._wanted:
             # One bit would do; the numbers of the targets cost little more, and pictures of results show them.
             mask = np.minimum(scene.mask, 255).astype(np.uint8)
             rows.masks[number] = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         if scene.step is not None and scene.step.reliable:
             rows.steps[number] = scene.step.later_from_earlier
         if not scene.reliable:
-            causes[number] = scene.cause
-        tick()
-    unreliable = len(causes)
-    if unreliable:
-        first = min(causes)
-        rows.notes.append(f"{unreliable} frames with unreliable registration, first {first}: {causes[first]}")
-    return rows
+            self._causes[number] = scene.cause
+        self._tick()
+
+    def rows(self) -> Rows:
+        """All of it, and in words how many frames could not be trusted."""
+        if self._causes:
+            first = min(self._causes)
+            told = f"{len(self._causes)} frames with unreliable registration, first {first}: {self._causes[first]}"
+            self._rows.notes.append(told)
+        return self._rows
+
+
+def scenes_kept(scenes: Iterator[Scene], wanted: set[int], tick: Tick) -> Rows:
+    """What is kept of a clip's scenes."""
+    kept = Kept(wanted, tick)
+    for scene in scenes:
+        kept.add(scene)
+    return kept.rows()
 
 
 def scenes_again(clip: Clip, found: Found) -> Iterator[Scene]:
