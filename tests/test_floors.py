@@ -81,6 +81,18 @@ FLOORS: dict[str, set[str]] = {
     "sources.telemetry": {"numpy", "av", "pymavlink", "pyulog", "pynmea2", "sources", "types", "errors"},
     "sources.elevation": {"numpy", "rasterio", "types", "errors"},
     "sinks": {"numpy", "cv2", "av", "types", "errors", "__init__"},
+    # A study's page tells its results and draws its clips' pictures.
+    "sinks.study_report": {
+        "numpy",
+        "cv2",
+        "sinks",
+        "metrics",
+        "sources",
+        "studies.record",
+        "studies.scored",
+        "picture_bytes",
+        "errors",
+    },
     "simulation": {"numpy", "cv2", "types", "targets.geodesy", "errors"},
     # A scenario is knobs: the same machinery reads, checks and describes them.
     "simulation.scenario": {"pydantic", "settings", "errors"},

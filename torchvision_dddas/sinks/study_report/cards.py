@@ -1,0 +1,65 @@
+"""What the page says first: of each task how good, how sure, where it fails, and what it cost."""
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from torchvision_dddas.sinks.page_tables import number
+from torchvision_dddas.sinks.study_report.costs import Cost, summed
+from torchvision_dddas.sinks.study_report.figures import Told
+from torchvision_dddas.sinks.study_report.measures import groups_of, shown
+from torchvision_dddas.sinks.study_report.words import GROUPS, HEADLINES, TITLES, measure
+from torchvision_dddas.studies.record import Task
+
+
+def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
+    """A task at a glance; it leads to the task's section."""
+    parts = [f'<h3><a href="#{task}">{TITLES[task]}</a></h3>']
+    chosen = headline(task, told)
+    if chosen is None:
+        parts.append("<p>no measure</p>")
+    else:
+        group, name = chosen
+        known = measure(name)
+        only = next(iter(told.clips.values()))
+        whole = (told.pooled if len(told.clips) > 1 else only).get(group, {}).get(name)
+        if whole is not None:
+            meaning = f' title="{escape(known.meaning)}"' if known.meaning else ""
+            parts.append(
+                f'<div class="big">{number(whole.value, known.digits)} <span{meaning}>{escape(known.name)}, '
+                f"{escape(GROUPS.get(group, group))}</span></div>"
+            )
+            if math.isfinite(whole.low) and math.isfinite(whole.high):
+                ends = f"{number(whole.low, known.digits)} to {number(whole.high, known.digits)}"
+                parts.append(f"<p>95 % interval: {ends}</p>")
+        parts.append(f"<p>{_over(told, group, name)}</p>")
+    if cost := summed(costs, task):
+        parts.append(f'<p class="soft">{escape(cost)}</p>')
+    if left_out:
+        parts.append(f'<p class="bad">{left_out} left out, see <a href="#left-out">below</a></p>')
+    return f'<section class="card">{"".join(parts)}</section>'
+
+
+def headline(task: Task, told: Told) -> tuple[str, str] | None:
+    """The group and measure that a task is judged by: the first of HEADLINES that most clips have."""
+    wanted = [pair for pair in HEADLINES[task] if any(pair[1] in clip.get(pair[0], {}) for clip in told.clips.values())]
+    if wanted:
+        return max(wanted, key=lambda pair: sum(pair[1] in clip.get(pair[0], {}) for clip in told.clips.values()))
+    for group in groups_of(told):
+        if names := shown(told, group):
+            return group, names[0]
+    return None
+
+
+def _over(told: Told, group: str, name: str) -> str:
+    """Over how many clips, and which is the worst."""
+    values: Mapping[str, float] = {
+        clip: groups[group][name].value
+        for clip, groups in told.clips.items()
+        if name in groups.get(group, {}) and math.isfinite(groups[group][name].value)
+    }
+    if len(values) < 2:
+        return f"one clip: {escape(next(iter(values), 'none'))}"
+    known = measure(name)
+    worst = (max if known.better < 0 else min)(values, key=lambda clip: values[clip])
+    return f"pooled over {len(values)} clips; worst: {escape(worst)}, {number(values[worst], known.digits)}"

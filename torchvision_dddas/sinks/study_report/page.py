@@ -1,0 +1,173 @@
+"""report.html of a study: how good, how sure, where it fails, what it cost; one page that opens offline."""
+
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from torchvision_dddas.sinks.journal import finite
+from torchvision_dddas.sinks.page import SCRIPT, page, picture_url
+from torchvision_dddas.sinks.page_tables import Column, sorted_table, words
+from torchvision_dddas.sinks.study_report.cards import card
+from torchvision_dddas.sinks.study_report.costs import cost_charts, cost_table, costs_of, summed
+from torchvision_dddas.sinks.study_report.curves import course_charts, ranked_charts
+from torchvision_dddas.sinks.study_report.figures import Told, told
+from torchvision_dddas.sinks.study_report.maps import maps
+from torchvision_dddas.sinks.study_report.measures import groups_of, measure_plot, measure_table
+from torchvision_dddas.sinks.study_report.pictures import KEY
+from torchvision_dddas.sinks.study_report.words import GROUPS, TITLES
+from torchvision_dddas.sinks.study_report.worst import Worst, drawn, worst_frames
+from torchvision_dddas.studies.record import TASKS, Case, Results
+
+MOST_LEFT_OUT = 200
+MOST_BYTES = 12_000_000
+"""Of pictures, as they stand on the page."""
+
+
+def report(metrics: Mapping[str, Any], results: Results) -> str:
+    """The HTML. metrics: as `studies.summary.summary` has it; pictures are drawn from the clips' files."""
+    by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
+    told_of = {task: told(metrics, task) for task, cases in by_task.items() if cases}
+    costs = costs_of(results.cases)
+    title = f"Study {results.spec.name}"
+    scored = [case for case in results.cases if case.scored is not None]
+    clips = len({str(case.clip.place) + case.clip.name for case in scored})
+    failed = [case for case in results.cases if case.cause]
+    state = f"{_many(clips, 'clip')}, {_many(len(told_of), 'task')}; in all {summed(costs) or 'no times kept'}"
+    parts = [f"<h1>{escape(title)}</h1>", f'<p class="soft">{escape(state)}</p>', '<div class="cards">']
+    for task, mine in told_of.items():
+        parts.append(card(task, mine, costs, sum(case.cause != "" for case in by_task[task])))
+    parts.append("</div>")
+    parts.append(_left_out(failed, results.left_out))
+    shown: list[Worst] = []
+    for task, mine in told_of.items():
+        parts += _task(task, mine, by_task[task], shown)
+    parts += _costs(costs)
+    parts += _facts(results)
+    return page(title, [part for part in parts if part], script=SCRIPT)
+
+
+def _task(task: str, mine: Told, cases: Sequence[Case], shown: list[Worst]) -> list[str]:
+    parts = [f'<h2 id="{task}">{TITLES[task]}</h2>', f'<p class="soft">{escape(TASKS[task])}</p>']  # type: ignore[index]
+    frames = {case.clip.name: len(case.scored.frames) for case in cases if case.scored is not None}
+    plots = []
+    for group in groups_of(mine):
+        plot, more = measure_plot(mine, group)
+        note = f"the worst {len(mine.clips) - more}; {more} better ones are in the table" if more else ""
+        plots += [_plot(plot, note)] if plot else []
+    plots += [_plot(chart) for chart in ranked_charts(cases)]
+    parts += ['<div class="plots">', *plots, "</div>"] if plots else []
+    for group in groups_of(mine):
+        parts += [f"<h3>{escape(GROUPS.get(group, group)).capitalize()}</h3>", measure_table(mine, group, frames)]
+    chosen, others = worst_frames(cases)
+    if chosen:
+        shown += chosen
+        parts += _pictures(chosen, others)
+    ordered = sorted(cases, key=lambda case: _rank(case, chosen))
+    if courses := course_charts(ordered):
+        more = len([case for case in cases if case.scored is not None]) - len(courses)
+        note = f'<p class="note">{_many(more, "other clip")} not drawn.</p>' if more > 0 else ""
+        parts += ["<h3>As the clips go on</h3>", '<div class="plots">', *(_plot(c) for c in courses), "</div>", note]
+    if seen := maps(cases):
+        parts += ["<h3>Maps</h3>", '<div class="plots">', *(_plot(one) for one in seen), "</div>"]
+    notes = [f"{case.clip.name}: {note}" for case in cases if case.scored for note in case.scored.notes]
+    if notes:
+        items = "".join(f"<li>{escape(note)}</li>" for note in dict.fromkeys(notes))
+        parts.append(f"<details><summary>Notes ({len(notes)})</summary><ul>{items}</ul></details>")
+    return parts
+
+
+def _pictures(chosen: Sequence[Worst], others: int) -> list[str]:
+    left = f"; {_many(others, 'other frame')} with a fault left out" if others else ""
+    key = "".join(
+        f'<li><svg viewBox="0 0 26 16" aria-hidden="true">{sign}</svg>{escape(name)}</li>' for name, sign in KEY
+    )
+    figures = [_figure(one) for one in drawn(chosen)]
+    return [
+        "<h3>Where it went worst</h3>",
+        f'<p class="note">{_many(len(chosen), "frame")}, at most three of a clip{left}.</p>',
+        f'<ul class="key">{key}</ul>',
+        '<div class="pictures">',
+        *figures,
+        "</div>",
+    ]
+
+
+def _figure(one: Worst) -> str:
+    when = f"{one.case.clip.name}, frame {one.frame}"
+    words_of_it = f"<figcaption><b>{escape(when)}</b>: {escape(one.words)}</figcaption>"
+    if one.pair is None:
+        return (
+            f'<figure><p class="note">no picture: {escape(one.trouble or "nothing to draw")}</p>{words_of_it}</figure>'
+        )
+    sides = "".join(
+        f'<div><span>{what}</span><img loading="lazy" alt="{escape(f"{what} of {when}: {one.words}")}" '
+        f'src="{picture_url(jpeg)}"></div>'
+        for what, jpeg in (("truth", one.pair.truth), ("result", one.pair.result))
+    )
+    return f'<figure><div class="pair">{sides}</div>{words_of_it}</figure>'
+
+
+def _left_out(failed: Sequence[Case], left_out: Sequence[str]) -> str:
+    lines = list(left_out)
+    lines += [f"{c.clip.name}, {c.task}: {c.cause}" for c in failed if not any(c.cause in line for line in lines)]
+    if not lines:
+        return ""
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines[:MOST_LEFT_OUT])
+    more = f'<p class="note">and {len(lines) - MOST_LEFT_OUT} more</p>' if len(lines) > MOST_LEFT_OUT else ""
+    folded = "" if len(lines) > 8 else " open"
+    head = f'<summary class="bad">Left out ({len(lines)})</summary>'
+    return f'<details id="left-out"{folded}>{head}<ul>{items}</ul>{more}</details>'
+
+
+def _costs(costs: Sequence[Any]) -> list[str]:
+    if not costs:
+        return []
+    plots = [_plot(one) for one in cost_charts(costs)]
+    return [
+        '<h2 id="costs">Costs</h2>',
+        '<p class="soft">Seconds of computing, when and where it was done; a result that was kept has its own.</p>',
+        *(['<div class="plots">', *plots, "</div>"] if plots else []),
+        cost_table(costs),
+    ]
+
+
+def _facts(results: Results) -> list[str]:
+    spec = results.spec
+    said = {
+        "data sets": [f"{source.kind}: {', '.join(source.clips)}" for source in spec.sources],
+        "tasks": spec.tasks or ["all that each clip allows"],
+        "configuration": spec.config or "defaults",
+        "set": spec.overrides or "nothing",
+        "back end": spec.backend,
+        "interval": spec.interval,
+        **results.facts,
+    }
+    rows = [[words(name.replace("_", " ")), words(_in_words(value))] for name, value in said.items()]
+    settings = json.dumps(finite(results.settings.model_dump(mode="json")), indent=2)
+    return [
+        '<h2 id="settings">What was run</h2>',
+        sorted_table("what was run", [Column("what", text=True), Column("value", text=True)], rows, sorts=False),
+        f'<details><summary>Settings in force</summary><pre tabindex="0">{escape(settings)}</pre></details>',
+    ]
+
+
+def _plot(svg: str, note: str = "") -> str:
+    return f"<figure>{svg}{f'<figcaption>{escape(note)}</figcaption>' if note else ''}</figure>"
+
+
+def _rank(case: Case, chosen: Sequence[Worst]) -> int:
+    """Clips with a worst frame first, in the order of these."""
+    return next((k for k, one in enumerate(chosen) if one.case is case), len(chosen))
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_in_words(v)}" for name, v in value.items())
+    if isinstance(value, (list, tuple)):
+        return "; ".join(_in_words(v) for v in value)
+    return "unknown" if value is None else str(value)
