@@ -45,7 +45,8 @@ def within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
     side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     inside = np.prod(np.maximum(side, 0), axis=-1)
     share: np.ndarray = inside / np.maximum(np.prod(box_px[:, 2:], axis=1), EPSILON)[:, None]
-    return (share > WITHIN + EPSILON).any(axis=1)
+    lies: np.ndarray = (share > WITHIN + EPSILON).any(axis=1)
+    return lies
 
 
 def _at(table: TrackTable | None, frame: int) -> np.ndarray:
