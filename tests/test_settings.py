@@ -155,3 +155,8 @@ def test_settings_cannot_be_changed_in_place() -> None:
 def test_settings_survive_a_round_trip_through_plain_data() -> None:
     settings = load("source")
     assert Settings.model_validate_json(settings.model_dump_json()) == settings
+
+
+def test_pauses_before_a_stream_is_opened_again_cannot_shrink():
+    with pytest.raises(InputError, match=r"retry_most_s = 1 is below retry_s = 4"):
+        load(None, ["live.retry_s=4", "live.retry_most_s=1"])

@@ -382,7 +382,7 @@ class PeopleKnobs(Group):
         "-",
         0.001,
         1,
-        meaning="regions: what a look may cost at most, as a share of one at the whole picture, so that none takes long: "
+        meaning="regions: what a look may cost at most, as a share of one at the whole picture, so none takes long: "
         "picture and regions are then searched in turns from the first look on; 1: no bound. --live takes 0.1 at most",
     )
     region_margin: float = knob(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
@@ -662,6 +662,12 @@ class LiveKnobs(Group):
     status_s: float = knob(
         2.0, "s", 0.1, 600, meaning="how often the state of the run is written, and results are put to disk"
     )
+
+    @model_validator(mode="after")
+    def _pauses_grow(self) -> "LiveKnobs":
+        if self.retry_most_s < self.retry_s:
+            raise ValueError(f"retry_most_s = {self.retry_most_s:g} is below retry_s = {self.retry_s:g}")
+        return self
 
 
 class Settings(Group):

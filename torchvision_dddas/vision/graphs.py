@@ -72,16 +72,18 @@ def manifest(folder: Path) -> dict[str, Any]:
 def _checked(path: Path, text: bytes) -> dict[str, Any]:
     try:
         held = json.loads(text)
+        made_by = held["package"]
         intact = isinstance(held["graphs"], dict) and held["seal"] == seal(held)
     except (ValueError, KeyError, TypeError, RecursionError):
-        intact, held = False, {}
-    if not intact:
-        raise InputError(f"{path} is not as `dddas export` wrote it: damaged or changed; {_again(path.parent)}")
-    if held.get("package") != __version__:
+        intact, held, made_by = False, {}, __version__
+    # Before the seal, which another version may make in another way.
+    if isinstance(made_by, str) and made_by != __version__:
         raise InputError(
-            f"the graphs in {path.parent} were made by torchvision-dddas {held.get('package')}, "
+            f"the graphs in {path.parent} were made by torchvision-dddas {made_by}, "
             f"and this is {__version__}; {_again(path.parent)}"
         )
+    if not intact:
+        raise InputError(f"{path} is not as `dddas export` wrote it: damaged or changed; {_again(path.parent)}")
     return dict(held)
 
 
