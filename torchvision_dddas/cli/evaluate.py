@@ -115,7 +115,7 @@ def evaluate(
 
     With --dataset the clips of whole data sets are run and scored; metrics.json, report.html and run.json are written.
     """
-    study = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
+    study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
     study |= {"--config": config, "--set": set_ or None, "--backend": backend}
     if dataset is not None:
         _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")

@@ -16,7 +16,8 @@ from torchvision_dddas.run import Clip as Frames
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.studies.memory import Peak
 from torchvision_dddas.studies.record import Found
-from torchvision_dddas.studies.stages import Kept, Tick, labelled, narrowed, opened
+from torchvision_dddas.studies.rows import Kept, Tick
+from torchvision_dddas.studies.stages import labelled, narrowed, opened
 from torchvision_dddas.types import Scene, Telemetry
 from torchvision_dddas.vision import load
 from torchvision_dddas.vision.protocol import Vision

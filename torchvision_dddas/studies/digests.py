@@ -21,11 +21,15 @@ PACKAGE = Path(__file__).resolve().parent.parent
 FINDS = (
     *("types.py", "shapes.py", "settings.py", "picture_bytes.py", "windows.py", "pipeline.py", "control.py", "run.py"),
     *("recognizing.py", "confirming.py", "locating.py", "following.py", "geolocating", "surveying.py", "spotting.py"),
-    *("ops", "targets", "vision", "sources", "graphs", "models", "studies/stages.py", "studies/placing.py"),
+    *("ops", "targets", "vision", "sources", "graphs", "models", "cli/aerial.py", "cli/prepared.py", "mission"),
+    *(f"studies/{name}.py" for name in ("record", "rows", "stages", "placing", "batches")),
 )
 """The files and folders of the package that decide what is found in a clip."""
 
-SCORES = ("types.py", "picture_bytes.py", "targets", "metrics", "studies/scored.py", "studies/scoring.py")
+SCORES = (
+    *("types.py", "picture_bytes.py", "targets", "metrics"),
+    *("studies/scored.py", "studies/scoring.py", "studies/placing_score.py"),
+)
 """Those that decide how right it is."""
 
 _LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "pymap3d", "av")
@@ -84,17 +88,23 @@ def _version(library: str) -> str:
         return ""
 
 
+class UnreadError(Exception):
+    """A digest is not known, and no file was to be read for it."""
+
+
 class Files:
     """Digests of files' content. A list of files that is as it was by size and time is not read again.
 
-    memory: a folder where they are kept; None keeps nothing.
+    memory: a folder where they are kept; None keeps nothing. read: whether files may be read, else UnreadError.
     """
 
-    def __init__(self, memory: Path | None) -> None:
-        self.memory = memory
+    def __init__(self, memory: Path | None, read: bool = True) -> None:
+        self.memory, self.read = memory, read
 
     def digest(self, paths: Sequence[Path]) -> str:
         """The digest of the content of files, in order. Raises InputError for one that cannot be read."""
+        if not paths:
+            return ""
         marks = [_mark(path) for path in paths]
         place = None if self.memory is None else self.memory / f"{of(marks)}.txt"
         if place is not None:
@@ -102,6 +112,8 @@ class Files:
                 known = place.read_text(encoding="ascii", errors="replace").strip()
                 if len(known) == 64:
                     return known
+        if not self.read:
+            raise UnreadError
         digest = of(list(_contents(paths)))
         if place is not None and all(time.time() - mark[2] / 1e9 > _SETTLED_S for mark in marks):
             with suppress(OSError):  # only time is lost

@@ -5,7 +5,6 @@ import hashlib
 import importlib
 import io
 import json
-import types
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +30,7 @@ def packed(record: Any) -> bytes:
     content = json.dumps(_plain(record, arrays), ensure_ascii=True)
     arrays[_CONTENT] = np.frombuffer(content.encode("ascii"), np.uint8)
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    np.savez(file, allow_pickle=False, **arrays)
     body = file.getvalue()
     return hashlib.sha256(body).digest() + body
 
@@ -109,8 +108,6 @@ def _kind(name: str) -> type:
     if not module.startswith(_HOME):
         raise DamagedError(f"{name} is no record of this package")
     found = getattr(importlib.import_module(module), own)
-    if not isinstance(found, type) or isinstance(found, types.GenericAlias):
-        raise DamagedError(f"{name} is no record of this package")
-    if not (dataclasses.is_dataclass(found) or hasattr(found, "_fields")):
+    if not isinstance(found, type) or not (dataclasses.is_dataclass(found) or hasattr(found, "_fields")):
         raise DamagedError(f"{name} is no record of this package")
     return found

@@ -7,7 +7,7 @@ import struct
 import sys
 import threading
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 LIMITS = {
     **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
@@ -18,14 +18,14 @@ LIMITS = {
 _LENGTH = struct.Struct(">Q")
 
 
-def send(pipe: BinaryIO, message: Any) -> None:
+def send(pipe: IO[bytes], message: Any) -> None:
     """Write a message. Raises OSError where nobody reads any more."""
     content = pickle.dumps(message)
     pipe.write(_LENGTH.pack(len(content)) + content)
     pipe.flush()
 
 
-def receive(pipe: BinaryIO) -> Any | None:
+def receive(pipe: IO[bytes]) -> Any | None:
     """The next message; None where the other end is gone. Only a process of one's own is at the other end."""
     head = pipe.read(_LENGTH.size)
     if len(head) < _LENGTH.size:

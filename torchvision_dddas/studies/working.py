@@ -1,9 +1,7 @@
 """One clip from its files to its measures: each stage is taken from what is kept, or computed and kept."""
 
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +9,10 @@ from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.studies import digests
-from torchvision_dddas.studies.cache import Store
+from torchvision_dddas.studies.cache import Cache, Store
 from torchvision_dddas.studies.record import Found, Task
-from torchvision_dddas.studies.scored import Scored
-from torchvision_dddas.studies.stages import KNOBS, Tick, allowed, files_of, find, labelled, upstream
+from torchvision_dddas.studies.rows import Tick
+from torchvision_dddas.studies.stages import KNOBS, allowed, files_of, find, labelled, upstream
 
 
 @dataclass(frozen=True)
@@ -44,26 +42,39 @@ class Done:
     trace: str = ""
 
 
-def keys(job: Job, task: Task, files: digests.Files) -> tuple[str, str]:
-    """The keys of what a task finds, and of how right that is. Raises InputError where a file cannot be read."""
-    clip, before = job.clip, upstream(job.clip, task)
-    knobs = {group: getattr(job.settings, group).model_dump() for group in KNOBS[task]}
-    truth: Any = sorted(labelled(clip)) if task == "motion" else None
-    if task == "association" and clip.truth is not None:
-        truth = clip.truth.tracks
-    found = digests.of(
-        ("found", task, digests.code(digests.FINDS, job.backend), job.backend),
-        knobs,
-        files.digest([*files_of(clip, task), *_named_by(job.settings, task)]),
-        clip.rate_hz,
-        truth,
-        None if task in ("motion", "people") else job.interval,
-        "" if before is None else keys(job, before, files)[0],
-    )
-    scored = digests.of(
-        "scored", task, digests.code(digests.SCORES), found, job.interval, clip.still, clip.shows, _truth(clip, files)
-    )
-    return found, scored
+class Keys:
+    """The keys of a job's tasks, each made once."""
+
+    def __init__(self, job: Job, files: digests.Files) -> None:
+        self._job, self._files = job, files
+        self._found: dict[Task, str] = {}
+
+    def found(self, task: Task) -> str:
+        """That of what a task finds. Raises InputError where a file cannot be read."""
+        if task not in self._found:
+            self._found[task] = self._of(task)
+        return self._found[task]
+
+    def scored(self, task: Task) -> str:
+        """That of how right it is. Raises InputError where a file cannot be read."""
+        job, clip = self._job, self._job.clip
+        known = (clip.still, clip.shows, _truth(clip, self._files))
+        return digests.of("scored", task, digests.code(digests.SCORES), self.found(task), job.interval, known)
+
+    def _of(self, task: Task) -> str:
+        job, clip, before = self._job, self._job.clip, upstream(self._job.clip, task)
+        truth: Any = sorted(labelled(clip)) if task == "motion" else None
+        if task == "association" and clip.truth is not None:
+            truth = clip.truth.tracks
+        return digests.of(
+            ("found", task, digests.code(digests.FINDS, job.backend), job.backend),
+            {group: getattr(job.settings, group).model_dump() for group in KNOBS[task]},
+            self._files.digest([*files_of(clip, task), *_named_by(job.settings, task)]),
+            clip.rate_hz,
+            truth,
+            None if task in ("motion", "people") else job.interval,
+            "" if before is None else self.found(before),
+        )
 
 
 def _named_by(settings: Settings, task: Task) -> list[Path]:
@@ -83,63 +94,61 @@ def _truth(clip: Clip, files: digests.Files) -> Any:
     if truth is None:
         return None
     masks = files.digest([truth.masks[frame] for frame in sorted(truth.masks)])
-    rest = (truth.kind, truth.boxes, truth.tracks, truth.ignored, truth.length, truth.labels, truth.positions)
+    rest = {name: value for name, value in vars(truth).items() if name not in ("masks", "place")}
     return (sorted(truth.masks), masks, rest)
 
 
-def work(
-    job: Job,
-    store: Store,
-    files: digests.Files,
-    tell: Callable[[Done], object] = lambda done: None,
-    tick: Tick = lambda: None,
-) -> list[Done]:
-    """Do a job; one task's bad input does not hinder the others. tell: is given each task as it is done."""
-    done: list[Done] = []
-    for task in job.tasks:
-        done.append(_one(job, task, store, files, tick))
-        tell(done[-1])
-    return done
+def work(job: Job, store: Store, files: digests.Files, tick: Tick = lambda: None) -> list[Done]:
+    """Do a job; one task's bad input does not hinder the others. tick: called once a frame."""
+    keys = Keys(job, files)
+    return [_Work(job, keys, store, tick).done(task) for task in job.tasks]
 
 
-def _one(job: Job, task: Task, store: Store, files: digests.Files, tick: Tick) -> Done:
-    computed: list[str] = []
+def kept(job: Job, cache: Cache, files: digests.Files) -> list[Done] | None:
+    """What became of a job where all of it is kept; None where something is not, or its files have to be read."""
+    keys = Keys(job, files)
     try:
-        if task not in allowed(job.clip):
-            raise InputError(f"its pictures and truth do not allow {task}")
-        found_key, scored_key = keys(job, task, files)
-        scored = store.get(scored_key)
-        found = _found(job, task, store, files, computed, tick) if scored is None else store.get(found_key)
-        if found is None:  # damaged
-            found = _found(job, task, store, files, computed, tick)
-        if scored is None:
-            store.put(scored_key, _score(job, task, found))
-            computed.append(f"{task}: scored")
-    except InputError as error:
-        return Done(task, cause=str(error), computed=tuple(computed))
-    except Exception as error:
-        cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
-        return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
-    return Done(task, found_key, scored_key, computed=tuple(computed))
+        done = [Done(task, keys.found(task), keys.scored(task)) for task in job.tasks]
+    except (InputError, digests.UnreadError):
+        return None
+    return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
-def _score(job: Job, task: Task, found: Found) -> Scored:
-    if find_spec("torchvision_dddas.studies.scoring") is None:
-        return Scored(found.looked, {})
-    from torchvision_dddas.studies.scoring import score
+class _Work:
+    """A job under way."""
 
-    return score(job.clip, task, found, job.interval)
+    def __init__(self, job: Job, keys: Keys, store: Store, tick: Tick) -> None:
+        self._job, self._keys, self._store, self._tick = job, keys, store, tick
+        self._computed: list[str] = []
 
+    def done(self, task: Task) -> Done:
+        """Do a task."""
+        try:
+            if task not in allowed(self._job.clip):
+                raise InputError(f"its pictures and truth do not allow {task}")
+            found_key, scored_key = self._keys.found(task), self._keys.scored(task)
+            found = self._found(task, self._tick)
+            if self._store.get(scored_key) is None:
+                from torchvision_dddas.studies.scoring import score
 
-def _found(job: Job, task: Task, store: Store, files: digests.Files, computed: list[str], tick: Tick) -> Found:
-    """What a task finds, kept or computed."""
-    key = keys(job, task, files)[0]
-    kept: Found | None = store.get(key)
-    if kept is not None:
-        return kept
-    need = upstream(job.clip, task)
-    before = None if need is None else _found(job, need, store, files, computed, lambda: None)
-    found = find(job.clip, task, job.settings, job.backend, job.interval, before, tick)
-    store.put(key, found)
-    computed.append(task)
-    return found
+                self._store.put(scored_key, score(self._job.clip, task, found, self._job.interval))
+                self._computed.append(f"{task}: score")
+        except InputError as error:
+            return Done(task, cause=str(error), computed=tuple(self._computed))
+        except Exception as error:
+            cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
+            return Done(task, cause=cause, computed=tuple(self._computed), trace=traceback.format_exc())
+        return Done(task, found_key, scored_key, computed=tuple(self._computed))
+
+    def _found(self, task: Task, tick: Tick) -> Found:
+        """What a task finds, kept or computed."""
+        key, job = self._keys.found(task), self._job
+        known: Found | None = self._store.get(key)
+        if known is not None:
+            return known
+        need = upstream(job.clip, task)
+        before = None if need is None else self._found(need, lambda: None)
+        found = find(job.clip, task, job.settings, job.backend, job.interval, before, tick)
+        self._store.put(key, found)
+        self._computed.append(task)
+        return found
