@@ -5,7 +5,7 @@ Frames that follow each other are alike, so that single frames, drawn anew, woul
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ RESAMPLES = 1000
 LEVEL = 0.95
 
 FEWEST = 5
-"""Independent parts below which nothing is said: the range of five values misses their median in 1 of 16 cases."""
+"""Independent blocks below which nothing is said: the range of five values misses their median in 1 of 16 cases."""
 
 Statistic = Callable[[np.ndarray], dict[str, float]]
 """Weights (U,) of units, how often each counts, to measures by name; NaN where one is undefined."""
@@ -28,54 +28,72 @@ class Interval(NamedTuple):
     high: float
 
 
+class Stratum(NamedTuple):
+    """Units that are drawn among themselves, in blocks of neighbours: the frames of a clip, or all clips (block 1)."""
+
+    units: int
+    block: int = 1
+
+
 def intervals(
-    statistic: Statistic, units: int, block: int, seed: int, resamples: int = RESAMPLES
+    statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES
 ) -> dict[str, Interval | None]:
-    """An interval for each measure; None where fewer than FEWEST blocks, or a tenth of the samples gave no figure.
+    """An interval for each measure; None where there are fewer than FEWEST blocks or too few samples gave a figure.
 
     Percentiles of the resampled figures, widened for few blocks as a t distribution is against the normal one. Source:
     Hesterberg, 2015, "expanded percentile interval".
     """
-    parts = units / max(block, 1)
-    whole = statistic(np.ones(units))
-    if parts < FEWEST:
+    whole = statistic(np.ones(sum(stratum.units for stratum in strata)))
+    if parts(strata) < FEWEST:
         return dict.fromkeys(whole)
-    drawn = samples(statistic, units, block, seed, resamples)
-    return {name: percentiles(values, parts) if math.isfinite(whole[name]) else None for name, values in drawn.items()}
+    drawn = samples(statistic, strata, seed, resamples)
+    return {
+        name: percentiles(values, parts(strata)) if math.isfinite(whole[name]) else None
+        for name, values in drawn.items()
+    }
+
+
+def parts(strata: Sequence[Stratum]) -> float:
+    """How many blocks there are, what may be taken as independent."""
+    return sum(stratum.units / stratum.block for stratum in strata)
 
 
 def samples(
-    statistic: Statistic, units: int, block: int, seed: int, resamples: int = RESAMPLES
+    statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES
 ) -> dict[str, np.ndarray]:
     """(R,) each measure in each sample."""
-    found = [statistic(weight) for weight in weights(units, block, seed, resamples)]
+    found = [statistic(weight) for weight in weights(strata, seed, resamples)]
     return {name: np.array([one[name] for one in found]) for name in found[0]}
 
 
-def weights(units: int, block: int, seed: int, resamples: int = RESAMPLES) -> np.ndarray:
-    """(R, U) how often each unit is in each sample: blocks of neighbours, the last followed by the first.
+def weights(strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES) -> Iterator[np.ndarray]:
+    """How often each unit is in each sample, (U,): blocks of neighbours, after the last comes the first.
 
     Source: Politis and Romano, 1992, the circular block bootstrap. A block of 1: the plain bootstrap.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    begins = rng.integers(0, units, (resamples, -(-units // block)))
-    rows = ((begins[..., None] + np.arange(block)) % units).reshape(resamples, -1)[:, :units]
-    return np.stack([np.bincount(row, minlength=units) for row in rows]).astype(float)
+    for _ in range(resamples):
+        drawn = []
+        for units, block in strata:
+            begins = rng.integers(0, units, -(-units // block))
+            rows = ((begins[:, None] + np.arange(block)) % units).ravel()[:units]
+            drawn.append(np.bincount(rows, minlength=units))
+        yield np.concatenate(drawn).astype(float)
 
 
-def percentiles(values: np.ndarray, parts: float, level: float = LEVEL) -> Interval | None:
-    """The interval that samples of so many independent parts tell; None if a tenth of them are no number."""
+def percentiles(values: np.ndarray, count: float, level: float = LEVEL) -> Interval | None:
+    """The interval that samples of so many independent blocks tell; None if a tenth of them are no number."""
     known = values[np.isfinite(values)]
     if len(known) < 0.9 * len(values) or not len(known):
         return None
-    tail = expanded(parts, level)
+    tail = expanded(count, level)
     low, high = np.quantile(known, [tail, 1 - tail])
     return Interval(float(low), float(high))
 
 
-def expanded(parts: float, level: float = LEVEL) -> float:
-    """The share of samples beyond either end."""
-    return float(ndtr(math.sqrt(parts / (parts - 1)) * stdtrit(parts - 1, (1 - level) / 2)))
+def expanded(count: float, level: float = LEVEL) -> float:
+    """The share of samples beyond either end, for so many independent blocks."""
+    return float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - level) / 2)))
 
 
 def block_length(series: np.ndarray) -> int:
