@@ -189,7 +189,7 @@ def _draw_stages(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
         left = [a + b for a, b in zip(left, wide, strict=True)]
     axis.set_xlabel("processor time of a frame, ms")
     axis.grid(axis="y", visible=False)
-    axis.legend(frameon=False, fontsize=9, loc="lower right")
+    axis.legend(frameon=False, fontsize=9, loc="upper right")
     axis.set_title(f"Stages, {size[0]}×{size[1]}", fontsize=12, weight="bold")
 
 
@@ -209,7 +209,7 @@ def _draw_ratios(axis: Any, scenes: dict[tuple[int, int], Figures]) -> None:
         axis.axhline(goal, color="#888888", lw=1, ls=":")
     axis.axhline(1, color="#888888", lw=1)
     axis.set_yscale("log")
-    axis.set_ylim(0.05, None)
+    axis.set_ylim(0.025, None)
     axis.set_yticks([0.1, 0.2, 0.3, 0.5, 1, 2, 5], ["0.1", "0.2", "0.3", "0.5", "1", "2", "5"])
     axis.minorticks_off()
     axis.set_xticks(range(len(compared)), [f"{w}×{h}" for w, h in compared])
