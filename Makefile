@@ -43,5 +43,5 @@ $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "torchvision-dddas needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[torch,video,telemetry,elevation,export,train,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[torch,video,telemetry,elevation,export,train,tune,distributed,parquet,dev]'
 	@touch $@
