@@ -1,7 +1,7 @@
 """The measures of a study's metrics.json as figures with their intervals."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,35 +20,37 @@ Groups = Mapping[str, Mapping[str, Figure]]
 
 @dataclass(frozen=True)
 class Told:
-    """A task's figures: of each clip by name, of all counts together, the mean over clips, and the worst of a clip."""
+    """A task's figures: of each clip by name, of all counts together, and the mean over clips.
+
+    over: by group, what the intervals of all together are over: "clips", or "frames", which says nothing of others.
+    """
 
     clips: Mapping[str, Groups] = field(default_factory=dict)
     pooled: Groups = field(default_factory=dict)
     mean: Groups = field(default_factory=dict)
+    over: Mapping[str, str] = field(default_factory=dict)
 
 
 def told(metrics: Mapping[str, Any], task: str) -> Told:
     """A task's figures; empty where the study has none of it."""
     mine = metrics.get("tasks", {}).get(task, {})
     clips = {name: _groups(clip) for name, clip in mine.get("clips", {}).items()}
-    return Told(clips, _groups(mine.get("pooled", {})), _groups(mine.get("mean", {})))
+    pooled = mine.get("pooled", {})
+    return Told(clips, _groups(pooled), _groups(mine.get("mean", {})), pooled.get("over", {}))
 
 
 def _groups(groups: Mapping[str, Any]) -> Groups:
+    spans = groups.get("intervals", {})
     return {
-        group: {name: _figure(value) for name, value in measures.items()}
+        group: {name: _figure(value, spans.get(group, {}).get(name)) for name, value in measures.items()}
         for group, measures in groups.items()
-        if isinstance(measures, Mapping)
+        if isinstance(measures, Mapping) and group not in ("intervals", "over")
     }
 
 
-def _figure(value: Any) -> Figure:
-    if isinstance(value, Mapping):
-        low, high = value.get("interval") or (value.get("low"), value.get("high"))
-        return Figure(_number(value.get("value")), _number(low), _number(high))
-    if isinstance(value, (list, tuple)) and len(value) == 3:
-        return Figure(*(_number(v) for v in value))
-    return Figure(_number(value))
+def _figure(value: Any, span: Sequence[float] | None) -> Figure:
+    low, high = span or (None, None)
+    return Figure(_number(value), _number(low), _number(high))
 
 
 def _number(value: Any) -> float:
