@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.studies.record import Results, Spec
     from torchvision_dddas.studies.running import Plan
 
-FILES = ("metrics.json", "report.html", "run.json")
+FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", "scores.bin", "report.html", "run.json")
 
 
 def asked(
@@ -61,6 +61,7 @@ def study_into(
             raise
         measures = _measures(results)
         _write(folder, "metrics.json", measures)
+        _write_tables(folder, measures, results)
         if find_spec("torchvision_dddas.sinks.study_report.page") is not None:
             write_whole(folder / "report.html", _report(finite(measures), results).encode())
         _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
@@ -74,6 +75,17 @@ def _write(folder: Path, name: str, content: Any) -> None:
     from torchvision_dddas.sinks.whole import write_whole
 
     write_whole(folder / name, (json.dumps(finite(content), indent=2) + "\n").encode())
+
+
+def _write_tables(folder: Path, measures: dict[str, Any], results: "Results") -> None:
+    """The figures as tables, and what `dddas compare` needs."""
+    from torchvision_dddas.studies.scored import ScoredCase, write_scores
+    from torchvision_dddas.studies.tables import write_csv, write_parquet
+
+    write_csv(folder / "metrics.csv", measures)
+    write_parquet(folder, measures, results)
+    kept = [ScoredCase(case.task, case.clip.name, case.scored) for case in results.cases if case.scored is not None]
+    write_scores(folder, results.spec.name, kept)
 
 
 def _report(measures: dict[str, Any], results: "Results") -> str:

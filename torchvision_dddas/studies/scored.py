@@ -1,11 +1,18 @@
 """How right what was found in a clip is: counts that add over clips, frame by frame, and what curves are drawn of."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.clip import Counts
+from torchvision_dddas.sinks.whole import write_whole
+from torchvision_dddas.studies.stored import DamagedError, packed, unpacked
+
+SCORES = "scores.bin"
+"""The file of a study's folder that holds its counts, frame by frame."""
 
 
 @dataclass(frozen=True)
@@ -24,3 +31,44 @@ class Scored:
     ranked: Mapping[str, np.ndarray] = field(default_factory=dict)
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScoredCase:
+    """What a study keeps of a case, to be compared with that of another study."""
+
+    task: str
+    clip: str
+    scored: Scored
+
+
+@dataclass(frozen=True)
+class ScoredStudy:
+    """A study's cases, by task and name, as they lie in its folder."""
+
+    name: str
+    cases: tuple[ScoredCase, ...]
+
+
+def write_scores(folder: Path, name: str, cases: Iterable[ScoredCase]) -> None:
+    """Write a study's counts beside its figures, whole or not at all. Raises OSError."""
+    ordered = tuple(sorted(cases, key=lambda case: (case.task, case.clip)))
+    write_whole(folder / SCORES, packed(ScoredStudy(name, ordered)))
+
+
+def read_scores(folder: Path) -> ScoredStudy:
+    """Read them back. Raises InputError where the folder holds no study, or its file is damaged."""
+    place = folder / SCORES
+    try:
+        study = unpacked(place.read_bytes())
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder} holds no study: no {SCORES}; wanted a folder that dddas evaluate --dataset wrote"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{place} cannot be read: {error.strerror}") from None
+    except DamagedError as error:
+        raise InputError(f"{place} is damaged or of another version ({error}); run the study again") from None
+    if not isinstance(study, ScoredStudy):
+        raise InputError(f"{place} holds no scores of a study; run the study again")
+    return study
