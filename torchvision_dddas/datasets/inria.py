@@ -27,7 +27,6 @@ from torchvision_dddas.datasets.pictures import images_in
 from torchvision_dddas.datasets.record import Clip, Dataset
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.sources.images import read_image
 
 TERMS = "research; as is, without any warranty"
 BODY_HEIGHT_PX = 96.0
@@ -47,14 +46,14 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         nobody = np.zeros((0, 4))
         found = {
             "pos": _each(images_in(home / "pos"), _annotated, notes),
-            "neg": _each(images_in(home / "neg"), lambda picture: (picture, _size(picture), nobody), notes),
+            "neg": _each(images_in(home / "neg"), lambda picture: (picture, size_of(picture), nobody), notes),
         }
         notes += [f"no pictures in {home / name}, where they belong" for name in found if not images_in(home / name)]
     elif crops := images_in(folder):
         height_px = given["body_height_px"]
 
         def one(picture: Path) -> Pictured:
-            size = _size(picture)
+            size = size_of(picture)
             return picture, size, body_of(size, height_px)
 
         found = {"crops": _each(crops, one, notes)}
@@ -78,19 +77,10 @@ def _annotated(picture: Path) -> Pictured:
     path = picture.parents[1] / "annotations" / f"{picture.stem}.txt"
     if not path.is_file():
         raise InputError(f"no truth, which belongs in {path}")
-    said, size = read_annotation(path), _size(picture)
+    said, size = read_annotation(path), size_of(picture)
     if said.size != size:
         raise InputError(f"it is {size[0]}×{size[1]} pixels, but {path} says {said.size[0]}×{said.size[1]}")
     return picture, size, said.box_px
-
-
-def _size(picture: Path) -> tuple[int, int]:
-    if (size := size_of(picture)) is not None:
-        return size
-    image = read_image(picture)
-    if image is None:
-        raise InputError("it is no picture that can be read")
-    return image.shape[1], image.shape[0]
 
 
 def _each(pictures: Iterable[Path], read_one: Callable[[Path], Pictured], notes: list[str]) -> list[Pictured]:

@@ -18,7 +18,7 @@ KINDS: Mapping[str, str] = {
     "cdnet": "CDnet 2012 or 2014: a folder a category, in it one a video with input/ and groundtruth/",
     "uav123": "UAV123, UAV20L or UAV123 at 10 frames a second: anno/, data_seq/ and configSeqs.m",
     "vivid": "VIVID of PETS 2005: egtest01/ and its like, with boxes or masks of every tenth frame",
-    "motchallenge": "MOTChallenge 2015 to 2020 and its like: SEQUENCE/gt/gt.txt, with img1/ or a video where there is one",
+    "motchallenge": "MOTChallenge 2015 to 2020 and its like: SEQUENCE/gt/gt.txt, with img1/ or a video if there",
     "visdrone": "VisDrone-MOT: sequences/ and annotations/ of a split, or a folder of splits",
     "uavdt": "UAVDT of many targets: UAV-benchmark-M/ and UAV-benchmark-MOTD_v1.0/GT/",
     "cvml": "PETS 2009 and CAVIAR as CVML: NAME.xml, with pictures in NAME/ where it has them",
