@@ -1,6 +1,7 @@
 """Whether a clip's pictures and its truth fit each other, seen before any work is done on it."""
 
 from torchvision_dddas.datasets.picture_size import size_of
+from torchvision_dddas.datasets.pictures import frame_size
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 
@@ -34,13 +35,14 @@ def fitted(clip: Clip) -> Clip:
 def _check_sizes(clip: Clip) -> None:
     """The first and the last mask beside the first picture; the others are seen when they are scored."""
     truth = clip.truth
-    if truth is None or not truth.masks or not (size := size_of(clip.pictures[0])):
+    if truth is None or not truth.masks:
         return
-    for frame in {truth.frames[0]: 0, truth.frames[-1]: 0}:
-        mask = truth.masks[frame]
+    first = clip.pictures[0]
+    size = frame_size(first)
+    for mask in (truth.masks[truth.frames[0]], truth.masks[truth.frames[-1]]):
         found = size_of(mask)
-        if found and found != size:
+        if found != size:
             raise InputError(
-                f"{mask} is {found[0]}×{found[1]} pixels, but {clip.pictures[0].name} {size[0]}×{size[1]}; "
+                f"{mask} is {found[0]}×{found[1]} pixels, but {first.name} {size[0]}×{size[1]}; "
                 "wanted masks of the size of the pictures"
             )

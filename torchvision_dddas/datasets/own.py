@@ -64,10 +64,10 @@ def pictures_at(place: Path) -> tuple[Path, ...]:
     for name in FRAMES:
         if found := images_in(place / name):
             return found
-    videos = videos_in(place)
+    videos = [v for v in videos_in(place) if v.stem != "telemetry"]  # MPEG-TS that carries metadata alone
     if len(videos) > 1:
         raise InputError(f"{place} holds {len(videos)} videos, {videos[0].name} and {videos[1].name}; wanted one")
-    return videos
+    return tuple(videos)
 
 
 def truth_at(place: Path, pictures: tuple[Path, ...], labels: Labels) -> Truth | None:

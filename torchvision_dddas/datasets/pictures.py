@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+from torchvision_dddas.datasets.picture_size import size_of
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.sources.images import IMAGE_SUFFIXES, natural_order
+from torchvision_dddas.sources.video import VideoSource
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".ts", ".mpg", ".mpeg", ".wmv"})
 
@@ -23,12 +25,20 @@ def frames_of(pictures: tuple[Path, ...]) -> int:
 
     Raises InputError where the video cannot be opened.
     """
-    if len(pictures) == 1 and pictures[0].suffix.lower() in VIDEO_SUFFIXES:
-        from torchvision_dddas.sources.video import VideoSource
-
+    if len(pictures) == 1 and is_video(pictures[0]):
         video = VideoSource(str(pictures[0]), pictures[0].name)
         return (video.count or 0) if video.exact else 0
     return len(pictures)
+
+
+def frame_size(picture: Path) -> tuple[int, int]:
+    """(width, height), px, of a picture or of a video's frames. Raises InputError where it cannot be read."""
+    return VideoSource(str(picture), picture.name).size if is_video(picture) else size_of(picture)
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is one by its name."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def _files(folder: Path, suffixes: frozenset[str]) -> tuple[Path, ...]:
