@@ -9,6 +9,7 @@ import typer
 from torchvision_dddas import __version__
 from torchvision_dddas.cli.calibrate import calibrate
 from torchvision_dddas.cli.colours import colours
+from torchvision_dddas.cli.compare import compare
 from torchvision_dddas.cli.confirm import confirm
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
@@ -29,7 +30,10 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, detect, people, track, confirm, calibrate, colours, evaluate, simulate, export, demo, settings):
+for command in (
+    *(run, detect, people, track, confirm, calibrate, colours),
+    *(evaluate, compare, simulate, export, demo, settings),
+):
     app.command()(command)
 app.add_typer(locate, name="locate")
 

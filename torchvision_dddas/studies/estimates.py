@@ -56,8 +56,7 @@ def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
         strata = tuple(Stratum(len(t), block) for t, block in zip(tables, blocks[group], strict=True) if len(t))
         if strata:
             found[group] = Estimate(_of_sums(np.concatenate(tables), measure), strata, tuple(tables))
-    if any("boxes" in scored.ranked for scored in cases):
-        having = [scored for scored in cases if "boxes" in scored.per_frame]
+    if having := [scored for scored in cases if "boxes" in scored.ranked]:
         true: list[np.ndarray] = []
         unit: list[np.ndarray] = []
         for scored in having:
@@ -70,8 +69,8 @@ def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
         rows = np.concatenate([scored.ranked["boxes"] for scored in having])
         ranked = ranking(rows[:, 0], rows[:, 1], np.concatenate(unit), np.concatenate(true))
         found[RANKED] = Estimate(ranked.measures, found["boxes"].strata, _content(ranked))
-    if any("error_m" in scored.samples for scored in cases):
-        found |= _metres_over_frames([scored for scored in cases if "error_m" in scored.samples])
+    if having := [scored for scored in cases if "error_m" in scored.samples]:
+        found[METRES] = _metres_over_frames(having)
     return found
 
 
@@ -181,25 +180,20 @@ def _influence(table: np.ndarray, measure: Measure) -> np.ndarray:
     return series
 
 
-def _metres_over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
+def _metres_over_frames(cases: Sequence[Scored]) -> Estimate:
     units: list[np.ndarray] = []
     strata: list[Stratum] = []
     for scored in cases:
-        frames, row = np.unique(scored.samples["frame"], return_inverse=True)
-        if not len(frames):
-            continue
-        series = []
+        row, count, series = np.searchsorted(scored.frames, scored.samples["frame"]), len(scored.frames), []
         for name in ("error_m", "inside", "relative_error_m", "relative_inside"):
             value = scored.samples[name]
             known = np.isfinite(value)
             apart = np.where(known, value - (value[known].mean() if known.any() else 0.0), 0.0)
-            series.append(np.bincount(row, apart, len(frames)))
+            series.append(np.bincount(row, apart, count))
         units.append(row + sum(stratum.units for stratum in strata))
-        strata.append(Stratum(len(frames), bootstrap.block_length(np.stack(series, axis=1))))
-    if not strata:
-        return {}
-    samples, unit = samples_of([s for s in cases if len(s.samples["frame"])]), np.concatenate(units)
-    return {METRES: Estimate(_of_samples(samples, unit), tuple(strata), _metres_content(samples, unit))}
+        strata.append(Stratum(count, bootstrap.block_length(np.stack(series, axis=1))))
+    samples, unit = samples_of(cases), np.concatenate(units)
+    return Estimate(_of_samples(samples, unit), tuple(strata), _metres_content(samples, unit))
 
 
 def _metres_content(samples: dict[str, np.ndarray], unit: np.ndarray) -> tuple[np.ndarray, ...]:

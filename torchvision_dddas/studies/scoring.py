@@ -56,7 +56,8 @@ def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scor
     )
     notes: list[str] = []
     scored = score_clip(clip.truth, result, How(interval if followed else 1), notes)
-    frames, per_frame = _beside(scored.each)
+    whole = 1 + interval * np.arange(scored.frames) if followed else np.zeros(0, np.int64)
+    frames, per_frame = _beside(scored.each, whole)
     ranked = {}
     if "boxes" in scored.counts:
         rows = np.isin(found.frame, scored.each["boxes"]["frame"])
@@ -126,16 +127,17 @@ def _ranked(truth: Truth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarr
     return np.stack([score, right, frame], axis=1)
 
 
-def _beside(each: dict[str, Each]) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
-    """All groups' counts over all frames that any group has, NaN in the others."""
-    frames = np.unique(np.concatenate([columns["frame"] for columns in each.values()])) if each else np.zeros(0, int)
+def _beside(each: dict[str, Each], whole: np.ndarray) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
+    """All groups' counts over all frames that any group has, NaN in the others.
+
+    whole: frames that tracks are scored on; those without any box count nothing, which is a result too.
+    """
+    frames = np.unique(np.concatenate([whole, *(columns["frame"] for columns in each.values())]))
     per_frame: dict[str, dict[str, np.ndarray]] = {}
     for group, columns in each.items():
         rows = np.searchsorted(frames, columns["frame"])
-        per_frame[group] = {}
-        for name, values in columns.items():
-            if name != "frame":
-                spread = np.full(len(frames), np.nan)
-                spread[rows] = values
-                per_frame[group][name] = spread
+        spread = np.where(np.isin(frames, whole), 0.0, np.nan)
+        per_frame[group] = {name: spread.copy() for name in columns if name != "frame"}
+        for name, values in per_frame[group].items():
+            values[rows] = columns[name]
     return frames.astype(np.int64), per_frame

@@ -1,0 +1,104 @@
+"""`dddas compare`: two studies of the same clips, and whether what changed is beyond noise."""
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+MOST_CLIPS = 20
+"""Rows of single clips that are shown; --json has all."""
+
+
+@explained
+def compare(
+    first: Annotated[
+        Path, typer.Argument(metavar="A", help="The folder of a study, as dddas evaluate --dataset wrote it.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="B", help="The folder of another study of the same clips.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
+    from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.studies.comparing import compare as beside
+    from torchvision_dddas.studies.scored import read_scores
+
+    found = beside(read_scores(first), read_scores(second))
+    if as_json:
+        typer.echo(json.dumps(finite(found), indent=2))
+    else:
+        show(found, str(first), str(second))
+
+
+def show(found: Mapping[str, Any], first: str, second: str) -> None:
+    """Print a table of each task, the clips that changed, and the notes."""
+    from rich.console import Console
+
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    console.print(f"A: {first}\nB: {second}", markup=False, highlight=False)
+    for task, mine in found["tasks"].items():
+        names = [(group, name) for group in mine["pooled"] for name in mine["pooled"][group]]
+        rows = [(f"{group} {name}", mine["pooled"][group][name]) for group, name in names]
+        count = len(mine["same"]) + len(mine["clips"])
+        console.print(_table(f"{task}, {count} clip{'s' * (count != 1)} together", rows))
+        clips = [
+            (f"{clip}: {group} {name}", entry)
+            for clip, groups in mine["clips"].items()
+            for group, by_name in groups.items()
+            for name, entry in by_name.items()
+            if entry["change"]
+        ]
+        clips.sort(key=lambda row: _p(row[1]))
+        if clips:
+            console.print(_table(f"{task}, single clips", clips[:MOST_CLIPS]))
+        if len(clips) > MOST_CLIPS:
+            console.print(f"{len(clips) - MOST_CLIPS} more rows: --json", highlight=False)
+        if mine["same"]:
+            console.print(f"the same in both to the last digit: {', '.join(mine['same'])}", markup=False)
+    console.print(
+        "better, worse: beyond noise, p below 0.05 after Holm's correction; "
+        '"on these clips": too few clips, or too unlike, to say so of others',
+        highlight=False,
+    )
+    for note in found["notes"]:
+        console.print(f"note: {note}", markup=False, highlight=False)
+
+
+def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("measure", overflow="fold")
+    for column in ("A", "B", "change", "95 % interval", "p"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("says")
+    for name, entry in rows:
+        way = entry.get("over_clips") or entry.get("over_frames") or {}
+        span = way.get("interval")
+        table.add_row(
+            name,
+            _figure(entry["first"]),
+            _figure(entry["second"]),
+            _figure(entry["change"], "+"),
+            "–" if span is None else f"{span[0]:+.3f} to {span[1]:+.3f}",
+            f"{way['p_holm']:.3f}" if way else "–",
+            entry["says"],
+        )
+    return table
+
+
+def _p(entry: Mapping[str, Any]) -> float:
+    way = entry.get("over_frames")
+    return float(way["p_holm"]) if way else 2.0
+
+
+def _figure(value: float, sign: str = "") -> str:
+    return "–" if math.isnan(value) else f"{value:{sign}.3f}"
