@@ -10,7 +10,7 @@ import numpy as np
 from torchvision_dddas.sinks.map_frame import step_of
 
 WIDE, HIGH = 420, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 48, 14, 28, 40
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 18, 28, 40
 _LETTER = 6.4
 """Pixels of a letter, about."""
 MOST_POINTS = 400
@@ -29,7 +29,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Line:
-    """A curve of (N,) places, broken where they are NaN. colour: 1 to 6, see page.STYLE. faint: one of many."""
+    """A curve of (N,) places, broken where they are NaN. colour: 1 to 6, see page.STYLE. faint: one of many.
+
+    steps: it stays as high as it is until the next place.
+    """
 
     name: str
     x: np.ndarray
@@ -37,6 +40,7 @@ class Line:
     colour: int = 1
     faint: bool = False
     dashed: bool = False
+    steps: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def chart(
     parts = [f'<text x="6" y="16" class="title">{escape(title)}</text>', *legend]
     parts += _ticks_up(up, y, y0, wide, high) + _ticks_across(across, x, y0, wide, high)
     for line in lines:
-        parts.append(_path(line, *place(*_thinned(line.x, line.y))))
+        parts.append(_path(line, *place(*_corners(*_thinned(line.x, line.y), line.steps))))
     for one in dots:
         parts += _signs(one, *place(one.x, one.y))
     total = y0 + high + _BOTTOM
@@ -126,6 +130,10 @@ def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x[kept], y[kept]
 
 
+def _corners(x: np.ndarray, y: np.ndarray, steps: bool) -> tuple[np.ndarray, np.ndarray]:
+    return (np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]) if steps and len(x) else (x, y)
+
+
 def _path(line: Line, x: np.ndarray, y: np.ndarray) -> str:
     known = np.isfinite(x) & np.isfinite(y)
     edges = np.flatnonzero(np.diff(np.r_[0, known.astype(np.int8), 0])).reshape(-1, 2)
@@ -177,7 +185,9 @@ def _legend(names: Sequence[tuple[str, Line | Dots]]) -> tuple[list[str], int]:
 
 
 def _ticks_up(axis: Axis, span: tuple[float, float], y0: float, wide: float, high: float) -> list[str]:
-    parts = []
+    middle = f"{y0 + high / 2:g}"
+    turned = f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">'
+    parts = [f"{turned}{escape(axis.name)}</text>"]
     for value, text in _numbers(axis, span, max(2, int(high // 45))):
         y = y0 + high - float(_share(np.array(value), span, axis.log)) * high
         parts.append(f'<path d="M{_LEFT} {y:.1f}h{wide}" class="grid"/>')

@@ -15,7 +15,7 @@ STYLE = """
 html{-webkit-text-size-adjust:100%}
 body{font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Liberation Sans",sans-serif;color:var(--ink);
  background:var(--paper);max-width:1200px;margin:0 auto;padding:24px 24px 64px;overflow-wrap:anywhere}
-h1{font-size:26px;line-height:1.2;margin:0 0 4px}
+h1{font-size:26px;line-height:1.2;margin:0 0 4px}h1 span{font-weight:400;color:var(--soft)}
 h2{font-size:21px;margin:44px 0 4px;padding-top:14px;border-top:1px solid var(--line)}
 h3{font-size:16px;margin:26px 0 8px}
 p{margin:4px 0 12px}a{color:var(--link)}.soft,.note{color:var(--soft)}.bad{color:var(--bad)}
@@ -47,7 +47,8 @@ thead [aria-sort=descending] button::after{content:"\\2193";opacity:1}
 thead button:focus-visible{outline:3px solid var(--link);outline-offset:-3px}
 input[type=search]{font:inherit;color:inherit;background:var(--paper);border:1px solid var(--line);border-radius:6px;
  padding:4px 10px;margin:0 0 8px;width:260px;max-width:100%}
-.plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,340px),1fr));gap:14px;align-items:start}
+.plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,340px),1fr));gap:14px;align-items:start;
+ margin:0 0 18px}
 .plots figure{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:10px}
 figure{margin:0}figcaption{font-size:13px;color:var(--soft);margin-top:4px}figcaption b{color:var(--ink)}
 img,svg{width:100%;height:auto;display:block}
@@ -57,7 +58,8 @@ svg .grid{stroke:var(--line);fill:none}svg .axis{stroke:var(--soft);fill:none}
 svg .line{fill:none;stroke-width:2;stroke-linejoin:round}svg .faint{fill:none;stroke-width:1.2;opacity:.45}
 svg .band{stroke:none;opacity:.2}
 .pictures{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,540px),1fr));gap:18px}
-.pair{display:grid;grid-template-columns:1fr 1fr;gap:4px}.pair img{border-radius:4px;background:#777}
+.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(220px,1fr));gap:4px}
+ .pair img{border-radius:4px;background:#777}
 .pair span{font-size:12px;color:var(--soft)}
 .key{display:flex;flex-wrap:wrap;gap:4px 18px;padding:0;margin:0 0 12px;list-style:none;font-size:14px}
 .key svg{display:inline-block;width:26px;height:16px;vertical-align:-3px;margin-right:6px}
@@ -66,7 +68,7 @@ pre{background:var(--card);border:1px solid var(--line);border-radius:8px;paddin
 ul{padding-left:20px;margin:4px 0 12px}
 @media (max-width:600px){body{padding:16px 14px 48px}h1{font-size:22px}th,td{padding:5px 8px}
  thead button,thead th>span{padding:5px 8px}
- .wide tr>:first-child{max-width:42vw;white-space:normal;overflow-wrap:anywhere}
+ .wide tr>:first-child{min-width:8.5em;max-width:42vw;white-space:normal;overflow-wrap:anywhere}
  .card .big{font-size:28px}}
 @media print{body{max-width:none}.wide{overflow:visible}}
 """ + "".join(

@@ -21,8 +21,7 @@ def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
     else:
         group, name = chosen
         known = measure(name)
-        only = next(iter(told.clips.values()))
-        whole = (told.pooled if len(told.clips) > 1 else only).get(group, {}).get(name)
+        whole = told.pooled.get(group, {}).get(name)
         if whole is not None:
             meaning = f' title="{escape(known.meaning)}"' if known.meaning else ""
             parts.append(
@@ -31,7 +30,8 @@ def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
             )
             if math.isfinite(whole.low) and math.isfinite(whole.high):
                 ends = f"{number(whole.low, known.digits)} to {number(whole.high, known.digits)}"
-                parts.append(f"<p>95 % interval: {ends}</p>")
+                over = "clips" if told.over.get(group) == "clips" else "blocks of frames"
+                parts.append(f"<p>95 % interval over {over}: {ends}</p>")
         parts.append(f"<p>{_over(told, group, name)}</p>")
     if cost := summed(costs, task):
         parts.append(f'<p class="soft">{escape(cost)}</p>')

@@ -1,10 +1,10 @@
 """Curves of a task: precision over recall, misses against false alarms, and how right it is as a clip goes on."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from torchvision_dddas.metrics.ranking import precision_recall, ranking
 from torchvision_dddas.sinks.charts import Axis, Dots, Line, chart
 from torchvision_dddas.sinks.study_report.tallies import main_group, tally
 from torchvision_dddas.studies.record import Case
@@ -13,55 +13,36 @@ from torchvision_dddas.studies.scored import Scored
 MOST_CLIPS = 6
 """Clips whose course is drawn."""
 _BINS = 80
-_LEAST = 1e-3
-
-
-class Ranked(NamedTuple):
-    """A clip's detections that count, best first: (M,) score and right; how many are true, and pictures looked at."""
-
-    name: str
-    score: np.ndarray
-    right: np.ndarray
-    true: int
-    images: int
+_LEAST, _MOST = 0.01, 10.0
+"""False positives an image from which and up to which misses are drawn."""
+_ALL = "all clips"
 
 
 def ranked_charts(cases: Sequence[Case]) -> list[str]:
     """Precision against recall, and the miss rate against false positives an image, of each group with scores."""
     charts: list[str] = []
     for group in dict.fromkeys(g for case in cases if case.scored for g in case.scored.ranked):
-        each = [one for case in cases if (one := _ranked(case, group)) is not None and one.true]
+        mine = [(case.clip.name, case.scored) for case in cases if case.scored and group in case.scored.ranked]
+        each = [(name, scored) for name, scored in mine if _true(scored, group)]
         if not each:
             continue
-        whole = Ranked(
-            "all clips" if len(each) > 1 else each[0].name,
-            np.concatenate([one.score for one in each]),
-            np.concatenate([one.right for one in each]),
-            sum(one.true for one in each),
-            sum(one.images for one in each),
-        )
-        pairs = [(one, True) for one in each if len(each) > 1] + [(whole, False)]
         exact, missing = [], []
-        for k, (one, faint) in enumerate(pairs):
-            precision, recall, false_per_image = rates(one)
-            name = ("each clip" if k == 0 else "") if faint else one.name
-            colour = 6 if faint else 1
-            exact.append(Line(name, recall, precision, colour, faint))
-            missing.append(Line(name, np.maximum(false_per_image, _LEAST), 1 - recall, colour, faint))
+        for k, (name, scored) in enumerate([*each, (_ALL, None)] if len(each) > 1 else each):
+            whole = scored is None or len(each) == 1
+            taken = [one for _, one in each] if scored is None else [scored]
+            said = name if whole else "each clip" if k == 0 else ""
+            colour = 1 if whole else 6
+            precision, recall, false = _rates(taken, group)
+            # Both curves go on to where nothing is found, and the second to where no more can be had.
+            start, end = precision[:1], recall[-1:]
+            exact.append(Line(said, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, not whole))
+            ways = np.r_[_LEAST, np.maximum(false, _LEAST), _MOST], 1 - np.r_[0.0, recall, end if len(end) else 0.0]
+            missing.append(Line(said, *ways, colour, not whole, steps=True))
         up, misses = Axis("precision", 0, 1), Axis("miss rate", 0, 1)
+        across = Axis("false positives an image", _LEAST, _MOST, log=True)
         charts.append(chart("Precision and recall", Axis("recall", 0, 1), up, exact))
-        charts.append(chart("Misses and false alarms", Axis("false positives an image", log=True), misses, missing))
+        charts.append(chart("Misses and false alarms", across, misses, missing))
     return charts
-
-
-def rates(one: Ranked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(K,) precision, recall and false positives an image as ever lower scores are taken; equal scores go together."""
-    order = np.argsort(-one.score, kind="stable")
-    score, right = one.score[order], one.right[order]
-    hits, false = np.cumsum(right), np.cumsum(1 - right)
-    last = np.flatnonzero(np.r_[np.diff(score) != 0, np.ones(min(len(score), 1), bool)])
-    hits, false = hits[last], false[last]
-    return hits / np.maximum(hits + false, 1), hits / max(one.true, 1), false / max(one.images, 1)
 
 
 def course_charts(cases: Sequence[Case]) -> list[str]:
@@ -76,15 +57,19 @@ def course_charts(cases: Sequence[Case]) -> list[str]:
     return charts
 
 
-def _ranked(case: Case, group: str) -> Ranked | None:
-    scored = case.scored
-    if scored is None or group not in scored.ranked:
-        return None
-    rows = scored.ranked[group]
-    rows = rows[np.isfinite(rows[:, 1])]
+def _true(scored: Scored, group: str) -> int:
     counts = scored.counts.get(group)
-    true = getattr(counts, "hit", 0) + getattr(counts, "missed", 0)
-    return Ranked(case.clip.name, rows[:, 0], rows[:, 1], true, len(scored.frames))
+    return getattr(counts, "hit", 0) + getattr(counts, "missed", 0)
+
+
+def _rates(clips: Sequence[Scored], group: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(K,) precision, recall and false positives an image of clips together, as ever lower scores are taken."""
+    rows = np.concatenate([scored.ranked[group] for scored in clips])
+    unit = np.repeat(np.arange(len(clips)), [len(scored.ranked[group]) for scored in clips])
+    true = np.array([_true(scored, group) for scored in clips], float)
+    curve = ranking(rows[:, 0], rows[:, 1], unit, true).curve()
+    precision, recall = precision_recall(curve, float(true.sum()))
+    return precision, recall, curve.false / sum(len(scored.frames) for scored in clips)
 
 
 def _course(name: str, scored: Scored) -> str | None:

@@ -7,6 +7,9 @@ from torchvision_dddas.sinks.page_tables import Cell, Column, figure, sorted_tab
 from torchvision_dddas.sinks.study_report.figures import Figure, Told
 from torchvision_dddas.sinks.study_report.words import GROUPS, SHOWN, measure
 
+UNDRAWN = ("location",)
+"""Groups whose plot says no more than their table."""
+
 
 def groups_of(told: Told) -> list[str]:
     """The groups that any clip has, in the page's order."""
@@ -44,7 +47,7 @@ def measure_table(told: Told, group: str, frames: dict[str, int]) -> str:
 def measure_plot(told: Told, group: str) -> tuple[str, int]:
     """The group's first measure clip by clip, the worst first, and how many clips are left out; empty for one clip."""
     names = shown(told, group)
-    if not names:
+    if not names or group in UNDRAWN:
         return "", 0
     name = names[0]
     known = measure(name)
@@ -59,7 +62,7 @@ def measure_plot(told: Told, group: str) -> tuple[str, int]:
     whole = told.pooled.get(group, {}).get(name, Figure(math.nan))
     title = f"{known.name}, {GROUPS.get(group, group)}"
     all_of_them = Interval("pooled", *whole) if len(rows) > 1 else None
-    span = (0.0, 1.0) if known.share else (0.0, 0.0)
+    span = (0.0, 1.0 if known.share else 0.0)
     return interval_plot(title, rows, all_of_them, span), max(len(rows) - MOST_ROWS, 0)
 
 

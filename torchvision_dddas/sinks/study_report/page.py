@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from torchvision_dddas.sinks.journal import finite
+from torchvision_dddas.sinks.journal import finite, versions
 from torchvision_dddas.sinks.page import SCRIPT, page, picture_url
 from torchvision_dddas.sinks.page_tables import Column, sorted_table, words
 from torchvision_dddas.sinks.study_report.cards import card
@@ -25,16 +25,17 @@ MOST_BYTES = 12_000_000
 
 
 def report(metrics: Mapping[str, Any], results: Results) -> str:
-    """The HTML. metrics: as `studies.summary.summary` has it; pictures are drawn from the clips' files."""
+    """The HTML. metrics: as `studies.summary.summary` has it; pictures are drawn of the clips' files."""
     by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
     told_of = {task: told(metrics, task) for task, cases in by_task.items() if cases}
     costs = costs_of(results.cases)
-    title = f"Study {results.spec.name}"
+    title = f"{results.spec.name}: study"
     scored = [case for case in results.cases if case.scored is not None]
     clips = len({str(case.clip.place) + case.clip.name for case in scored})
     failed = [case for case in results.cases if case.cause]
     state = f"{_many(clips, 'clip')}, {_many(len(told_of), 'task')}; in all {summed(costs) or 'no times kept'}"
-    parts = [f"<h1>{escape(title)}</h1>", f'<p class="soft">{escape(state)}</p>', '<div class="cards">']
+    heading = f"<h1>{escape(results.spec.name)} <span>study</span></h1>"
+    parts = [heading, f'<p class="soft">{escape(state)}</p>', '<div class="cards">']
     for task, mine in told_of.items():
         parts.append(card(task, mine, costs, sum(case.cause != "" for case in by_task[task])))
     parts.append("</div>")
@@ -58,7 +59,7 @@ def _task(task: str, mine: Told, cases: Sequence[Case], shown: list[Worst]) -> l
     plots += [_plot(chart) for chart in ranked_charts(cases)]
     parts += ['<div class="plots">', *plots, "</div>"] if plots else []
     for group in groups_of(mine):
-        parts += [f"<h3>{escape(GROUPS.get(group, group)).capitalize()}</h3>", measure_table(mine, group, frames)]
+        parts += [f"<h3>{escape(_capital(GROUPS.get(group, group)))}</h3>", measure_table(mine, group, frames)]
     chosen, others = worst_frames(cases)
     if chosen:
         shown += chosen
@@ -135,14 +136,16 @@ def _costs(costs: Sequence[Any]) -> list[str]:
 def _facts(results: Results) -> list[str]:
     spec = results.spec
     said = {
-        "data sets": [f"{source.kind}: {', '.join(source.clips)}" for source in spec.sources],
+        "datasets": [f"{source.kind}: {', '.join(source.clips)}" for source in spec.sources],
         "tasks": spec.tasks or ["all that each clip allows"],
         "configuration": spec.config or "defaults",
         "set": spec.overrides or "nothing",
-        "back end": spec.backend,
-        "interval": spec.interval,
-        **results.facts,
+        "interval": f"{spec.interval} frames, of tracking and association",
+        **{name.replace("backend", "back end"): fact for name, fact in results.facts.items() if name != "faults"},
+        "versions": versions(),
     }
+    said["datasets"] = [_of_set(one) for one in results.facts.get("datasets", ())] or said["datasets"]
+    said = {name: value for name, value in said.items() if value not in ("", [], (), None)}
     rows = [[words(name.replace("_", " ")), words(_in_words(value))] for name, value in said.items()]
     settings = json.dumps(finite(results.settings.model_dump(mode="json")), indent=2)
     return [
@@ -152,6 +155,12 @@ def _facts(results: Results) -> list[str]:
     ]
 
 
+def _of_set(told: Mapping[str, Any]) -> str:
+    """A data set in words: kind, folder, clips, terms of use."""
+    where = f"{told.get('kind')} in {told.get('folder')}, {_many(int(told.get('clips', 0)), 'clip')}"
+    return where + (f" ({told['terms']})" if told.get("terms") else "")
+
+
 def _plot(svg: str, note: str = "") -> str:
     return f"<figure>{svg}{f'<figcaption>{escape(note)}</figcaption>' if note else ''}</figure>"
 
@@ -159,6 +168,10 @@ def _plot(svg: str, note: str = "") -> str:
 def _rank(case: Case, chosen: Sequence[Worst]) -> int:
     """Clips with a worst frame first, in the order of these."""
     return next((k for k, one in enumerate(chosen) if one.case is case), len(chosen))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _many(count: int, what: str) -> str:

@@ -66,7 +66,8 @@ def mask_pair(picture: np.ndarray, labels: np.ndarray, found: np.ndarray) -> Pai
     left, right = base.copy(), _faint(base)
     for side in (left, right):
         _tint(side, unscored, size, UNSCORED, 0.75)
-    _outline(left, true, size, TRUE)
+    _tint(left, true, size, TRUE, 0.3)
+    _outline(left, true, size, TRUE, 2)
     for area, colour in ((true & found, HIT), (true & ~found, TRUE), (found & ~true, FALSE)):
         _tint(right, area, size, colour, 0.7)
         _outline(right, area, size, colour)
@@ -126,13 +127,13 @@ def _tint(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: 
     picture[:] = (picture * (1 - part) + np.array(colour) * part).astype(np.uint8)
 
 
-def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: Colour) -> None:
+def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: Colour, thick: int = 1) -> None:
     """Lines around what is there: even a target of few pixels is seen in a reduced picture."""
     height, width = area.shape
     contours, _ = cv2.findContours(area.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     share = np.array([size[0] / width, size[1] / height])
     drawn = [whole((contour + 0.5) * share) for contour in contours]
-    cv2.polylines(picture, drawn, True, colour, 1, cv2.LINE_AA)
+    cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
 
 
 def _box(picture: np.ndarray, box: np.ndarray, colour: Colour, name: str, thick: int = 1) -> None:
