@@ -24,7 +24,7 @@ from torchvision_dddas.datasets.fitting import fitted
 from torchvision_dddas.datasets.gathering import folders_in, gather
 from torchvision_dddas.datasets.kinds import Wanted
 from torchvision_dddas.datasets.options import checked
-from torchvision_dddas.datasets.own import clip_at
+from torchvision_dddas.datasets.own import clip_at, pictures_at
 from torchvision_dddas.datasets.record import Clip, Dataset
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import truth as truths
@@ -43,9 +43,9 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         place = places[name]
         if not (place / "truth").is_dir():
             raise InputError(f"{place} has no truth/; wanted what `dddas simulate --out` writes")
-        clip = clip_at(place, name, _rate(place / "run.json"))
-        if not clip.pictures:
+        if not pictures_at(place):
             raise InputError(f"{place} holds neither frames/ nor clip.mp4; simulate it with --save frames,masks")
+        clip = clip_at(place, name, _rate(place / "run.json"))
         return fitted(replace(clip, truth=_truth(place / "truth", clip.frames)))
 
     return gather("simulated", folder, "", filter(wanted, places), clip_of)

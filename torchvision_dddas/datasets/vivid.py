@@ -47,13 +47,13 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         frames = frames_by_number(pictures)
         if not frames:
             raise InputError(f"{pictures[0].parent}: the names of the pictures lack numbers, or repeat them")
-        truth = _truth(folder, name, frames)
+        truth = _truth(folder, name, frames, pictures)
         return fitted(Clip(name, place, pictures, said["rate_hz"] or RATE_HZ, len(pictures), truth))
 
     return gather("vivid", folder, TERMS, filter(wanted, names), clip_of)
 
 
-def _truth(folder: Path, name: str, frames: Mapping[int, int]) -> Truth:
+def _truth(folder: Path, name: str, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
     """The truth of a clip, wherever it lies. Raises InputError where there is none."""
     homes = (folder / name, folder, folder / "Groundtruth", folder / "groundtruth")
     for pattern, reader in (("*_truth.csv", vivid_truth.vehicles), ("*.txt", vivid_truth.boxes)):
@@ -64,5 +64,5 @@ def _truth(folder: Path, name: str, frames: Mapping[int, int]) -> Truth:
         inside = folders_in(home) if home.is_dir() else []
         masks = [home / d for d in inside if "mask" in d.lower() and (home == folder / name or d.startswith(name))]
         if masks:
-            return vivid_truth.masks(masks[0], frames)
+            return vivid_truth.masks(masks[0], frames, pictures)
     raise InputError(f"{folder} has no truth of it; wanted {name}_truth.csv, {name}*.txt or a folder {name}_mask")

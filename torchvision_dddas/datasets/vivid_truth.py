@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.datasets.numbering import labelled
+from torchvision_dddas.datasets.picture_size import size_of
 from torchvision_dddas.datasets.pictures import images_in
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.matching import TrackTable
@@ -30,6 +31,8 @@ def vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
     if not rows:
         raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height a line")
     values = np.array(rows)
+    if len(strange := values[values[:, 1] % 1 != 0]):
+        raise InputError(f"{path}: {strange[0, 1]:g} is no identity; wanted whole numbers")
     table = TrackTable(values[:, 0].astype(np.int64), values[:, 1].astype(np.int64), values[:, 2:])
     if (table.box_px[:, 2:] <= 0).any():
         raise InputError(f"{path}: a box has no width or height; wanted more than 0")
@@ -64,12 +67,22 @@ def boxes(path: Path, frames: Mapping[int, int]) -> Truth:
     return _one(path, found, len(frames))
 
 
-def masks(place: Path, frames: Mapping[int, int]) -> Truth:
+def masks(place: Path, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
     """One target, by the box about what is not 0 in its masks. Raises InputError."""
     files = labelled(images_in(place), frames, place.parent)
     if not files:
         raise InputError(f"{place} holds no masks; there belongs the truth of every tenth frame")
-    return _one(place, {frame: _about(read_mask(path)) for frame, path in files.items()}, len(frames))
+    size = size_of(pictures[0])
+    found = {}
+    for frame, path in files.items():
+        mask = read_mask(path)
+        if mask.shape != size[::-1]:
+            raise InputError(
+                f"{path} is {mask.shape[1]}×{mask.shape[0]} pixels, but {pictures[0].name} {size[0]}×{size[1]}; "
+                "wanted masks of the size of the pictures"
+            )
+        found[frame] = _about(mask)
+    return _one(place, found, len(frames))
 
 
 def _one(place: Path, found: Mapping[int, np.ndarray], length: int) -> Truth:
