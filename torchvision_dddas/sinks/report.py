@@ -1,6 +1,5 @@
 """report.html: what a run did, in one file that asks no other host for anything."""
 
-import base64
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 
 from torchvision_dddas.sinks.journal import finite
 from torchvision_dddas.sinks.keyframes import KeyFrame
+from torchvision_dddas.sinks.page import page, picture_url
 from torchvision_dddas.sinks.timeline import OverTime, Panel, plots
 
 MOST_ROWS = 200
@@ -77,7 +77,7 @@ def report(story: Story, timeline: OverTime) -> str:
         parts += ["<h2>Notes</h2>", "<ul>", *(f"<li>{escape(note)}</li>" for note in story.notes), "</ul>"]
     parts += _tables(story.first)
     if story.map_png is not None:
-        parts += ["<h2>Map</h2>", f'<img alt="map of the tracks" src="{_inline(story.map_png)}">']
+        parts += ["<h2>Map</h2>", f'<img alt="map of the tracks" src="{picture_url(story.map_png)}">']
     if story.pictures:
         parts += ["<h2>Key frames</h2>", '<div class="frames">', *(_figure(one) for one in story.pictures), "</div>"]
     if drawn := plots(timeline, story.panels):
@@ -88,12 +88,7 @@ def report(story: Story, timeline: OverTime) -> str:
     for name in (name for name in FOLDED if name in story.facts):
         text = json.dumps(finite(story.facts[name]), indent=2)
         parts.append(f"<details><summary>{name}</summary><pre>{escape(text)}</pre></details>")
-    body = "\n".join(parts)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(story.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
-    )
+    return page(story.title, parts, _STYLE)
 
 
 def _tables(tables: Sequence[Table]) -> list[str]:
@@ -106,14 +101,8 @@ def _tables(tables: Sequence[Table]) -> list[str]:
 def _figure(picture: KeyFrame) -> str:
     when = f"frame {picture.number}" + (f", {picture.time_s:.1f} s" if math.isfinite(picture.time_s) else "")
     words = f": {escape(picture.words)}" if picture.words else ""
-    shown = f'<img alt="{when}" src="{_inline(picture.jpeg)}">'
+    shown = f'<img alt="{when}" src="{picture_url(picture.jpeg)}">'
     return f"<figure>{shown}<figcaption><b>{when}</b>{words}</figcaption></figure>"
-
-
-def _inline(picture: bytes) -> str:
-    """A picture as a URL that holds it: JPEG by its first two bytes, else PNG."""
-    kind = "jpeg" if picture[:2] == b"\xff\xd8" else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def table(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -32,6 +32,8 @@ def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
                 ends = f"{number(whole.low, known.digits)} to {number(whole.high, known.digits)}"
                 over = "clips" if told.over.get(group) == "clips" else "blocks of frames"
                 parts.append(f"<p>95 % interval over {over}: {ends}</p>")
+            else:
+                parts.append("<p>no interval: too few clips or frames</p>")
         parts.append(f"<p>{_over(told, group, name)}</p>")
     if cost := summed(costs, task):
         parts.append(f'<p class="soft">{escape(cost)}</p>')

@@ -20,8 +20,10 @@ from torchvision_dddas.sinks.study_report.worst import Worst, drawn, worst_frame
 from torchvision_dddas.studies.record import TASKS, Case, Results
 
 MOST_LEFT_OUT = 200
-MOST_BYTES = 12_000_000
-"""Of pictures, as they stand on the page."""
+"""Lines; run.json has them all."""
+
+
+_NAVIGATION = '<nav><a href="#costs">costs</a><a href="#settings">what was run, settings, versions</a></nav>'
 
 
 def report(metrics: Mapping[str, Any], results: Results) -> str:
@@ -35,20 +37,19 @@ def report(metrics: Mapping[str, Any], results: Results) -> str:
     failed = [case for case in results.cases if case.cause]
     state = f"{_many(clips, 'clip')}, {_many(len(told_of), 'task')}; in all {summed(costs) or 'no times kept'}"
     heading = f"<h1>{escape(results.spec.name)} <span>study</span></h1>"
-    parts = [heading, f'<p class="soft">{escape(state)}</p>', '<div class="cards">']
+    parts = [heading, f'<p class="soft">{escape(state)}</p>', _NAVIGATION, '<div class="cards">']
     for task, mine in told_of.items():
         parts.append(card(task, mine, costs, sum(case.cause != "" for case in by_task[task])))
     parts.append("</div>")
     parts.append(_left_out(failed, results.left_out))
-    shown: list[Worst] = []
     for task, mine in told_of.items():
-        parts += _task(task, mine, by_task[task], shown)
+        parts += _task(task, mine, by_task[task])
     parts += _costs(costs)
     parts += _facts(results)
     return page(title, [part for part in parts if part], script=SCRIPT)
 
 
-def _task(task: str, mine: Told, cases: Sequence[Case], shown: list[Worst]) -> list[str]:
+def _task(task: str, mine: Told, cases: Sequence[Case]) -> list[str]:
     parts = [f'<h2 id="{task}">{TITLES[task]}</h2>', f'<p class="soft">{escape(TASKS[task])}</p>']  # type: ignore[index]
     frames = {case.clip.name: len(case.scored.frames) for case in cases if case.scored is not None}
     plots = []
@@ -62,7 +63,6 @@ def _task(task: str, mine: Told, cases: Sequence[Case], shown: list[Worst]) -> l
         parts += [f"<h3>{escape(_capital(GROUPS.get(group, group)))}</h3>", measure_table(mine, group, frames)]
     chosen, others = worst_frames(cases)
     if chosen:
-        shown += chosen
         parts += _pictures(chosen, others)
     ordered = sorted(cases, key=lambda case: _rank(case, chosen))
     if courses := course_charts(ordered):
@@ -96,7 +96,8 @@ def _pictures(chosen: Sequence[Worst], others: int) -> list[str]:
 
 def _figure(one: Worst) -> str:
     when = f"{one.case.clip.name}, frame {one.frame}"
-    words_of_it = f"<figcaption><b>{escape(when)}</b>: {escape(one.words)}</figcaption>"
+    bare = "" if one.case.clip.pictures else " (a clip without pictures)"
+    words_of_it = f"<figcaption><b>{escape(when)}</b>: {escape(one.words)}{bare}</figcaption>"
     if one.pair is None:
         return (
             f'<figure><p class="note">no picture: {escape(one.trouble or "nothing to draw")}</p>{words_of_it}</figure>'

@@ -89,7 +89,7 @@ def box_pair(picture: np.ndarray | None, size_px: tuple[int, int], boxes: Boxes)
     for k, box in enumerate(boxes.found_px * scale):
         hit, changed = boxes.of_found[k] >= 0, bool(boxes.marked[k])
         colour = HIT if hit else FALSE if boxes.judged[k] else UNSCORED
-        _box(right, box, colour, boxes.found_names[k], 3 if changed or colour == FALSE else 1)
+        _box(right, box, colour, boxes.found_names[k], 3 if changed or colour == FALSE else 2)
     return Pair(_jpeg(left), _jpeg(right))
 
 
@@ -136,9 +136,9 @@ def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colou
     cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
 
 
-def _box(picture: np.ndarray, box: np.ndarray, colour: Colour, name: str, thick: int = 1) -> None:
+def _box(picture: np.ndarray, box: np.ndarray, colour: Colour, name: str, thick: int = 2) -> None:
     x, y, right, bottom = whole(np.array([*box[:2], *(box[:2] + box[2:])])).tolist()
-    cv2.rectangle(picture, (x, y), (right, bottom), (0, 0, 0), thick + 2)
+    cv2.rectangle(picture, (x - 1, y - 1), (right + 1, bottom + 1), (0, 0, 0), thick)
     cv2.rectangle(picture, (x, y), (right, bottom), colour, thick)
     if name:
         label(picture, box, name, colour)
@@ -148,14 +148,15 @@ def _dashed(picture: np.ndarray, box: np.ndarray, colour: Colour) -> None:
     low, high = box[:2], box[:2] + box[2:]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]], low])
     for start, end in pairwise(corners):
-        count = max(int(np.abs(end - start).sum() / 4), 1)
-        steps = min(count, 400)
-        for shade, thick, first in (((0, 0, 0), 3, 0), (colour, 1, 0)):
-            for k in range(first, steps, 2):
+        steps = min(max(int(np.abs(end - start).sum() / 6) | 1, 1), 401)
+        for shade, thick in (((0, 0, 0), 4), (colour, 2)):
+            for k in range(0, steps, 2):
                 a, b = (whole(start + (end - start) * t / steps) for t in (k, k + 1))
                 cv2.line(picture, tuple(a.tolist()), tuple(b.tolist()), shade, thick)
 
 
 def _jpeg(picture: np.ndarray) -> bytes:
-    how = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    # Thin lines need their colour at each pixel.
+    finest = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    how = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, finest]
     return cv2.imencode(".jpg", picture, how)[1].tobytes()

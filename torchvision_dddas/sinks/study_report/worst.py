@@ -91,9 +91,9 @@ def _of_case(case: Case) -> tuple[list[Worst], int]:
 def _said(counts: Tally, k: int) -> str:
     right, false, missed, switched = (float(x[k]) for x in counts[:4])
     named = ((right, "right"), (false, "false"), (missed, "missed"))
-    found = ", ".join(f"{number(int(n))} {counts.unit} {what}" for n, what in named)
+    found = f"{counts.unit}: " + ", ".join(f"{number(int(n))} {what}" for n, what in named)
     whole = 2 * right + false + missed
-    score = f"{counts.measure} {number(2 * right / whole, 2)}: " if whole and counts.measure != "hit" else ""
+    score = f"{counts.measure} {number(2 * right / whole, 2)}; " if whole and counts.measure != "hit" else ""
     return f"{score}{found}" + (f"; {number(int(switched))} changed identity" if switched else "")
 
 
