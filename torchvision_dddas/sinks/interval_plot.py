@@ -34,6 +34,7 @@ def interval_plot(
     shown = [row for row in rows if math.isfinite(row.value)][:MOST_ROWS]
     ends = [end for row in shown for end in (row.value, row.low, row.high) if math.isfinite(end)]
     low, high = min([span[0], *ends]), max([span[1], *ends])
+    high = high if high > low else low + 1.0  # all of them 0, as false alarms may be
     wide, tall = WIDE - _NAMES - _RIGHT, _ROW * len(shown)
 
     def across(value: float) -> float:

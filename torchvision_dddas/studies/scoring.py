@@ -1,7 +1,7 @@
 """How right what was found in a clip is: the same counts as `dddas evaluate`, frame by frame, and what it has not."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -39,6 +39,10 @@ def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scor
     if clip.truth is None:
         raise InputError(f"{clip.name} has no truth; nothing can be scored")
     followed = task in ("tracking", "association")
+    truth = clip.truth
+    if followed and truth.kind == "masks":
+        # A simulated clip has both: masks tell pixels, boxes tell identities.
+        truth = replace(truth, kind="boxes")
     box_px = as_written(found.box_px)
     counts = uncounted.counted(clip.truth, found.frame, box_px) & ~_unlabelled(clip.truth, found.frame, box_px)
     rows = counts & (found.identity != -1) if followed else counts
@@ -55,7 +59,7 @@ def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scor
         clip.name,
     )
     notes: list[str] = []
-    scored = score_clip(clip.truth, result, How(interval if followed else 1), notes)
+    scored = score_clip(truth, result, How(interval if followed else 1), notes)
     whole = 1 + interval * np.arange(scored.frames) if followed else np.zeros(0, np.int64)
     frames, per_frame = _beside(scored.each, whole)
     ranked = {}

@@ -53,7 +53,7 @@ def allowed(clip: Clip) -> tuple[Task, ...]:
         return tuple(tasks)
     if truth.tracks is not None and ((pictures and moves) or clip.given is not None):
         tasks.append("tracking")
-    if truth.tracks is not None and truth.kind == "boxes":
+    if truth.tracks is not None and truth.kind != "one target":
         tasks.append("association")
     if pictures and "people" in clip.shows and truth.kind == "boxes":
         tasks.append("people")
