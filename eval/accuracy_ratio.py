@@ -18,10 +18,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report
+from footage import film_of, sequences, truth_of
 
 from torchvision_dddas.following import Follower
 from torchvision_dddas.metrics import clear, identity, windows
-from torchvision_dddas.metrics import truth as truths
 from torchvision_dddas.metrics.matching import TrackTable, pair
 from torchvision_dddas.metrics.windows import Windows
 from torchvision_dddas.settings import Settings, load
@@ -51,8 +51,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="trackers whose name begins with this")
     parser.add_argument("--write", type=Path, help="a text file with the accuracy_ratio marks, such as README.md")
     options = parser.parse_args()
-    places = sorted(file.parents[1] for file in options.data.glob("*/gt/gt.txt"))
-    filmed = [(place, clip) for place in places for clip in sorted(place.glob("*.mp4"))[:1]]
+    filmed = [(place, film) for place in sequences(options.data) if (film := film_of(place))]
     if not filmed:
         sys.exit(f"{options.data} holds no sequences with gt/gt.txt and a video; nothing was measured")
     lines = [
@@ -72,7 +71,7 @@ def main() -> None:
 
 def measured(place: Path, clip: Path | None, interval: int, settings: Settings) -> str:
     """The cells of a row."""
-    truth = truths.load(place / "gt/gt.txt").tracks
+    truth = truth_of(place).tracks
     assert truth is not None
     links, switches, idf1 = [Windows(), Windows()], [], []
     tracks, looked = followed(truth, clip, interval, settings)

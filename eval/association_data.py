@@ -1,18 +1,17 @@
 """True boxes with their histograms, windows of frames, and the affinities of all windows as one padded batch.
 
-A sequence is a folder with gt/gt.txt (MOTChallenge text; rows whose seventh column is 0 are left out) and a video, or a
-folder `img1*` of pictures named by their frame, not necessarily all of them.
+A sequence is one of MOTChallenge (see `datasets.motchallenge`), with pictures of all frames, or single ones in folders
+`img1*`, named by their frame.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
+from footage import frames_of, truth_of
 
-from torchvision_dddas.metrics.mot_text import read_rows
+from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.ops import affinity
 from torchvision_dddas.targets import jaccard
 from torchvision_dddas.targets.dispersion import dispersion
@@ -38,52 +37,27 @@ class Truth:
         return np.flatnonzero(self.frame == frame)
 
 
-def sequences(folder: Path) -> list[Path]:
-    """The folders with truth, by name."""
-    return sorted(path.parent.parent for path in folder.glob("*/gt/gt.txt"))
-
-
 def read(place: Path, pictures: str, histograms: str = "channel", ignored: bool = False) -> Truth:
     """Read a sequence. pictures: video or images. histograms: count, or channel, which adds up to 1 in each.
 
     ignored: with the rows that are marked to be left out.
     """
-    found = read_rows(place / "gt" / "gt.txt", "truth")
-    real = (found.mark != 0) | ignored
-    frame, box_px = found.table.frame[real], found.table.box_px[real]
-    histogram, seen = np.zeros((len(frame), 768)), set()
-    for number, image in _pictures(place, pictures):
-        rows = np.flatnonzero(frame == number)
+    truth = truth_of(place)
+    table = truth.tracks
+    assert table is not None
+    if ignored and truth.ignored is not None:
+        parts = zip(table, truth.ignored, strict=True)
+        table = TrackTable(*(np.concatenate(pair) for pair in parts))
+        table = table.at(np.lexsort([table.identity, table.frame]))
+    histogram, seen = np.zeros((len(table.frame), 768)), set()
+    for number, image in frames_of(place, pictures):
+        rows = np.flatnonzero(table.frame == number)
         # MOTChallenge counts pixels from 1.
-        histogram[rows] = rgb_histograms(image, box_px[rows] - (1, 1, 0, 0))
+        histogram[rows] = rgb_histograms(image, table.box_px[rows] - (1, 1, 0, 0))
         seen.add(number)
     if histograms == "channel":
         histogram = jaccard.per_channel(histogram)
-    return Truth(place.name, frame, found.table.identity[real], box_px, histogram, frozenset(seen))
-
-
-def has_pictures(place: Path, pictures: str) -> bool:
-    """Whether a sequence has them."""
-    return bool(_video(place) if pictures == "video" else _images(place))
-
-
-def _pictures(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
-    if pictures == "video":
-        video, number = cv2.VideoCapture(str(_video(place)[0])), 0
-        while (read_one := video.read())[0]:
-            number += 1
-            yield number, read_one[1]
-    else:
-        for path in _images(place):
-            yield int(path.stem), cv2.imread(str(path))
-
-
-def _video(place: Path) -> list[Path]:
-    return sorted(path for path in place.iterdir() if path.suffix in (".mp4", ".avi", ".webm"))
-
-
-def _images(place: Path) -> list[Path]:
-    return sorted(path for path in place.glob("img1*/*") if path.suffix in (".jpg", ".png"))
+    return Truth(place.name, table.frame, table.identity, table.box_px, histogram, frozenset(seen))
 
 
 @dataclass(frozen=True)

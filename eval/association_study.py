@@ -29,6 +29,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import association_data as data
 import association_plots as plots
+import footage
 
 from torchvision_dddas.metrics.accuracy_ratio import accuracy_ratio
 from torchvision_dddas.settings import PaperKnobs
@@ -80,8 +81,8 @@ def main() -> None:
     options = parser.parse_args()
     if unknown := set(options.study.split(",")) - set(STUDIES):
         sys.exit(f"no such study: {', '.join(sorted(unknown))}; give one or more of {', '.join(STUDIES)}")
-    places = [place for place in data.sequences(options.folder) if options.only in place.name]
-    places = [place for place in places if data.has_pictures(place, "video")]
+    places = [place for place in footage.sequences(options.folder) if options.only in place.name]
+    places = [place for place in places if footage.has_pictures(place, "video")]
     if not places:
         sys.exit(f"{options.folder} holds no sequences with gt/gt.txt and a video; nothing was measured")
     found: Figures = {}
@@ -163,7 +164,7 @@ def by_reference(place: Path, interval: int, _: int) -> Figures:
     row("video", video, np.arange(len(video.frames)))
     ignored = _windows(place, 2, interval, ignored=True)
     row("video, ignored boxes too", ignored, np.arange(len(ignored.frames)))
-    if data.has_pictures(place, "images"):
+    if footage.has_pictures(place, "images"):
         single = _windows(place, 2, interval, "images")
         if len(single.frames):
             row("single pictures", single, np.arange(len(single.frames)))

@@ -20,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report
+from footage import film_of, sequences, truth_of
 from simulated_camera import CAMERAS, Filmed, flight, seen, translation
 
 from torchvision_dddas.following import Follower, follow_clip, follow_scenes
@@ -71,17 +72,16 @@ def of_sequences(folder: Path) -> list[str]:
         "| sequence | camera, at most in a frame | all | translation | nothing | what it measures itself |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
     ]
-    for place in sorted(path.parent.parent for path in folder.rglob("gt/gt.txt")):
-        videos = [path for path in sorted(place.iterdir()) if path.suffix in (".mp4", ".avi", ".webm")]
-        truth = truths.load(place).tracks
-        if truth is None or not videos:
+    for place in sequences(folder):
+        truth, video = truth_of(place).tracks, film_of(place)
+        if truth is None or video is None:
             continue
-        size = open_source(str(videos[0])).size
+        size = open_source(str(video)).size
         for name, camera in CAMERAS.items():
             maps = flight(int(truth.frame.max()), size, camera)
             table = _detections(seen(truth, maps))
             runs: list[Iterable[Followed]] = [_told(table, maps, told, size) for told in TOLD.values()]
-            runs.append(_measured(table, Filmed(videos[0], maps)))
+            runs.append(_measured(table, Filmed(video, maps)))
             cells = [_switches_and_idf1(seen(truth, maps).every(INTERVAL), _table(run)) for run in runs]
             rows.append(f"| {place.name} | {name} | {' | '.join(cells)} |")
             print(rows[-1], file=sys.stderr, flush=True)

@@ -25,7 +25,7 @@ import numpy as np
 import report
 from geo_error import INSIDE, flight_of
 from geo_scene import ALTITUDE_SIGMA, FOCAL_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, TILT_SIGMA, looking, turned
-from ranging_error import SIZES, People, detected, fitted, read_truth, tsai
+from ranging_error import SIZES, People, detected, fitted, identities, read_truth, tsai
 
 from torchvision_dddas.settings import GroundKnobs, Settings, with_knobs
 from torchvision_dddas.targets.plane import ground_points
@@ -206,9 +206,8 @@ def main() -> None:
         if not (folder / "gt" / "gt.txt").is_file():
             print(f"{folder} has no gt/gt.txt: skipped", file=sys.stderr)
             continue
-        truth = read_truth(folder / "gt" / "gt.txt", size)
-        rows = np.loadtxt(folder / "gt" / "gt.txt", delimiter=",")
-        who = rows[rows[:, 6] == 1, 1].astype(int)
+        truth = read_truth(folder, size)
+        who = identities(folder)
         camera = tsai(folder / "View_001.xml") if name.startswith("PETS") else fitted(truth, size)
         kinds = {f"{name}, true boxes": crowd_of(truth, truth, who, PIXEL_SIGMA[name])}
         if name.startswith("PETS") and options.detections is not None:

@@ -1,18 +1,16 @@
 """Recall against false positives, for people_miss_rate.py: clips with truth, matching, curves, their measures, plots.
 
 A clip is a folder with gt/gt.txt (MOTChallenge text, pixels from 1; rows whose seventh column is 0 do not count) and
-pictures: a folder img1* of files named by their frame, or else a video. People who are mostly hidden are in the truth
+pictures: folders img1* of files named by their frame, or else a video. People who are mostly hidden are in the truth
 and stay there; so do people whom the truth leaves out, whose boxes are false positives.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
+from footage import frames_of, has_pictures, truth_of
 
-from torchvision_dddas.metrics import truth as truths
 from torchvision_dddas.metrics.detection import iou
 
 CLIPS = ("PETS09-S2L1", "TUD-Stadtmitte")
@@ -42,23 +40,11 @@ class Clip:
 
 def read(place: Path, every: int) -> Clip:
     """A clip's frames, every so many of those that there are."""
-    tracks = truths.load(place / "gt/gt.txt").tracks
+    tracks = truth_of(place).tracks
     assert tracks is not None
-    frames = {number: image for i, (number, image) in enumerate(_pictures(place)) if i % every == 0}
+    pictures = "images" if has_pictures(place, "images") else "video"
+    frames = {number: image for i, (number, image) in enumerate(frames_of(place, pictures)) if i % every == 0}
     return Clip(place.name, frames, {n: tracks.box_px[tracks.frame == n] - (1, 1, 0, 0) for n in frames})
-
-
-def _pictures(place: Path) -> Iterator[tuple[int, np.ndarray]]:
-    files = sorted(path for folder in place.glob("img1*") for path in folder.glob("*.jpg"))
-    for path in files:
-        image = cv2.imread(str(path))
-        assert image is not None
-        yield int(path.stem), image
-    if not files:
-        video, number = cv2.VideoCapture(str(sorted(place.glob("*.mp4"))[0])), 0
-        while (one := video.read())[0]:
-            number += 1
-            yield number, one[1]
 
 
 def matched(found: Found, truth: np.ndarray) -> np.ndarray:

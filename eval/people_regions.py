@@ -17,10 +17,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report
+from footage import film_of, truth_of
 from people_curves import CLIPS, matched
 
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.metrics import truth as truths
 from torchvision_dddas.recognizing import recognize, recognizer_of
 from torchvision_dddas.run import scenes
 from torchvision_dddas.settings import Settings, load, with_knobs
@@ -67,9 +67,8 @@ def main() -> None:
 
 def of_clip(place: Path, settings: Settings, engine: Recognizer, count: int) -> list[str]:
     """The rows of a clip."""
-    tracks = truths.load(place / "gt/gt.txt").tracks
+    tracks, video = truth_of(place).tracks, str(film_of(place))
     assert tracks is not None
-    video = str(sorted(place.glob("*.mp4"))[0])
     rate_hz = open_source(video).rate_hz
     moving = movers(islice(iter(open_source(video)), count), settings, rate_hz)
     clips = tee(islice(iter(open_source(video)), count), len(MODES))

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import report
+from footage import truth_of
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from torchvision_dddas.metrics.detection import iou
@@ -49,12 +50,20 @@ class People:
     east_north_m: np.ndarray
 
 
-def read_truth(path: Path, size: tuple[int, int]) -> People:
-    """The true boxes, whose pixels count from 1, and where their people stand."""
-    rows = np.loadtxt(path, delimiter=",")
-    rows = rows[rows[:, 6] == 1]
-    box = rows[:, 2:6] - (1, 1, 0, 0)
-    return People(rows[:, 0].astype(int), box, touches_border(box, size), rows[:, 7:9])
+def read_truth(place: Path, size: tuple[int, int]) -> People:
+    """The true boxes of a sequence, whose pixels count from 1, and where their people stand."""
+    truth = truth_of(place)
+    assert truth.tracks is not None and truth.positions is not None
+    assert (truth.positions.identity == truth.tracks.identity).all(), "people without a place"
+    box = truth.tracks.box_px - (1, 1, 0, 0)
+    return People(truth.tracks.frame, box, touches_border(box, size), truth.positions.east_north_m)
+
+
+def identities(place: Path) -> np.ndarray:
+    """(N,) of the people of `read_truth`."""
+    tracks = truth_of(place).tracks
+    assert tracks is not None
+    return tracks.identity
 
 
 def tsai(path: Path) -> Camera:
@@ -237,7 +246,7 @@ def main() -> None:
         if not (folder / "gt" / "gt.txt").is_file():
             print(f"{folder} has no gt/gt.txt: skipped", file=sys.stderr)
             continue
-        truth = read_truth(folder / "gt" / "gt.txt", size)
+        truth = read_truth(folder, size)
         camera = tsai(folder / "View_001.xml") if name.startswith("PETS") else fitted(truth, size)
         print(
             f"{name}: camera {camera.height_m:.2f} m high, {np.degrees(camera.pitch_rad):.2f}° down, focal "

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from footage import sequences, truth_of
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
@@ -130,10 +131,12 @@ def dense_window(targets: int, seed: int) -> np.ndarray:
 
 def real_windows(folder: Path, most: int) -> Iterator[tuple[Window, np.ndarray]]:
     """Both kinds of windows from the true boxes of a sequence, spread over it."""
-    rows = np.loadtxt(folder / "gt" / "gt.txt", delimiter=",", usecols=range(7))
-    rows = rows[rows[:, 6] != 0]
+    table = truth_of(folder).tracks
+    assert table is not None
     frames = {
-        int(frame): {int(r[1]): r[2:6] for r in rows[rows[:, 0] == frame]} for frame in np.unique(rows[:, 0]).tolist()
+        frame: dict(zip(here.identity.tolist(), here.box_px, strict=True))
+        for frame in np.unique(table.frame).tolist()
+        for here in [table.at(table.frame == frame)]
     }
     starts = [f for f in frames if all(f + look * INTERVAL in frames for look in (-1, 1, 2))]
     for start in starts[:: max(len(starts) // most, 1)][:most]:
@@ -260,7 +263,7 @@ def main() -> None:
     for targets in options.dense:
         tensors = [dense_window(targets, seed) for seed in range(options.windows)]
         rows += measure_dense("simulated dense", targets, tensors, options.gap)
-    for folder in sorted(path.parents[1] for path in options.data.glob("*/gt/gt.txt")) if options.data else []:
+    for folder in sequences(options.data) if options.data else []:
         both = list(real_windows(folder, options.windows))
         if both:
             targets = float(np.median([tensor.shape[0] - 1 for _, tensor in both]))

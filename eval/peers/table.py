@@ -25,7 +25,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import report
+from footage import sequences
 
+from torchvision_dddas.datasets import motchallenge
 from torchvision_dddas.metrics import clear, hota, identity, mot_text, tracking
 from torchvision_dddas.metrics import truth as truths
 from torchvision_dddas.metrics.matching import TrackTable, pair
@@ -133,13 +135,12 @@ def main() -> None:
 def read(data: Path) -> list[Sequence]:
     """The sequences, as long as seqinfo.ini says, or as their truth where there is none."""
     found = []
-    for file in sorted(data.glob("*/gt/gt.txt")):
-        place, truth = file.parents[1], truths.load(file)
-        given = place / "det/det.txt"
-        scores = mot_text.read_rows(given, "detections").mark if given.exists() else np.full(1, np.nan)
+    for clip in map(motchallenge.sequence, sequences(data)):
+        scores = mot_text.read_rows(clip.given, "detections").mark if clip.given else np.full(1, np.nan)
         probable = bool(((scores >= 0) & (scores <= 1)).all())
-        clip = next(iter(sorted(place.glob("*.mp4"))), None)
-        found.append(Sequence(place.name, truth, truth.length or truth.frames[-1], clip, given if probable else None))
+        film = clip.pictures[0] if len(clip.pictures) == 1 else None
+        assert clip.truth is not None
+        found.append(Sequence(clip.name, clip.truth, clip.frames, film, clip.given if probable else None))
     return found
 
 
