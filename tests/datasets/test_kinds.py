@@ -88,3 +88,10 @@ def test_an_option_of_another_type_is_refused(tmp_path: Path, option: dict[str, 
     with pytest.raises(InputError) as caught:
         read("folder", tmp_path, **option)
     assert line in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", kinds.KINDS)
+def test_each_kind_is_in_the_documentation(kind: str) -> None:
+    told = (Path(__file__).parents[2] / "docs" / "datasets.md").read_text(encoding="utf-8")
+    assert f"\n| [`{kind}`](#{kind}" in told
+    assert f"\n## `{kind}`" in told
