@@ -21,6 +21,7 @@ from torchvision_dddas.cli.people import people
 from torchvision_dddas.cli.run import run
 from torchvision_dddas.cli.settings import settings
 from torchvision_dddas.cli.simulate import simulate
+from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 
 app = typer.Typer(
@@ -32,7 +33,7 @@ app = typer.Typer(
 )
 for command in (
     *(run, detect, people, track, confirm, calibrate, colours),
-    *(evaluate, compare, simulate, export, demo, settings),
+    *(evaluate, compare, sweep, simulate, export, demo, settings),
 ):
     app.command()(command)
 app.add_typer(locate, name="locate")

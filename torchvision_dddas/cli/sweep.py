@@ -1,0 +1,170 @@
+"""`dddas sweep`: a study with other knobs, again and again, and which of them measure best."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.studies.sweep import Trial
+    from torchvision_dddas.studies.swept import Swept
+
+MOST_SHOWN = 20  # rows of the table
+MOST_PROPOSED = 10_000
+
+
+@explained
+def sweep(
+    dataset: Annotated[Path, typer.Option(metavar="FILE", help="The TOML of a study, as of dddas evaluate.")],
+    measure: Annotated[
+        str, typer.Option(metavar="TASK.GROUP.MEASURE", help="What is to be best, such as motion.pixels.f.")
+    ],
+    grid: Annotated[
+        list[str] | None,
+        typer.Option("--grid", metavar="KNOB=A,B,C", help="Values of a knob; may be repeated: all combinations."),
+    ] = None,
+    optuna: Annotated[
+        int | None, typer.Option(metavar="N", help="So many points within --range, as Optuna proposes them.")
+    ] = None,
+    range_: Annotated[
+        list[str] | None,
+        typer.Option("--range", metavar="KNOB=LOW:HIGH", help="Of Optuna; or KNOB=LOW:HIGH:log, KNOB=A,B,C."),
+    ] = None,
+    by: Annotated[
+        str, typer.Option(metavar="pooled|mean|worst", help="All clips' counts pooled, their mean, or the worst.")
+    ] = "pooled",
+    holdout: Annotated[
+        str | None,
+        typer.Option(metavar="PATTERN,...", help="Clips without a say; before and best are measured on them too."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of what Optuna draws.")] = 0,
+    clips: Annotated[
+        str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one a core]")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler in place of --jobs.")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
+    ] = None,
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Annotated[Backend | None, typer.Option(help="The engine. [default: as FILE says]")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for sweep.json and best.toml.")] = Path("dddas-sweep"),
+    quiet: Quiet = False,
+) -> None:
+    """Try knobs on whole data sets, all points of a grid or as Optuna proposes; writes sweep.json and best.toml.
+
+    Results are kept as those of dddas evaluate --dataset: a sweep that is asked for again goes on where it was.
+    """
+    from torchvision_dddas.cli.study import asked
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.studies import axes
+    from torchvision_dddas.studies import sweep as sweeping
+    from torchvision_dddas.studies.goals import goal_of
+    from torchvision_dddas.studies.swept import Swept
+    from torchvision_dddas.studies.tried import Tried, parted
+
+    if jobs is not None and jobs < 1:
+        raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
+    if jobs is not None and scheduler is not None:
+        raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
+    _check_search(grid, optuna, range_)
+    goal, spec = goal_of(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
+    spec = replace(spec, tasks=(goal.task,))
+    settings = load(spec.config, spec.overrides)
+    choices, ranges = axes.on_grid(grid or [], settings), axes.in_ranges(range_ or [], settings)
+    points = optuna if optuna is not None else sum(1 for _ in axes.points(choices))
+    if optuna is not None:
+        sweeping.need_optuna()
+    tuned, held = parted(spec, dataset.parent, _patterns(clips), _patterns(holdout))
+    tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache)
+    search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
+    swept = Swept(out, settings, goal, search, tuned, held)
+    on_tuned = lambda knobs: tried.measured(knobs, tuned)  # noqa: E731
+    trials = (
+        sweeping.on_grid(choices, settings, on_tuned, lambda points: tried.ahead(points, tuned))
+        if optuna is None
+        else sweeping.proposed(ranges, settings, on_tuned, optuna, seed, goal.least)
+    )
+    for trial in trials:
+        swept.add(trial)
+        if not quiet:
+            print(f"{trial.number} of {points}: {_said(trial)}", file=sys.stderr, flush=True)
+    if (found := sweeping.best(swept.trials, goal.least)) is None:
+        raise InputError(f"no setting has a {goal.name}: {swept.trials[0].cause}")
+    if held:
+        tried.ahead([{}, found.knobs], held)
+    swept.choose(found, (tried.measured({}, held), tried.measured(found.knobs, held)) if held else None)
+    if not quiet:
+        show(swept)
+
+
+def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] | None) -> None:
+    if optuna is None and ranges:
+        raise InputError("--range is for Optuna; give --optuna N too, or --grid knob=value,value")
+    if optuna is not None and grid:
+        raise InputError("--grid and --optuna were both given; wanted one (--range takes values too: knob=a,b,c)")
+    if optuna is None and not grid:
+        raise InputError("nothing to try; give --grid knob=value,value or --optuna N --range knob=low:high")
+    if optuna is not None and not ranges:
+        raise InputError("--optuna has nothing to draw; give --range knob=low:high")
+    if optuna is not None and not 1 <= optuna <= MOST_PROPOSED:
+        raise InputError(f"--optuna is {optuna}; wanted 1 to {MOST_PROPOSED} points")
+
+
+def _patterns(text: str | None) -> list[str]:
+    return [word.strip() for word in (text or "").split(",") if word.strip()]
+
+
+def show(swept: "Swept") -> None:
+    """Print the best trials, what the clips held out say, and where the rest is."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from torchvision_dddas.studies.sweep import ranked
+    from torchvision_dddas.studies.swept import number
+
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    knobs = list(dict.fromkeys(knob for trial in swept.trials for knob in trial.knobs))
+    table = Table(title=f"{swept.heading}, {'least' if swept.goal.least else 'most'} first")
+    for column in ("trial", *knobs, swept.goal.measure):
+        table.add_column(column, justify="left" if column in knobs else "right")
+    ordered = ranked(swept.trials, swept.goal.least)
+    shown = ordered[:MOST_SHOWN]
+    if swept.trials[0] not in shown:
+        shown.append(swept.trials[0])
+    for trial in shown:
+        cells = [_value(trial.knobs[k]) if k in trial.knobs else "as it was" for k in knobs]
+        table.add_row(str(trial.number), *cells, number(trial.value))
+    console.print(table)
+    if len(ordered) > len(shown):
+        console.print(f"{len(ordered) - len(shown)} more in {swept.folder / 'sweep.json'}", highlight=False)
+    for trial in ordered:
+        if trial.cause:
+            console.print(f"trial {trial.number} has no value: {trial.cause}", markup=False, highlight=False)
+    if swept.on_held is not None:
+        before, after = (number(value) for value, _ in swept.on_held)
+        names = ", ".join(swept.held)
+        console.print(f"Held out ({names}): {after} with the best, {before} before.", markup=False, highlight=False)
+    typer.echo(f"{swept.folder}: sweep.json, best.toml (for --config)")
+
+
+def _said(trial: "Trial") -> str:
+    from torchvision_dddas.studies.swept import number
+
+    knobs = ", ".join(f"{knob}={_value(value)}" for knob, value in trial.knobs.items()) or "as it was"
+    return f"{knobs}: {trial.cause or number(trial.value)}"
+
+
+def _value(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(list(value) if isinstance(value, tuple) else value)
