@@ -116,3 +116,10 @@ def test_parts_that_are_not_there_are_told_with_their_place(tmp_path: Path) -> N
     uav123(tmp_path)
     line = complaint("uav123", tmp_path)
     assert line == f"{tmp_path / 'anno'} is not there; there belong the boxes, CLIP.txt"
+
+
+def test_the_long_variant_may_share_its_sequences_with_the_short_one(tmp_path: Path) -> None:
+    uav123(tmp_path, "UAV123", sequence="bike1", frames=4)
+    text(tmp_path / "anno" / "UAV20L" / "bike1.txt", "\n".join(BOXES))
+    found = clip("uav123", tmp_path, variant="UAV20L")
+    assert found.pictures[0] == tmp_path / "data_seq" / "UAV123" / "bike1" / "000001.jpg"

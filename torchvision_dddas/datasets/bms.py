@@ -74,7 +74,7 @@ def _published(place: Path, name: str, rate_hz: float | None) -> Clip:
     )
     if not pictures:
         raise InputError(f"{path} is the truth of a clip without pictures; put them into {place}")
-    if said.frames != len(pictures):
+    if len(pictures) < said.frames:
         raise InputError(f"{path} is of {said.frames} frames, but {place} holds {len(pictures)} pictures; is it whole?")
     frames = {p.stem: frame for frame, p in enumerate(pictures, 1)}
     masks = {}
@@ -84,7 +84,7 @@ def _published(place: Path, name: str, rate_hz: float | None) -> Clip:
             raise InputError(f"{path}: picture {picture} of frame {number} is not in {place}; is it whole?")
         masks[frame] = _mask(home, file)
     labels = Labels(background=said.regions[:1], movers=said.regions[1:])
-    truth = Truth("masks", home, dict(sorted(masks.items())), {}, length=said.frames, labels=labels)
+    truth = Truth("masks", home, dict(sorted(masks.items())), {}, length=len(pictures), labels=labels)
     return Clip(name, place, pictures, rate_hz, len(pictures), truth)
 
 

@@ -70,11 +70,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
 
 
 def _places(folder: Path, variant: str) -> tuple[Path, Path]:
-    """Where the boxes and the sequences of a variant lie."""
-    return tuple(  # type: ignore[return-value]
-        next((p for p in (folder / name / variant, folder / name) if p.is_dir()), folder / name / variant)
-        for name in ("anno", "data_seq")
-    )
+    """Where the boxes and the sequences of a variant lie; those of UAV20L may be among those of UAV123."""
+    shared = "UAV123" if variant == "UAV20L" else variant
+    anno = (folder / "anno" / variant, folder / "anno")
+    data = (folder / "data_seq" / variant, folder / "data_seq" / shared, folder / "data_seq")
+    return next(filter(Path.is_dir, anno), anno[0]), next(filter(Path.is_dir, data), data[0])
 
 
 def _cuts(folder: Path, variant: str) -> dict[str, tuple[str, int, int]]:
