@@ -64,8 +64,9 @@ def show(found: Mapping[str, Any], first: str, second: str) -> None:
         if mine["same"]:
             console.print(f"the same in both to the last digit: {', '.join(mine['same'])}", markup=False)
     console.print(
-        "better, worse: beyond noise, p below 0.05 after Holm's correction; "
-        '"on these clips": too few clips, or too unlike, to say so of others',
+        "better, worse: beyond noise, p below 0.05 after Holm's correction. On these clips: by blocks of their frames; "
+        "their number is too small, or they are too unlike, to say so of others. Too little to tell: so few frames or "
+        "clips could not show any change.",
         highlight=False,
     )
     for note in found["notes"]:
@@ -77,19 +78,20 @@ def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
 
     table = Table(title=title)
     table.add_column("measure", overflow="fold")
-    for column in ("A", "B", "change", "95 % interval", "p"):
+    pooled = any("over_clips" in entry for _, entry in rows)
+    for column in ("A", "B", "change", "95 % interval", *(("p, clips", "p, frames") if pooled else ("p",))):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("says")
     for name, entry in rows:
-        way = entry.get("over_clips") or entry.get("over_frames") or {}
-        span = way.get("interval")
+        ways = [entry.get(way) or {} for way in (("over_clips", "over_frames") if pooled else ("over_frames",))]
+        span = next((way["interval"] for way in ways if way.get("interval")), None)
         table.add_row(
             name,
             _figure(entry["first"]),
             _figure(entry["second"]),
             _figure(entry["change"], "+"),
             "–" if span is None else f"{span[0]:+.3f} to {span[1]:+.3f}",
-            f"{way['p_holm']:.3f}" if way else "–",
+            *(f"{way['p_holm']:.3f}" if way else "–" for way in ways),
             entry["says"],
         )
     return table

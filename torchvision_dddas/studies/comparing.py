@@ -38,10 +38,11 @@ def compare(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
 
     {"first", "second": names, "tasks": {task: {"same": clips whose counts are alike to the last digit, "pooled":
     {group: {measure: {"first", "second", "change", "over_clips", "over_frames", "says"}}}, "clips": {name: {group:
-    {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames are
-    {"interval", "p", "p_holm"} or None: of other clips like these, and of other frames of these very clips. p_holm is
-    corrected for all that is asked of a task's pooled figures, or of all its clips. Raises InputError where no task
-    has a clip in both.
+    {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames,
+    {"interval", "p", "p_holm", "enough"} or None, speak of other clips like these, and of other frames of these very
+    clips. p_holm is corrected for all that is asked of a task's pooled figures, or of all its clips. Not enough: so few
+    clips or blocks of frames could not make it small, whatever changed. Raises InputError where no task has a clip in
+    both.
     """
     by_key = [{(case.task, case.clip): case.scored for case in study.cases} for study in (first, second)]
     both = sorted(by_key[0].keys() & by_key[1].keys())
@@ -118,7 +119,11 @@ def _entries(
 
 
 def _told(effect: Effect) -> dict[str, Any]:
-    return {"interval": None if effect.interval is None else list(effect.interval), "p": effect.p}
+    return {
+        "interval": None if effect.interval is None else list(effect.interval),
+        "p": effect.p,
+        "least": effect.least,
+    }
 
 
 def _over_clips(first: Sequence[Scored], second: Sequence[Scored]) -> dict[str, dict[str, Effect]]:
@@ -148,11 +153,12 @@ def _paired_strata(estimate: Estimate) -> tuple[Stratum, ...]:
 
 
 def _correct(entries: Sequence[dict[str, Any]], way: str) -> None:
-    """Add p_holm to all that are asked together."""
+    """Add p_holm to all that are asked together, and whether it could be below LEVEL at all."""
     told = [entry[way] for entry in entries if entry.get(way) is not None]
     adjusted = paired.holm({str(i): one["p"] for i, one in enumerate(told)})
     for i, one in enumerate(told):
         one["p_holm"] = adjusted[str(i)]
+        one["enough"] = one.pop("least") * len(told) < LEVEL
 
 
 def _says(entry: Mapping[str, Any], name: str) -> str:
@@ -161,12 +167,11 @@ def _says(entry: Mapping[str, Any], name: str) -> str:
         return "the same"
     better = (change < 0) == (name in BETTER_LOW)
     word = "better" if better else "worse"
-    over_clips, over_frames = entry.get("over_clips"), entry.get("over_frames")
-    if over_clips is not None and over_clips["p_holm"] < LEVEL:
-        return word
-    if over_frames is not None and over_frames["p_holm"] < LEVEL:
-        return f"{word} on these clips" if "over_clips" in entry else word
-    return "too little to tell" if over_clips is None and over_frames is None else "within noise"
+    ways = [way for name in ("over_clips", "over_frames") if (way := entry.get(name)) is not None]
+    for way in ways:
+        if way["p_holm"] < LEVEL:
+            return f"{word} on these clips" if "over_clips" in entry and way is not entry["over_clips"] else word
+    return "within noise" if any(way["enough"] for way in ways) else "too little to tell"
 
 
 def _same(one: Scored, other: Scored) -> bool:
