@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.datasets.layouts import clip, complaint, mask, pictures, read, text, video
@@ -91,7 +90,7 @@ def test_true_places_and_what_the_vehicle_says_go_with_the_clip(tmp_path: Path) 
     assert found.truth is not None
     assert found.truth.positions is not None
     assert found.truth.positions.identity.tolist() == [4, 4]
-    assert np.array_equal(found.truth.positions.east_north_m, [[7, -3], [7.5, -3]])
+    assert found.truth.positions.east_north_m.tolist() == [[7, -3], [7.5, -3]]
     files = (found.telemetry, found.landmarks, found.colours, found.camera, found.elevation)
     assert [f and f.name for f in files] == ["telemetry.srt", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif"]
 

@@ -1,6 +1,7 @@
 """The registry: every kind can be read, and what cannot be is told in a line."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -84,7 +85,7 @@ def test_a_folder_is_relative_to_the_base(tmp_path: Path) -> None:
         ({"still": [1]}, "still = [1] will not do"),
     ],
 )
-def test_an_option_of_another_type_is_refused(tmp_path: Path, option: dict[str, object], line: str) -> None:
+def test_an_option_of_another_type_is_refused(tmp_path: Path, option: dict[str, Any], line: str) -> None:
     with pytest.raises(InputError) as caught:
         read("folder", tmp_path, **option)
     assert line in str(caught.value)
