@@ -15,6 +15,7 @@ import numpy as np
 
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
+from tests.fuzz.layouts import LAYOUTS, ROOT
 from torchvision_dddas.errors import LONGEST, InputError
 
 
@@ -319,6 +320,30 @@ def _boxes_of_colours(path: Path) -> None:
     _box(words)
 
 
+def _dataset(kind: str, path: Path) -> None:
+    """What is wrong with a clip is told, and the clip left out; where none is left that counts as a refusal."""
+    from torchvision_dddas.datasets import kinds
+    from torchvision_dddas.studies.record import Source
+
+    folder = next(place for place in path.parents if place.name == ROOT)
+    found = kinds.read(Source(kind, folder), folder.parent)
+    for line in found.missing:
+        assert line.isprintable() and 0 < len(line) <= LONGEST, f"a line that is none: {line[:200]!r}"
+    if not found.clips:
+        raise InputError(found.missing[0])
+    for truth in (clip.truth for clip in found.clips if clip.truth is not None):
+        for table in (truth.tracks, truth.ignored, truth.others, truth.regions):
+            _finite(*(table or ()))
+        _finite(*([] if truth.positions is None else [truth.positions.east_north_m]))
+        assert truth.frames and truth.frames[0] >= 1
+
+
+def _study(path: Path) -> None:
+    from torchvision_dddas.studies.spec import read_spec
+
+    read_spec(path)
+
+
 def _text(kind: str) -> Callable[[], Sequence[bytes]]:
     return partial(seeds.text, kind)
 
@@ -428,6 +453,12 @@ PARSERS: tuple[Parser, ...] = (
     Parser("video H.264", "a.mp4", seeds.h264, _video, text=False, needs="av", share=0.15),
     Parser("names of inputs", "input.txt", _text("input names"), _input_name, share=0.5),
     Parser("colours by boxes", "box.txt", _text("boxes of colours"), _boxes_of_colours, share=0.3),
+    Parser("studies", "study.toml", _text("studies"), _study, words=(*_TOML, "[[dataset]]", "kind = ", "folder = ")),
+    *(
+        Parser(one.name, f"{ROOT}/{one.file}", one.seeds, partial(_dataset, one.kind), words=one.words,
+        beside=one.others, share=0.5)
+        for one in LAYOUTS
+    ),
     Parser("elevation GeoTIFF", "a.tif", partial(seeds.raster, 1), _elevation, text=False, needs="rasterio", share=0.3),
     Parser("photo GeoTIFF", "a.tif", partial(seeds.raster, 3), _ortho, text=False, needs="rasterio", share=0.3),
 )  # fmt: skip

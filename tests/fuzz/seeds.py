@@ -140,6 +140,11 @@ TEXT: dict[str, tuple[str, ...]] = {
             }
         ),
     ),
+    "studies": (
+        ('name = "all"\ntasks = ["motion", "tracking"]\nconfig = "fast"\nset = ["track.birth_score=0.5"]\n'
+        'backend = "onboard"\ninterval = 2\n[[dataset]]\nkind = "bms"\nfolder = "a"\nclips = ["bms_*"]\n'
+        '[[dataset]]\nkind = "kitti"\nfolder = "../kitti"\nclasses = ["Car"]\n'),
+    ),
     "addresses": ("8080", "0.0.0.0:8080", "[::1]:9000"),
     "cameras": ("camera:0", "camera:12", "rtsp://user:word@host/stream"),
     "streams": ("json:rows.jsonl", "mot:rows.txt", "json:/dev/null"),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.metrics.matching import TrackTable, pair
 from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.metrics.uncounted import counted
 
@@ -46,3 +46,21 @@ def test_a_box_in_a_region_counts_only_where_it_is_right() -> None:
 def test_frames_are_apart_and_without_boxes_nothing_is_said() -> None:
     assert counts(TRUTH) == []
     assert counted(TRUTH, np.array([2]), np.array([RIDER], float)).tolist() == [True]
+
+
+def test_it_takes_out_what_matching_for_tracks_takes_out() -> None:
+    """`matching.pair` with "removed", which is checked against TrackEval."""
+    rng = np.random.default_rng(3)
+    frame = np.repeat(np.arange(1, 41), 8)
+    labelled = TrackTable(
+        frame, np.tile(np.arange(8), 40), np.c_[rng.uniform(0, 60, (320, 2)), np.full((320, 2), 30.0)]
+    )
+    real = rng.random(320) < 0.6
+    found = TrackTable(frame, labelled.identity, labelled.box_px + rng.normal(0, 5, (320, 4)) * (1, 1, 0, 0))
+    true, ignored = labelled.at(real), labelled.at(~real)
+    boxes = {n: true.box_px[true.frame == n] for n in range(1, 41)}
+    truth = Truth("boxes", Path("gt.txt"), {}, boxes, true, ignored, ignoring="removed")
+    kept = counted(truth, found.frame, found.box_px)
+    assert 0.3 < kept.mean() < 0.9
+    theirs, ours = pair(true, found, ignored, "removed"), pair(true, found.at(kept))
+    assert [p.overlap.tolist() for p in theirs.frames] == [p.overlap.tolist() for p in ours.frames]

@@ -82,7 +82,9 @@ def read(source: Asked, base: Path) -> Dataset:
     if not clips and not found.missing:
         asked = "" if "*" in source.clips else f" by the name {' or '.join(source.clips)}"
         found = replace(found, missing=(f"{folder} holds no clip{asked}; wanted {KINDS[source.kind]}",))
-    return replace(found, clips=clips)
+    # A name that a file gives a clip, or a file's own, may hold anything; so may what was found in it.
+    told = tuple(str(InputError(line)) for line in found.missing)
+    return replace(found, clips=clips, missing=told)
 
 
 def known(kind: str) -> None:
