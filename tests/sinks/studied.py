@@ -15,7 +15,7 @@ from torchvision_dddas.studies.scoring import score
 
 SIZE = (160, 120)
 FRAMES = 6
-HOSTILE = "a <b>bold</b> & \"quoted\" clip"
+HOSTILE = 'a <b>bold</b> & "quoted" clip'
 
 
 def found(frame, box_px, identity=None, masks=None, east_north_m=None, seconds=0.5) -> Found:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
+from torchvision_dddas.sinks.map_frame import step_of
 from torchvision_dddas.sinks.page_tables import number
 
 WIDE = 420
@@ -34,6 +35,7 @@ def interval_plot(
     shown = [row for row in rows if math.isfinite(row.value)][:MOST_ROWS]
     ends = [end for row in shown for end in (row.value, row.low, row.high) if math.isfinite(end)]
     low, high = min([span[0], *ends]), max([span[1], *ends])
+    high = high if high > low else low + 1
     high = high if high > low else low + 1.0  # all of them 0, as false alarms may be
     wide, tall = WIDE - _NAMES - _RIGHT, _ROW * len(shown)
 
@@ -41,11 +43,12 @@ def interval_plot(
         return _NAMES + (value - low) / (high - low) * wide
 
     parts = [f'<text x="6" y="16" class="title">{escape(title)}</text>']
-    for k in range(6):
-        value = low + (high - low) * k / 5
+    step = step_of(high - low, 5)
+    for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
+        value = k * step
         x = across(value)
         parts.append(f'<path d="M{x:.1f} {_TOP}v{tall}" class="grid"/>')
-        text = f"{value:.3g}".replace("-", "−")
+        text = f"{value:g}".replace("-", "−")
         parts.append(f'<text x="{x:.1f}" y="{_TOP + tall + 16}" text-anchor="middle">{text}</text>')
     if whole is not None and math.isfinite(whole.value):
         if math.isfinite(whole.low) and math.isfinite(whole.high):

@@ -8,7 +8,7 @@ SERIES = 6
 
 STYLE = """
 :root{color-scheme:light dark;--paper:#fff;--card:#f6f8fa;--ink:#1b1f24;--soft:#57606a;--line:#d5dbe1;--link:#0b5cad;
- --bad:#a3341b;--c1:#0072b2;--c2:#c2560a;--c3:#00805e;--c4:#a8498a;--c5:#8a6d00;--c6:#5a6570}
+ --bad:#a3341b;--c1:#0072b2;--c2:#ad4a00;--c3:#00805e;--c4:#a8498a;--c5:#8a6d00;--c6:#5a6570}
 @media (prefers-color-scheme:dark){:root{--paper:#0f1419;--card:#182029;--ink:#e6edf3;--soft:#a3afbb;--line:#313c48;
  --link:#7cbcff;--bad:#ff9a80;--c1:#56b4e9;--c2:#f39c4a;--c3:#3fcfa4;--c4:#e39ac6;--c5:#e8d44d;--c6:#9aa7b4}}
 *{box-sizing:border-box}
@@ -24,8 +24,8 @@ nav{display:flex;flex-wrap:wrap;gap:4px 16px;margin:10px 0 0}
 .cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:14px;margin:18px 0 0;padding:0}
 .card{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px 16px}
 .card h3{margin:0;font-size:14px;color:var(--soft);font-weight:600}
-.card .big{font-size:32px;line-height:1.25;font-weight:600;font-variant-numeric:tabular-nums}
-.card .big span{font-size:15px;font-weight:400;color:var(--soft)}
+.card .big{font-size:32px;line-height:1.15;margin:4px 0 6px;font-weight:600;font-variant-numeric:tabular-nums}
+.card .big span{font-size:15px;line-height:1.3;display:inline-block;font-weight:400;color:var(--soft)}
 .card p{margin:2px 0;font-size:14px}
 .wide{overflow-x:auto;margin:0 0 6px;border:1px solid var(--line);border-radius:8px}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:14px;overflow-wrap:normal}

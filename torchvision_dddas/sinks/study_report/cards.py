@@ -24,10 +24,14 @@ def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
         whole = told.pooled.get(group, {}).get(name)
         if whole is not None:
             meaning = f' title="{escape(known.meaning)}"' if known.meaning else ""
-            parts.append(
-                f'<div class="big">{number(whole.value, known.digits)} <span{meaning}>{escape(known.name)}, '
-                f"{escape(GROUPS.get(group, group))}</span></div>"
+            metres = name.endswith("_m")
+            what = (
+                f"m, {known.meaning.removesuffix(', metres')}"
+                if metres
+                else f"{known.name}, {GROUPS.get(group, group)}"
             )
+            big = f"{number(whole.value, known.digits)} <span{meaning}>{escape(what)}</span>"
+            parts.append(f'<div class="big">{big}</div>')
             if math.isfinite(whole.low) and math.isfinite(whole.high):
                 ends = f"{number(whole.low, known.digits)} to {number(whole.high, known.digits)}"
                 over = "clips" if told.over.get(group) == "clips" else "blocks of frames"

@@ -18,8 +18,9 @@ def groups_of(told: Told) -> list[str]:
 
 
 def shown(told: Told, group: str) -> list[str]:
-    """The measures of a group's table that any clip has."""
-    having = dict.fromkeys(name for clip in told.clips.values() for name in clip.get(group, {}))
+    """The measures of a group's table that any clip has a value of."""
+    figures = [pair for clip in told.clips.values() for pair in clip.get(group, {}).items()]
+    having = dict.fromkeys(name for name, figure in figures if math.isfinite(figure.value))
     if group in SHOWN:
         return [name for name in SHOWN[group] if name in having]
     counts = [name for name in having if name.startswith("n_")]

@@ -12,7 +12,7 @@ from torchvision_dddas.sinks.study_report.cards import card
 from torchvision_dddas.sinks.study_report.costs import cost_charts, cost_table, costs_of, summed
 from torchvision_dddas.sinks.study_report.curves import course_charts, ranked_charts
 from torchvision_dddas.sinks.study_report.figures import Told, told
-from torchvision_dddas.sinks.study_report.maps import maps
+from torchvision_dddas.sinks.study_report.maps import error_clouds, maps
 from torchvision_dddas.sinks.study_report.measures import groups_of, measure_plot, measure_table
 from torchvision_dddas.sinks.study_report.pictures import KEY
 from torchvision_dddas.sinks.study_report.words import GROUPS, TITLES
@@ -69,7 +69,7 @@ def _task(task: str, mine: Told, cases: Sequence[Case]) -> list[str]:
         more = len([case for case in cases if case.scored is not None]) - len(courses)
         note = f'<p class="note">{_many(more, "other clip")} not drawn.</p>' if more > 0 else ""
         parts += ["<h3>As the clips go on</h3>", '<div class="plots">', *(_plot(c) for c in courses), "</div>", note]
-    if seen := maps(cases):
+    if seen := [*maps(cases), *error_clouds(cases)]:
         parts += ["<h3>Maps</h3>", '<div class="plots">', *(_plot(one) for one in seen), "</div>"]
     notes = [f"{case.clip.name}: {note}" for case in cases if case.scored for note in case.scored.notes]
     if notes:

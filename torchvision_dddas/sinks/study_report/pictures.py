@@ -16,6 +16,7 @@ UNSCORED: Colour = (150, 150, 150)
 MOST_WIDE, MOST_HIGH = 560, 420
 """Pixels of a picture on the page; a smaller one is enlarged up to three times."""
 _QUALITY = 80
+_SMALL, _RING = 4, 6  # px of a picture on the page
 
 KEY = (
     ("found and true", '<rect x="1" y="2" width="24" height="12" fill="#56b4e9" stroke="#2a6f96"/>'),
@@ -71,6 +72,7 @@ def mask_pair(picture: np.ndarray, labels: np.ndarray, found: np.ndarray) -> Pai
     for area, colour in ((true & found, HIT), (true & ~found, TRUE), (found & ~true, FALSE)):
         _tint(right, area, size, colour, 0.7)
         _outline(right, area, size, colour)
+    _rings(right, true, found, size)
     return Pair(_jpeg(left), _jpeg(right))
 
 
@@ -128,12 +130,29 @@ def _tint(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: 
 
 
 def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: Colour, thick: int = 1) -> None:
-    """Lines around what is there: even a target of few pixels is seen in a reduced picture."""
+    """Lines around what is there."""
+    drawn = [whole(contour) for contour in _contours(area, size)]
+    cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
+
+
+def _rings(picture: np.ndarray, true: np.ndarray, found: np.ndarray, size: tuple[int, int]) -> None:
+    """A ring around what stands alone and is so small in a reduced picture that nobody would see it."""
+    share = np.array([size[0] / true.shape[1], size[1] / true.shape[0]])
+    for contour in _contours(true | found, size):
+        low, high = contour.min(axis=(0, 1)), contour.max(axis=(0, 1))
+        if (high - low).max() < _SMALL:
+            x, y = (contour[0, 0] / share).astype(int).tolist()
+            colour = HIT if true[y, x] and found[y, x] else TRUE if true[y, x] else FALSE
+            centre = whole((low + high) / 2).tolist()
+            cv2.circle(picture, centre, _RING, (0, 0, 0), 4, cv2.LINE_AA)
+            cv2.circle(picture, centre, _RING, colour, 2, cv2.LINE_AA)
+
+
+def _contours(area: np.ndarray, size: tuple[int, int]) -> list[np.ndarray]:
+    """(N, 1, 2) each, in pixels of the picture on the page."""
     height, width = area.shape
     contours, _ = cv2.findContours(area.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    share = np.array([size[0] / width, size[1] / height])
-    drawn = [whole((contour + 0.5) * share) for contour in contours]
-    cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
+    return [(contour + 0.5) * (size[0] / width, size[1] / height) for contour in contours]
 
 
 def _box(picture: np.ndarray, box: np.ndarray, colour: Colour, name: str, thick: int = 2) -> None:
