@@ -54,7 +54,7 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         frames = agreed(pictures, 0, "")
         truth = read_truth(path, frames)
         if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {homes[0]}; by its boxes alone")
+            notes.append(f"{name}: what needs pictures, which belong in {homes[0]}")
         frames = frames or truth.frames[-1]
         return Clip(name, path, pictures, rate_hz, frames, truth, shows=("people",))
 

@@ -68,9 +68,9 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         lacking = [str(path) for path in (calibration, flight) if not path.is_file()]
         truth = read_truth(places[name], classes, len(pictures), None if lacking else (calibration, flight))
         if lacking:
-            notes.append(f"{name}: no positions, for which {' and '.join(lacking)} would be needed")
+            notes.append(f"{name}: places in metres, which need {' and '.join(lacking)}")
         if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {home / 'image_02' / name}; by its boxes alone")
+            notes.append(f"{name}: what needs pictures, which belong in {home / 'image_02' / name}")
         return Clip(name, places[name], pictures, RATE_HZ, agreed(pictures, 0, "") or truth.frames[-1], truth)
 
     found = gather("kitti", folder, TERMS, filter(wanted, places), clip_of)

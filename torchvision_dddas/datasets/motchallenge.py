@@ -63,7 +63,7 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     def clip_of(name: str) -> Clip:
         clip = sequence(places[name], given["benchmark"], given["least_visibility"])
         if not clip.pictures:
-            notes.append(f"{name}: no pictures, which belong in {places[name] / 'img1'}; by its boxes alone")
+            notes.append(f"{name}: what needs pictures, which belong in {places[name] / 'img1'}")
         return replace(clip, name=name)
 
     found = gather("motchallenge", folder, TERMS, filter(wanted, places), clip_of)

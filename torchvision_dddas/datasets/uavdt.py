@@ -72,7 +72,7 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         pictures = whole(next((p for home in homes if (p := images_in(home / name))), ()), 1)
         truth = read_truth(places[name], given["classes"], len(pictures))
         if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {folder / _PICTURES[0] / name}; by its boxes alone")
+            notes.append(f"{name}: what needs pictures, which belong in {folder / _PICTURES[0] / name}")
         return Clip(name, places[name], pictures, RATE_HZ, len(pictures) or truth.frames[-1], truth)
 
     def has(name: str) -> bool:

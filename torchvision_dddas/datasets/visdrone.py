@@ -68,7 +68,7 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         pictures = whole(images_in(folder), 1)
         truth = read_truth(places[name], classes, len(pictures))
         if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {folder}; by its boxes alone")
+            notes.append(f"{name}: what needs pictures, which belong in {folder}")
         return Clip(name, places[name], pictures, frames=len(pictures) or truth.frames[-1], truth=truth)
 
     found = gather("visdrone", folder, TERMS, filter(wanted, places), clip_of)
