@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test lint onboard peers
+.PHONY: demo test lint onboard peers figures
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
@@ -25,6 +25,11 @@ onboard: .venv-onboard/.installed
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check .
 	@touch $@
+
+# Tables and plots of the texts from the results that studies keep in docs/results: none of their figures is typed.
+figures: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[report]'
+	$(BIN)/python eval/figures.py
 
 # Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
 # tracking measures TrackEval's? DATA may name a folder of MOTChallenge 2015 sequences to check them on as well.

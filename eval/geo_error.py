@@ -21,11 +21,13 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import geo_plots
 import geo_tables
 import numpy as np
 import report
+import results
 from geo_scene import (
     BOUNDS,
     CAMERA,
@@ -362,6 +364,13 @@ def told(found: dict[str, list[dict]]) -> str:
     return "\n\n".join(f"{title}:\n\n{table(found[study])}" for study, title, table in TABLES if study in found)
 
 
+def shown(found: dict[str, Any]) -> dict[str, list[dict]]:
+    """The studies as the text has them: not every altitude and number of landmarks."""
+    parts = {name: found[name] for name in ("main", "six", "faults", "common", "time") if name in found}
+    few = [row for row in parts.get("main", []) if row["altitude_m"] != 100 and row["landmarks"] in (4, 6)]
+    return parts | ({"main": few} if few else {})
+
+
 def together(workers: int, jobs: Iterable[Callable[[], dict[str, object]]]) -> list[dict]:
     """Results of all jobs, in order."""
     with ProcessPoolExecutor(workers) as pool:
@@ -424,8 +433,8 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps({"seeds": seeds, **found}, indent=1), encoding="utf-8")
     if options.write:
-        few = [row for row in found.get("main", []) if row["altitude_m"] != 100 and row["landmarks"] in (4, 6)]
-        report.put(options.write, "geo-error", told(found | ({"main": few} if few else {})))
+        report.place(options.write, "geo-error", told(shown(found)))
+        results.keep("geo-error", {"command": results.command(), "day": results.today(), "seeds": seeds, **found})
     if options.plot and "main" in found:
         geo_plots.draw(found["main"], options.plot)
 

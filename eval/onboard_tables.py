@@ -16,6 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 import machine
 import report
+import results
 from chains import ONBOARD, STAGES, TURN
 from sim_runs import pyplot, table
 
@@ -266,10 +267,13 @@ def main() -> None:
     except (OSError, ValueError) as error:
         sys.exit(str(error))
     people = rest[0] if rest else None
+    if options.readme and options.readme.resolve() == results.ROOT / "README.md":
+        for name, content in (("speed", speed), ("live", live), *([("people", people)] if people else [])):
+            results.keep(f"onboard-{name}", {"command": results.command(), "day": results.today(), **content})
     if options.readme:
-        report.put(options.readme, "onboard", summary(speed, live, people))
+        report.place(options.readme, "onboard", summary(speed, live, people))
     if options.details:
-        report.put(options.details, "onboard", details(speed, live, people))
+        report.place(options.details, "onboard", details(speed, live, people))
     if options.plot:
         draw(speed, live, options.plot)
     if not (options.readme or options.details or options.plot):

@@ -1,6 +1,7 @@
 """Measured tables in a text file: `python eval/report.py README.md --speed FILE.json`, FILE made by speed.py --json.
 
-A table stands between `<!-- name -->` and `<!-- /name -->`, and is replaced whole.
+A table stands between `<!-- name -->` and `<!-- /name -->`, and is replaced whole. What goes into the texts of this
+project is kept in docs/results too, with the command and the day, and `make figures` puts it there again.
 """
 
 import argparse
@@ -9,8 +10,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import results
+
 
 def put(path: Path, name: str, text: str) -> None:
+    """Put a measurement between the marks of a name, and keep it. Ends the program with one line without marks."""
+    place(path, name, text)
+    where = path.resolve()
+    into = where.relative_to(results.ROOT).as_posix() if where.is_relative_to(results.ROOT) else ""
+    if into in results.TEXTS:
+        results.Result(into, name, results.command(), results.today(), results.blocks_of(text)).write()
+
+
+def place(path: Path, name: str, text: str) -> None:
     """Replace what stands between the marks of a name. Ends the program with one line if they are not there."""
     begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
     try:
