@@ -134,6 +134,7 @@ def test_only_what_is_asked_for_is_read(tmp_path: Path) -> None:
         ("gt.txt=1,1,10,20,30,40,0,3,1\n", "holds no pedestrian that counts"),
         ("seqinfo.ini=[Sequence]\nseqLength=4\n", "has 3 frames, but seqinfo.ini says 4"),
         ("seqinfo.ini=nothing\n", "does not tell seqLength"),
+        (f"seqinfo.ini=[Sequence]\nseqLength=3\nimDir={'9' * 300}\n", "is no folder's name"),
         ("000002.png=", "goes on with 000003.png where frame 2 belongs"),
     ],
 )

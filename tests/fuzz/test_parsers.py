@@ -98,6 +98,9 @@ def test_a_png_that_says_a_chunk_is_longer_than_the_file_is_refused_at_once(tmp_
         ("names of inputs", b"sim:" + b"a" * 300),
         ("seqinfo.ini", b"[Sequence]\nseqLength=" + b"9" * 60),
         ("MOT text", b"1,1,0,0,1e200,1e200\n"),
+        ("BMS's definition", BY_NAME["BMS's definition"].seeds()[0].replace(b"cars_01.pgm", b"a" * 300 + b".pgm")),
+        ("BMS's definition", BY_NAME["BMS's definition"].seeds()[0].replace(b"cars_01.pgm", b"/")),
+        ("KITTI's calib", BY_NAME["KITTI's calib"].seeds()[0].replace(b"R_rect 1", b"R_rect 0")),
         ("scenario TOML", b'[world]\nphoto = "' + b"a" * 300 + b'"'),
     ],
 )

@@ -8,11 +8,15 @@ Total number of labeled frames for this shot:
 Frame number:  File name:  Input file name: of each labelled frame: its number, labels and picture
 """
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from torchvision_dddas.errors import InputError
+
+_LONGEST = 250
+"""Bytes of a file's name; another ending may be tried, and 255 is what most systems take."""
 
 
 class Definition(NamedTuple):
@@ -42,7 +46,7 @@ def read(path: Path) -> Definition:
             f"{path} names {len(numbers)} labelled frames, {len(files)} files and {len(pictures)} pictures; "
             "wanted as many of each, and at least one"
         )
-    rows = [(_whole(n, path), f, p) for n, f, p in zip(numbers, files, pictures, strict=True)]
+    rows = [(_whole(n, path), _file(f, path), _file(p, path)) for n, f, p in zip(numbers, files, pictures, strict=True)]
     return Definition(tuple(regions), frames[0], tuple(rows))
 
 
@@ -59,3 +63,11 @@ def _whole(text: str, path: Path) -> int:
     if not text.isdecimal() or len(text) > 9:
         raise InputError(f"{path}: '{text[:40]}' will not do; wanted a whole number")
     return int(text)
+
+
+def _file(text: str, path: Path) -> str:
+    """The name of a file beside the definition, without folders that somebody else's machine had."""
+    name = re.split(r"[\\/]", text)[-1]
+    if name in ("", ".", "..") or "\0" in name or len(name.encode()) > _LONGEST:
+        raise InputError(f"{path}: '{text[:40]}' is no name of a file")
+    return name

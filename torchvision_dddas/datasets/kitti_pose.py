@@ -46,7 +46,7 @@ def camera_from_imu(path: Path) -> np.ndarray:
             raise InputError(f"{path} does not hold {name} with {size} numbers")
         matrix = np.eye(4)
         matrix[:3, : size // 3] = values.reshape(3, -1)
-        if abs(np.linalg.det(matrix[:3, :3])) < 1e-6:
+        if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.01:
             raise InputError(f"{path}: {name} is no rotation")
         matrices.append(matrix)
     rectified, camera_from_velodyne, velodyne_from_imu = matrices

@@ -20,7 +20,7 @@ class SeqInfo(NamedTuple):
 
 
 def read_seqinfo(path: Path) -> SeqInfo:
-    """Read the file. Raises InputError: no such file format, without a usable seqLength under [Sequence]."""
+    """Read the file. Raises InputError: no such format, no usable seqLength or imDir under [Sequence]."""
     ini = configparser.ConfigParser(interpolation=None)
     try:
         ini.read(path, encoding="utf-8")
@@ -34,4 +34,6 @@ def read_seqinfo(path: Path) -> SeqInfo:
     except ValueError:
         rate_hz = math.nan
     pictures = Path(ini.get("Sequence", "imDir", fallback="") or "img1").name
+    if len(pictures.encode()) > 255:  # no folder's name is longer
+        raise InputError(f"{path}: imDir = {pictures} is no folder's name")
     return SeqInfo(length, rate_hz if 0 < rate_hz <= 1000 else None, pictures)
