@@ -1,6 +1,7 @@
 """What the texts say was measured is what the results say: no figure of a table is typed by hand."""
 
 import importlib
+import itertools
 import json
 import re
 import subprocess
@@ -91,3 +92,57 @@ def test_the_check_of_the_texts_says_nothing_where_all_is_well() -> None:
         [sys.executable, str(ROOT / "eval" / "figures.py"), "--check"], capture_output=True, text=True
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# -- the source's tables and figures ---------------------------------------------------------------------------------
+
+
+def commands() -> list[str]:
+    """Those of the table of the source's tables and figures."""
+    if not (ROOT / "eval" / "README.md").is_file():
+        return []
+    content = (ROOT / "eval" / "README.md").read_text(encoding="utf-8")
+    section = content.partition("## The source's tables and figures")[2].partition("\n## ")[0]
+    return sorted(set(re.findall(r"`((?:python eval/|dddas )[^`]+)`", section)))
+
+
+def test_there_is_a_command_for_every_figure_of_the_source_that_measures_something() -> None:
+    content = (ROOT / "eval" / "README.md").read_text(encoding="utf-8")
+    section = content.partition("## The source's tables and figures")[2].partition("\n## ")[0]
+    named: dict[str, set[str]] = {"A": set(), "B": set(), "C": set()}
+    for row in section.splitlines():
+        for appendix, figures_of in re.findall(r"\b([ABC]) Fig\. ([\d, ab]+)", row.split("|")[1] if "|" in row else ""):
+            named[appendix] |= set(re.findall(r"\d+", figures_of))
+    assert {appendix: len(found) for appendix, found in named.items()} == {"A": 9, "B": 9, "C": 6}
+
+
+@pytest.mark.parametrize("command", commands())
+def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
+    from typer.main import get_command
+
+    from torchvision_dddas.cli import app
+    from torchvision_dddas.settings import load
+    from torchvision_dddas.simulation.scenario import load as load_scenario
+    from torchvision_dddas.studies.axes import on_grid
+    from torchvision_dddas.studies.goals import goal_of
+
+    program, name, *words = command.split()
+    options = [word for word in words if word.startswith("--")]
+    if program == "python":
+        said = "".join((ROOT / path).read_text(encoding="utf-8") for path in (name, "eval/sim_runs.py"))
+        assert all(f'"{option}"' in said for option in options)
+        return
+    known = {
+        option
+        for parameter in get_command(app).commands[name].params  # type: ignore[attr-defined]
+        for option in parameter.opts
+    }
+    assert set(options) <= known
+    values = dict(itertools.pairwise(words))
+    load(values.get("--config"), [values["--set"]] if "--set" in values else [])
+    on_grid([value for option, value in itertools.pairwise(words) if option == "--grid"], load())
+    if "--measure" in values:
+        goal_of(values["--measure"])
+    for word in words:
+        if word.startswith("sim:") or (name == "simulate" and word == words[0]):
+            load_scenario(word.removeprefix("sim:"))
