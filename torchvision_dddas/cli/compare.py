@@ -25,6 +25,9 @@ def compare(
     ],
     second: Annotated[Path, typer.Argument(metavar="B", help="The folder of another study of the same clips.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write it as a page too, such as compare.html.")
+    ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
     from torchvision_dddas.sinks.journal import finite
@@ -32,10 +35,25 @@ def compare(
     from torchvision_dddas.studies.scored import read_scores
 
     found = beside(read_scores(first), read_scores(second))
+    if out is not None:
+        _write(out, finite(found))
     if as_json:
         typer.echo(json.dumps(finite(found), indent=2))
     else:
         show(found, str(first), str(second))
+
+
+def _write(path: Path, found: dict[str, Any]) -> None:
+    """The page. Raises InputError where it cannot be written."""
+    from torchvision_dddas.sinks.comparison_report import comparison_report
+    from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, write_whole
+
+    refuse_folder(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, comparison_report(found).encode())
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 def show(found: Mapping[str, Any], first: str, second: str) -> None:

@@ -31,7 +31,10 @@ def interval_plot(
     span: tuple[float, float] = (0.0, 1.0),
     colour: int = 1,
 ) -> str:
-    """The plot, rows in their order, the first MOST_ROWS; whole: a line through all of them, with its band."""
+    """The plot, rows in their order, the first MOST_ROWS; whole: a line through all of them, with its band.
+
+    span: what the axis shows at least.
+    """
     shown = [row for row in rows if math.isfinite(row.value)][:MOST_ROWS]
     ends = [end for row in shown for end in (row.value, row.low, row.high) if math.isfinite(end)]
     low, high = min([span[0], *ends]), max([span[1], *ends])
@@ -60,7 +63,7 @@ def interval_plot(
         hint = f"<title>{escape(f'{whole.name} {number(whole.value)}')}</title>"
         parts.append(f'<path d="M{x:.1f} {_TOP - 3}v{tall + 6}" class="line c2" stroke-dasharray="5 4">{hint}</path>')
         anchor = "end" if x > WIDE - 120 else "start" if x < _NAMES + 60 else "middle"
-        said = f"{whole.name} {number(whole.value)}"
+        said = f"{whole.name} {number(whole.value)}" if whole.value else whole.name
         parts.append(
             f'<text x="{x:.1f}" y="{_TOP + tall + 31}" text-anchor="{anchor}" class="f2">{escape(said)}</text>'
         )

@@ -102,7 +102,7 @@ def cost_charts(costs: Sequence[Cost]) -> list[str]:
             dots.append(Dots(TITLES[task], np.array([c.megapixels for c in mine]), np.array(each_ms), k % 6 + 1, said))
     if not dots:
         return []
-    return [chart("Time and resolution", Axis("megapixels of a picture", 0), Axis("ms a frame", 0), dots=dots)]
+    return [chart("Time and resolution", Axis("megapixels of a picture", 0), Axis("ms a frame", log=True), dots=dots)]
 
 
 def _rate(each_second: float) -> str:
