@@ -188,15 +188,14 @@ def _unlike(one: Scored, other: Scored) -> str:
         return f"other frames were scored, {len(one.frames)} and {len(other.frames)}"
     for group in one.counts:
         true = [_true(scored, group) for scored in (one, other)]
-        if true[0] != true[1]:
-            return f"its truth is another, {true[0]:g} and {true[1]:g} in {group}"
+        if not np.array_equal(true[0], true[1]):
+            return f"its truth is another, {true[0].sum():g} and {true[1].sum():g} in {group}"
     return ""
 
 
-def _true(scored: Scored, group: str) -> float:
-    """How much there truly is: pixels, boxes, frames with the target, places."""
-    counts: Any = scored.counts[group]
-    if group == "tracks":
-        return float(counts.clear.tp + counts.clear.fn)
-    names = {"pixels": ("tp", "fn"), "boxes": ("hit", "missed"), "location": ("targets",)}
-    return float(sum(getattr(counts, name) for name in names.get(group, ("frames",))))
+def _true(scored: Scored, group: str) -> np.ndarray:
+    """(F,) how much there truly is in each frame: pixels, boxes, the target, places."""
+    names = {"pixels": ("tp", "fn"), "boxes": ("hit", "missed"), "tracks": ("tp", "fn"), "location": ("targets",)}
+    columns = [np.nan_to_num(scored.per_frame[group][name]) for name in names.get(group, ("frames",))]
+    total: np.ndarray = np.sum(columns, axis=0)
+    return total
