@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.sinks.whole import cannot_write, write_whole
-from torchvision_dddas.studies.stored import DamagedError, packed, unpacked
+from torchvision_dddas.sinks.whole import cannot_write, remove, write_whole
+from torchvision_dddas.studies.stored import DamagedError, packed, unpacked, whole
 
 Tell = Callable[[str], object]
 
@@ -39,19 +39,23 @@ class Cache:
         return self.folder / key[:2] / f"{key}.npz"
 
     def has(self, key: str) -> bool:
-        """Whether there is an entry, damaged or not."""
-        return self.place(key).is_file()
+        """Whether there is an entry that is whole; one that is damaged is told of and removed."""
+        content = self.content(key)
+        return content is not None and (whole(content) or self._damaged(key))
 
     def get(self, key: str) -> Any | None:
-        """The record of a key; None where there is none, or one that is damaged, which is told."""
+        """The record of a key; None where there is none. One that is damaged is told of and removed."""
         content = self.content(key)
-        if content is None:
-            return None
         try:
-            return unpacked(content)
-        except DamagedError as error:
-            self._tell(f"{self.place(key)} is damaged ({error}): computed again")
+            return None if content is None else unpacked(content)
+        except DamagedError:
+            self._damaged(key)
             return None
+
+    def _damaged(self, key: str) -> bool:
+        self._tell(f"{self.place(key)} is damaged: it is computed again")
+        remove(self.place(key))
+        return False
 
     def content(self, key: str) -> bytes | None:
         """The bytes of an entry, unchecked; None where there is none."""

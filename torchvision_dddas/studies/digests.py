@@ -27,8 +27,8 @@ FINDS = (
 """The files and folders of the package that decide what is found in a clip."""
 
 SCORES = (
-    *("types.py", "picture_bytes.py", "targets", "metrics"),
-    *("studies/scored.py", "studies/scoring.py", "studies/placing_score.py"),
+    *("types.py", "picture_bytes.py", "targets", "metrics", "sinks/tables.py"),
+    *(f"studies/{name}.py" for name in ("scored", "scoring", "placing_score")),
 )
 """Those that decide how right it is."""
 

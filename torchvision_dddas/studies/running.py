@@ -15,7 +15,7 @@ from torchvision_dddas.studies.cache import Cache
 from torchvision_dddas.studies.jobs import Event, cores, share
 from torchvision_dddas.studies.record import TASKS, Case, Results, Spec, Task
 from torchvision_dddas.studies.stages import allowed
-from torchvision_dddas.studies.working import Done, Job, work
+from torchvision_dddas.studies.working import Done, Job, kept, work
 
 Tell = Callable[[Event], object]
 
@@ -101,10 +101,11 @@ def _length(clip: Clip) -> int:
     return clip.truth.frames[-1] if clip.truth is not None and clip.truth.frames else 0
 
 
-def carry_out(planned: Plan, spec: Spec, events: Iterator[Event], cache: Cache, tell: Tell) -> Results:
-    """The results of the jobs' events. tell: is given each event."""
+def _gathered(
+    planned: Plan, spec: Spec, events: Iterator[Event], cache: Cache, tell: Tell, notes: list[str]
+) -> Results:
+    """The results of the jobs' events, each of which is told. notes: what the user should know, added to."""
     became: dict[int, tuple[Done, ...]] = {}
-    notes: list[str] = []
     for event in events:
         if event.note:
             notes.append(event.note)
@@ -159,19 +160,27 @@ def run_study(
     notes: list[str] = []
     store = Cache(cache or cache_folder(), notes.append)
     begun(planned)
-    ordered = order(planned.jobs)
+    events = _events(order(planned.jobs), count, scheduler, store)
+    return _gathered(planned, spec, events, store, tell, notes)
+
+
+def _events(jobs: Sequence[Job], count: int, scheduler: str | None, store: Cache) -> Iterator[Event]:
+    """What becomes of the jobs: those of which all is kept need no worker."""
+    # Files that were never read are read by the workers, which are many.
+    files = digests.Files(store.folder / "files", read=scheduler is not None)
+    waiting: list[Job] = []
+    for job in jobs:
+        done = kept(job, store, files)
+        if done is None:
+            waiting.append(job)
+        else:
+            yield Event(job, tuple(done))
     if scheduler is not None:
         from torchvision_dddas.studies.cluster import spread
 
-        events = spread(ordered, scheduler, store)
-    elif count == 0:
-        events = _here(ordered, store)
+        yield from spread(waiting, scheduler, store)
+    elif count:
+        yield from share(waiting, count, store.folder)
     else:
-        events = share(ordered, count, store.folder)
-    return carry_out(planned, spec, events, store, tell)
-
-
-def _here(jobs: Sequence[Job], store: Cache) -> Iterator[Event]:
-    files = digests.Files(store.folder / "files")
-    for job in jobs:
-        yield Event(job, tuple(work(job, store, files)))
+        files = digests.Files(store.folder / "files")
+        yield from (Event(job, tuple(work(job, store, files))) for job in waiting)

@@ -35,13 +35,17 @@ def packed(record: Any) -> bytes:
     return hashlib.sha256(body).digest() + body
 
 
+def whole(content: bytes) -> bool:
+    """Whether bytes are as they were stored."""
+    return hashlib.sha256(memoryview(content)[32:]).digest() == content[:32]
+
+
 def unpacked(content: bytes) -> Any:
     """The record of such bytes. Raises DamagedError where they are not whole, or of no record that there is."""
-    digest, body = content[:32], content[32:]
-    if hashlib.sha256(body).digest() != digest:
+    if not whole(content):
         raise DamagedError("its digest is another")
     try:
-        with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(content[32:]), allow_pickle=False) as arrays:
             return _record(json.loads(arrays[_CONTENT].tobytes()), arrays)
     except (ValueError, KeyError, TypeError, AttributeError, ImportError, zipfile.BadZipFile) as error:
         raise DamagedError(f"{type(error).__name__}: {error}") from error

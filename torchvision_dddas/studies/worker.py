@@ -35,13 +35,14 @@ def receive(pipe: IO[bytes]) -> Any | None:
     return pickle.loads(content) if len(content) == length else None
 
 
-def one_thread() -> None:
-    """Hold the libraries to one thread, as far as they are loaded."""
+def one_thread(backend: str = "") -> None:
+    """Hold the libraries to one thread; torch where the back end is, or where it is loaded."""
     import cv2
 
     cv2.setNumThreads(1)
-    torch: Any = sys.modules.get("torch")
-    if torch is not None:
+    if backend == "torch":
+        import torch
+
         torch.set_num_threads(1)
 
 
@@ -59,7 +60,6 @@ def main() -> None:
         os._exit(0)  # whoever sent jobs is gone, perhaps killed: nobody would read what comes of this one
 
     threading.Thread(target=listen, daemon=True).start()
-    one_thread()
     from torchvision_dddas.studies.cache import Cache
     from torchvision_dddas.studies.digests import Files
     from torchvision_dddas.studies.pace import Ticker
@@ -77,10 +77,7 @@ def main() -> None:
     say("ready", os.getpid())
     while True:
         job = waiting.get()
-        if job.backend == "torch":
-            import torch
-
-            torch.set_num_threads(1)
+        one_thread(job.backend)
         ticker = Ticker(lambda frames: say("frames", frames))
         done = work(job, cache, files, tick=ticker)
         ticker.flush()
