@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.datasets.annotations import read_rows, text_of
-from torchvision_dddas.datasets.boxes import table_of
+from torchvision_dddas.datasets.boxes import by_frame, table_of
 from torchvision_dddas.datasets.footage import agreed, whole
 from torchvision_dddas.datasets.gathering import folders_in, gather
 from torchvision_dddas.datasets.kinds import Wanted
@@ -102,7 +102,7 @@ def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) ->
     later = benchmark not in ("", "MOT15") or (not benchmark and _columns(path) == len(_COLUMNS))
     name = place.resolve().name
     vehicles = (NON_MOTORIZED,) if (benchmark or name).startswith("MOT20") else ()
-    truth = _with_classes(path, (*DISTRACTORS, *vehicles), least_visibility) if later else _of_2015(path)
+    truth = _with_classes(path, (*DISTRACTORS, *vehicles), least_visibility, frames) if later else _of_2015(path)
     truth = replace(truth, length=frames or truth.length)
     if frames and truth.frames[-1] > frames:
         raise InputError(f"{path} labels frame {truth.frames[-1]}, but the clip has {frames}; is it the same clip?")
@@ -145,7 +145,7 @@ def _of_2015(path: Path) -> Truth:
     return replace(truth, positions=where)
 
 
-def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: float) -> Truth:
+def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: float, length: int) -> Truth:
     rows = read_rows(path, _COLUMNS)
     frame, identity, counts, kind, visibility = (rows.values[:, k] for k in (0, 1, 6, 7, 8))
     table = table_of(path, frame, identity, rows.values[:, 2:6], rows.line)
@@ -154,7 +154,7 @@ def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: fl
     true = (kind == PEDESTRIAN) & (counts != 0) & ~hidden
     if not true.any():
         raise InputError(f"{path} holds no pedestrian that counts")
-    boxes = {int(f): table.box_px[true & (table.frame == f)] for f in np.unique(table.frame)}
+    boxes = by_frame(table.at(true), max(length, int(table.frame.max())))
     return Truth(
         "boxes",
         path,

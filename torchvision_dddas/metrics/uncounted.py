@@ -18,22 +18,22 @@ def counted(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     an ignored one, where `truth.ignoring` is "removed"; and of those that match none, boxes that lie by more than half
     of their area in one of the regions. TrackEval does so for MOTChallenge from 2016 on and for KITTI.
     """
-    counts = np.ones(len(frame), bool)
+    counts: np.ndarray = np.ones(len(frame), bool)
     ignored = truth.ignored if truth.ignoring == "removed" else None
     if ignored is None and truth.regions is None:
         return counts
-    for number in np.unique(frame):
-        rows = np.flatnonzero(frame == number)
-        true, other = truth.boxes.get(int(number), np.zeros((0, 4))), _at(truth.others, number)
-        distracting = _at(ignored, number)
-        labelled = np.concatenate([true, other, distracting])
+    other, distracting, unlabelled = (_by_frame(table) for table in (truth.others, ignored, truth.regions))
+    nothing = np.zeros((0, 4))
+    for number, rows in _rows_by_frame(frame).items():
+        before = [truth.boxes.get(number, nothing), other.get(number, nothing)]
+        labelled = np.concatenate([*before, distracting.get(number, nothing)])
         overlap = iou(labelled, box_px[rows])
         overlap[overlap < LEAST - EPSILON] = 0
         i, j = linear_sum_assignment(overlap, maximize=True)
         i, j = i[overlap[i, j] > 0], j[overlap[i, j] > 0]
-        counts[rows[j[i >= len(true) + len(other)]]] = False
+        counts[rows[j[i >= sum(map(len, before))]]] = False
         rest = np.setdiff1d(rows, rows[j])
-        counts[rest] &= ~within(box_px[rest], _at(truth.regions, number))
+        counts[rest[within(box_px[rest], unlabelled.get(number, nothing))]] = False
     return counts
 
 
@@ -45,9 +45,14 @@ def within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
     side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     inside = np.prod(np.maximum(side, 0), axis=-1)
     share: np.ndarray = inside / np.maximum(np.prod(box_px[:, 2:], axis=1), EPSILON)[:, None]
-    lies: np.ndarray = (share > WITHIN + EPSILON).any(axis=1)
-    return lies
+    return np.asarray((share > WITHIN + EPSILON).any(axis=1))
 
 
-def _at(table: TrackTable | None, frame: int) -> np.ndarray:
-    return np.zeros((0, 4)) if table is None else table.box_px[table.frame == frame]
+def _by_frame(table: TrackTable | None) -> dict[int, np.ndarray]:
+    return {} if table is None else {n: table.box_px[rows] for n, rows in _rows_by_frame(table.frame).items()}
+
+
+def _rows_by_frame(frame: np.ndarray) -> dict[int, np.ndarray]:
+    order = np.argsort(frame, kind="stable")
+    numbers, starts = np.unique(frame[order], return_index=True)
+    return dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True)) if len(frame) else {}
