@@ -2,7 +2,8 @@
 
 Sets results of many kinds against the truth of made-up walkers, and of the sequences under DATA (folders with
 gt/gt.txt in MOTChallenge 2015 text), and compares every figure of every sequence and of all together with what
-TrackEval gives in its own environment. Prints a table; ends with 1 if any figure differs by more than 1e-6.
+TrackEval gives in its own environment: once as `dddas evaluate TRUTH RESULT` reads the files, and once as a study of
+whole data sets scores what it holds. Prints a table; ends with 1 if any figure differs by more than 1e-6.
 """
 
 import argparse
@@ -11,11 +12,17 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.evaluate import evaluate
+from torchvision_dddas.metrics import truth as true_boxes
+from torchvision_dddas.studies.record import Found
+from torchvision_dddas.studies.scoring import as_written, score
+from torchvision_dddas.studies.summary import measures
 
 HERE = Path(__file__).resolve().parent
 PEERS = HERE.parents[1] / ".venv-peers/bin/python"
@@ -39,9 +46,9 @@ def main() -> None:
             found[name]["SORT"] = table
         for ignoring, interval in (("dropped", 1), ("removed", 1), ("dropped", 5)):
             with tempfile.TemporaryDirectory() as folder:
-                theirs, ours = both(Path(folder), truths, found, ignoring, interval)
+                theirs, ours, studied = both(Path(folder), truths, found, ignoring, interval)
             for result, clips in theirs.items():
-                gaps = differences(clips, ours[result])
+                gaps = differences(clips, ours[result]) + differences(clips, studied[result])
                 worst = max([worst, *gaps])
                 print(f"| {label} | {ignoring} | {interval} | {result} | {len(gaps)} | {max(gaps):.1e} |")
             if options.json and label == "made up" and ignoring == "dropped" and interval == 1:
@@ -119,8 +126,8 @@ def results(truth: np.ndarray, seed: int = 0) -> Tables:
     }
 
 
-def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, interval: int) -> tuple[dict, dict]:
-    """TrackEval's figures and ours by result and sequence."""
+def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, interval: int) -> tuple[dict, ...]:
+    """TrackEval's figures, those of our files, and those of our studies, by result and sequence."""
     lengths = {name: int(truth[:, 0].max()) for name, truth in truths.items()}
     for name, truth in truths.items():
         place = folder / "ours" / name / "gt.txt"
@@ -130,7 +137,8 @@ def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, 
             marked[:, 7] = np.where(truth[:, 6] == 0, DISTRACTOR, 1)
         write(folder / "gt" / name / "gt/gt.txt", thinned(marked, interval))
         for result, table in found[name].items():
-            table = np.c_[table[:, :7], np.full((len(table), 3), -1)]
+            # To hundredths of a pixel, as the program writes and a study scores them.
+            table = np.c_[table[:, :2], as_written(table[:, 2:6]), table[:, 6], np.full((len(table), 3), -1)]
             write(folder / "found" / result / f"{name}.txt", table)
             write(folder / "results" / result / "data" / f"{name}.txt", thinned(table, interval))
     (folder / "lengths.json").write_text(json.dumps({n: (f - 1) // interval + 1 for n, f in lengths.items()}))
@@ -143,7 +151,34 @@ def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, 
         report = evaluate(folder / "ours", folder / "found" / result, interval=interval, ignoring=ignoring)
         ours[result] = {name: clip["tracks"] for name, clip in report["clips"].items()}
         ours[result]["COMBINED"] = report["pooled"]["tracks"]
-    return theirs, ours
+    return theirs, ours, {result: studied(folder, result, truths, found, ignoring, interval) for result in theirs}
+
+
+def studied(folder: Path, result: str, truths: Tables, found: dict[str, Tables], ignoring: str, interval: int) -> dict:
+    """The figures of a study by sequence, from tables that it holds."""
+    scored = {}
+    for name, truth in truths.items():
+        known = replace(true_boxes.load(folder / "ours" / name / "gt.txt"), ignoring=ignoring)
+        table = thinned_only(found[name][result], interval)
+        count = len(table)
+        held = Found(
+            table[:, 0].astype(np.int64),
+            table[:, 2:6],
+            table[:, 6],
+            table[:, 1].astype(np.int64),
+            np.full((count, 2), np.nan),
+            np.full((count, 2, 2), np.nan),
+            np.arange(1, int(truth[:, 0].max()) + 1, interval),
+        )
+        scored[name] = score(Clip(name, folder, truth=known), "tracking", held, interval)
+    figures = {name: measures([one])["tracks"] for name, one in scored.items()}
+    return figures | {"COMBINED": measures([scored[name] for name in sorted(scored)])["tracks"]}
+
+
+def thinned_only(table: np.ndarray, interval: int) -> np.ndarray:
+    """Every interval-th frame, in order, with its own number."""
+    kept = table[(table[:, 0] - 1) % interval == 0]
+    return kept[np.argsort(kept[:, 0], kind="stable")]
 
 
 def thinned(table: np.ndarray, interval: int) -> np.ndarray:
