@@ -7,6 +7,9 @@ import pytest
 from tests.browser import Browser, chromium
 from tests.sinks.studied import HOSTILE, study
 from torchvision_dddas.sinks.journal import finite
+from torchvision_dddas.sinks.page import SCRIPT
+from torchvision_dddas.sinks.page import page as page_of
+from torchvision_dddas.sinks.page_tables import Column, figure, sorted_table, words
 from torchvision_dddas.sinks.study_report import report
 from torchvision_dddas.studies.summary import summary
 
@@ -161,9 +164,6 @@ def test_a_name_that_looks_like_code_stays_a_name(browser, page):
 
 
 def test_rows_of_a_long_table_can_be_sought(browser, tmp_path):
-    from torchvision_dddas.sinks.page import SCRIPT, page
-    from torchvision_dddas.sinks.page_tables import Column, figure, sorted_table, words
-
     rows = [[words(f"clip {k}"), figure(k / 40)] for k in range(40)]
     text = page(
         "many", [f"<div>{sorted_table('many', [Column('clip', text=True), Column('F')], rows)}</div>"], script=SCRIPT
@@ -178,3 +178,18 @@ def test_rows_of_a_long_table_can_be_sought(browser, tmp_path):
     browser.click("thead th:nth-child(1) button")
     browser.click("thead th:nth-child(1) button")
     assert browser.value(shown)[0] == "clip 39"  # as numbers go, not letters
+
+
+def test_a_tall_table_keeps_its_headings_and_what_belongs_to_all_in_sight(browser, tmp_path):
+    rows = [[words(f"clip {k}"), figure(k / 400)] for k in range(400)]
+    columns = [Column("clip", text=True), Column("F")]
+    table = sorted_table("many", columns, rows, [[words("pooled"), figure(0.5)]])
+    path = tmp_path / "tall.html"
+    path.write_text(page_of("tall", [f"<div>{table}</div>"]), encoding="utf-8")
+    browser.open(path)
+    assert browser.value("document.documentElement.scrollHeight") <= 1200
+    browser.value("document.querySelector('.wide').scrollTop=5000")
+    inside = """(function(){var w=document.querySelector('.wide').getBoundingClientRect();
+      return ['thead th','tfoot th'].map(function(s){var r=document.querySelector(s).getBoundingClientRect();
+      return r.top>=w.top-1&&r.bottom<=w.bottom+1;});})()"""
+    assert browser.value(inside) == [True, True]

@@ -14,6 +14,7 @@ from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.sinks.journal import finite
 from torchvision_dddas.sinks.study_report import report
+from torchvision_dddas.sinks.study_report.curves import MOST_FAINT, ranked_charts
 from torchvision_dddas.sinks.study_report.pictures import (
     FALSE,
     HIT,
@@ -224,3 +225,11 @@ def test_a_video_gives_the_frames_that_were_asked_for(tmp_path):
 def test_matched_boxes_are_those_that_are_counted():
     overlap = np.array([[0.9, 0.6], [0.8, 0.0]])
     assert matched(np.zeros((2, 4)), np.zeros((2, 4)), overlap).tolist() == [0, -1]
+
+
+def test_curves_of_many_clips_are_bounded_and_say_so(tmp_path):
+    case = tracked_clip(tmp_path, "people", "x")
+    many = [replace(case, clip=replace(case.clip, name=f"clip {k}")) for k in range(100)]
+    first, second = ranked_charts(many)
+    assert first.count('class="faint') == second.count('class="faint') == MOST_FAINT
+    assert f"{MOST_FAINT} of 100 clips" in first and "all clips" in first

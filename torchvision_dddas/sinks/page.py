@@ -25,10 +25,13 @@ nav{display:flex;flex-wrap:wrap;gap:4px 16px;margin:10px 0 0}
 .card{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px 16px}
 .card h3{margin:0;font-size:14px;color:var(--soft);font-weight:600}
 .card .big{font-size:32px;line-height:1.15;margin:4px 0 6px;font-weight:600;font-variant-numeric:tabular-nums}
-.card .big span{font-size:15px;line-height:1.3;display:inline-block;font-weight:400;color:var(--soft)}
+.card .big span{font-size:15px;line-height:1.3;display:block;font-weight:400;color:var(--soft)}
 .card p{margin:2px 0;font-size:14px}
 .wide{overflow-x:auto;margin:0 0 6px;border:1px solid var(--line);border-radius:8px}
-table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:14px;overflow-wrap:normal}
+.tall{max-height:min(75vh,900px);overflow-y:auto;content-visibility:auto;contain-intrinsic-size:auto 640px}
+.tall thead th{position:sticky;top:0;z-index:1}.tall thead tr>:first-child{z-index:2}
+.tall tfoot{position:sticky;bottom:0;z-index:1}
+table{border-collapse:separate;border-spacing:0;width:100%;font-variant-numeric:tabular-nums;font-size:14px;overflow-wrap:normal}
 th,td{text-align:right;padding:5px 12px;border-bottom:1px solid var(--line);white-space:nowrap;vertical-align:top}
 tbody tr:last-child>*{border-bottom:0}tfoot tr:first-child>*{border-top:2px solid var(--line)}
 tfoot tr:last-child>*{border-bottom:0}tfoot th,tfoot td{background:var(--card)}
@@ -70,7 +73,7 @@ ul{padding-left:20px;margin:4px 0 12px}
  thead button,thead th>span{padding:5px 8px}
  .wide tr>:first-child{min-width:8.5em;max-width:42vw;white-space:normal;overflow-wrap:anywhere}
  .card .big{font-size:28px}}
-@media print{body{max-width:none}.wide{overflow:visible}}
+@media print{body{max-width:none}.wide{overflow:visible;max-height:none;content-visibility:visible}}
 """ + "".join(
     f"svg .c{k}{{stroke:var(--c{k})}}svg .f{k}{{fill:var(--c{k});stroke:none}}svg text.f{k}{{fill:var(--c{k})}}"
     for k in range(1, SERIES + 1)

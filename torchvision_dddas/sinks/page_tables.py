@@ -9,6 +9,10 @@ NOTHING = "–"
 """What stands where there is no value."""
 
 
+TALL = 30
+"""A table of more rows scrolls in a window of its own, so that the page stays short and opens at once."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """What stands in a table. value: what it sorts by, None for last. small: below it. link: an address."""
@@ -71,9 +75,10 @@ def sorted_table(
     body = "".join(f"<tr>{_row(row, columns)}</tr>" for row in rows)
     below = f"<tfoot>{''.join(f'<tr>{_row(row, columns)}</tr>' for row in foot)}</tfoot>" if foot else ""
     kind = ' class="sorts"' if sorts else ""
+    region = "wide tall" if len(rows) > TALL else "wide"
     # The region can be scrolled by keys where the table is wider than the page.
     return (
-        f'<div class="wide" role="region" tabindex="0" aria-label="{escape(caption)}">'
+        f'<div class="{region}" role="region" tabindex="0" aria-label="{escape(caption)}">'
         f'<table{kind} aria-label="{escape(caption)}">'
         f"<thead><tr>{''.join(heads)}</tr></thead><tbody>{body}</tbody>{below}</table></div>"
     )

@@ -12,6 +12,8 @@ from torchvision_dddas.studies.scored import Scored
 
 MOST_CLIPS = 6
 """Clips whose course is drawn."""
+MOST_FAINT = 40
+"""Curves of single clips behind that of all."""
 _BINS = 80
 _LEAST, _MOST = 0.01, 10.0
 """False positives an image from which and up to which misses are drawn."""
@@ -27,10 +29,12 @@ def ranked_charts(cases: Sequence[Case]) -> list[str]:
         if not each:
             continue
         exact, missing = [], []
-        for k, (name, scored) in enumerate([*each, (_ALL, None)] if len(each) > 1 else each):
+        shown = each[:MOST_FAINT]
+        several = "each clip" if len(shown) == len(each) else f"{len(shown)} of {len(each)} clips"
+        for k, (name, scored) in enumerate([*shown, (_ALL, None)] if len(each) > 1 else each):
             whole = scored is None or len(each) == 1
             taken = [one for _, one in each] if scored is None else [scored]
-            said = name if whole else "each clip" if k == 0 else ""
+            said = name if whole else several if k == 0 else ""
             colour = 1 if whole else 6
             precision, recall, false = _rates(taken, group)
             # Both curves go on to where nothing is found, and the second to where no more can be had.
