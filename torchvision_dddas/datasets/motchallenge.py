@@ -10,7 +10,7 @@
 The folder is a sequence, or holds some, or holds train/ and test/ that do. What counts is what counts for TrackEval.
 2015: rows marked 0 are as if not there. Later: pedestrians (class 1) not marked 0; found boxes on persons on vehicles
 (2), who stand for ever (7), on distractors (8), reflections (12), and in 2020 vehicles without a motor (6), are taken
-out. Frames of all classes take part in the matching that finds those.
+out. Boxes of all classes take part in the matching that finds those.
 
 Terms, as its makers state them: CC BY-NC-SA 3.0; cite the paper of the year.
 """
