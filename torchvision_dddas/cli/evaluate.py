@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,17 +20,25 @@ if TYPE_CHECKING:
 COLUMNS = {
     "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
     "boxes": ("f1", "precision", "recall"),
+    "ranking": ("ap", "log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1"),
     "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
     "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
     "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
+    "still": ("false_blobs_per_frame", "alarmed"),
+    "location": ("located", "belongs"),
+    "metres": ("median_m", "mean_m", "p95_m", "in_ellipse", "relative_median_m", "relative_in_ellipse"),
 }
 
 TITLES = {
     "pixels": "Pixels",
     "boxes": "Boxes, IoU ≥ 0.5",
+    "ranking": "Boxes by score",
     "target": "One labelled target",
     "tracks": "Tracks",
     "target_track": "The labelled target's track, IoU ≥ 0.3",
+    "still": "Clips in which nothing moves",
+    "location": "Places",
+    "metres": "Errors of places; relative to the team of landmarks",
 }
 
 # Headings that fit a terminal of 80 columns beside the clips' names.
@@ -51,6 +60,19 @@ SHORT = {
     "same_identity": "same identity",
     "n_switches": "IDsw",
     "n_fragmentations": "frag.",
+    "ap": "AP",
+    "log_average_miss_rate": "LAMR",
+    "miss_rate_at_0.1": "miss at 0.1",
+    "miss_rate_at_1": "miss at 1",
+    "false_blobs_per_frame": "blobs a frame",
+    "alarmed": "frames with any",
+    "belongs": "somebody's",
+    "median_m": "median m",
+    "mean_m": "mean m",
+    "p95_m": "95 % m",
+    "in_ellipse": "in ellipse",
+    "relative_median_m": "rel. median m",
+    "relative_in_ellipse": "rel. in ellipse",
 }
 
 
@@ -80,6 +102,10 @@ def evaluate(
     ] = None,
     jobs: Annotated[
         int | None, typer.Option(metavar="N", help="Of a study: processes of one thread each. [default: one a core]")
+    ] = None,
+    together: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Of a study with torch: clips of one size at once, for a GPU. [default: 1]"),
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a study: a Dask scheduler, such as tcp://host:8786.")
@@ -116,6 +142,7 @@ def evaluate(
     With --dataset the clips of whole data sets are run and scored; metrics.json, report.html and run.json are written.
     """
     study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
+    study["--together"] = together
     study |= {"--config": config, "--set": set_ or None, "--backend": backend}
     if dataset is not None:
         _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
@@ -123,12 +150,16 @@ def evaluate(
 
         if jobs is not None and jobs < 1:
             raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
+        if together is not None and (together < 1 or scheduler is not None):
+            raise InputError(f"--together is {together}; wanted 1 or more clips, and no --scheduler")
         if jobs is not None and scheduler is not None:
             raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
         folder = out or Path("dddas-study")
         spec = whole.asked(dataset, config, set_ or [], backend and backend.value, interval)
         patterns = [text.strip() for text in (clips or "").split(",") if text.strip()]
-        results, measures = whole.study_into(folder, spec, dataset.parent, jobs, scheduler, cache, patterns, quiet)
+        results, measures = whole.study_into(
+            folder, spec, dataset.parent, jobs, scheduler, cache, patterns, quiet, together or 1
+        )
         if not quiet:
             whole.show(results, measures, folder)
         return
@@ -202,7 +233,15 @@ def _table(report: dict[str, Any], group: str) -> "Table":
         table.add_section()
         for name in ("pooled", "mean"):
             table.add_row(name, "", *(_cell(report[name].get(group, {}).get(c, math.nan)) for c in COLUMNS[group]))
+        spans = report["pooled"].get("intervals", {}).get(group, {})
+        if any(spans.values()):
+            over = report["pooled"]["over"][group]
+            table.add_row(f"95 %, over {over}", "", *(_span(spans.get(c)) for c in COLUMNS[group]))
     return table
+
+
+def _span(ends: Sequence[float] | None) -> str:
+    return "" if ends is None else f"{ends[0]:.2f}–{ends[1]:.2f}"
 
 
 def _cell(value: float) -> str:

@@ -1,7 +1,6 @@
 """`dddas evaluate --dataset`: a study of whole data sets, its tables, its report and what it cost."""
 
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -43,6 +42,7 @@ def study_into(
     cache: Path | None = None,
     clips: Sequence[str] = (),
     quiet: bool = False,
+    together: int = 1,
 ) -> tuple["Results", dict[str, Any]]:
     """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
     from torchvision_dddas.sinks.journal import finite
@@ -55,7 +55,7 @@ def study_into(
         _write(folder, "run.json", {"state": "running", "study": spec.name})
         try:
             with _shown(quiet) as (begun, tell):
-                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begun)
+                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begun, together)
         except BaseException:
             _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
             raise
@@ -209,16 +209,14 @@ def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
     """Print the measures of each task in short, what was left out, and where the rest is."""
     from rich.console import Console
 
+    from torchvision_dddas.cli.study_tables import tables
+
     console = Console() if sys.stdout.isatty() else Console(width=120)
-    for task in measures.get("tasks", {}):
-        console.print(f"{task}", highlight=False)
+    for table in tables(measures):
+        console.print(table)
     for line in results.left_out:
         console.print(f"left out: {line}", markup=False, highlight=False)
+    kept = sum(1 for case in results.cases if not case.cause)
+    typer.echo(f"{kept} of {len(results.cases)} cases scored, {results.facts['computed']} stages computed")
     made = [name for name in FILES if (folder / name).is_file()]
     typer.echo(f"{folder}: {', '.join(made)}")
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, int):
-        return str(value)
-    return "–" if value is None or math.isnan(value) else f"{value:.3f}"

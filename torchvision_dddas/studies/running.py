@@ -10,7 +10,7 @@ from typing import Any
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import Settings, load
-from torchvision_dddas.studies import digests
+from torchvision_dddas.studies import digests, lockstep
 from torchvision_dddas.studies.cache import Cache
 from torchvision_dddas.studies.jobs import Event, cores, share
 from torchvision_dddas.studies.record import TASKS, Case, Results, Spec, Task
@@ -146,11 +146,13 @@ def run_study(
     clips: Sequence[str] = (),
     tell: Tell = lambda event: None,
     begun: Callable[[Plan], object] = lambda planned: None,
+    together: int = 1,
 ) -> Results:
     """Run a study. base: what its folders are relative to; jobs: worker processes, 0 for none but this one.
 
     scheduler: the address of a Dask scheduler, whose workers do the work. cache: the folder where results are kept.
-    clips: patterns of names. begun: is told what will be done. The results depend on none of these but the clips.
+    clips: patterns of names. begun: is told what will be done. together: clips of one size that this process takes
+    through torch at once, before the others share the rest. The results depend on none of these but the clips.
     Raises InputError as `plan` does, and where the scheduler cannot be reached.
     """
     count = cores() if jobs is None else jobs
@@ -160,11 +162,13 @@ def run_study(
     notes: list[str] = []
     store = Cache(cache or cache_folder(), notes.append)
     begun(planned)
-    events = _events(order(planned.jobs), count, scheduler, store)
+    events = _events(order(planned.jobs), count, scheduler, store, together, notes)
     return _gathered(planned, spec, events, store, tell, notes)
 
 
-def _events(jobs: Sequence[Job], count: int, scheduler: str | None, store: Cache) -> Iterator[Event]:
+def _events(
+    jobs: Sequence[Job], count: int, scheduler: str | None, store: Cache, together: int, notes: list[str]
+) -> Iterator[Event]:
     """What becomes of the jobs: those of which all is kept need no worker."""
     # Files that were never read are read by the workers, which are many.
     files = digests.Files(store.folder / "files", read=scheduler is not None)
@@ -179,7 +183,10 @@ def _events(jobs: Sequence[Job], count: int, scheduler: str | None, store: Cache
         from torchvision_dddas.studies.cluster import spread
 
         yield from spread(waiting, scheduler, store)
-    elif count:
+        return
+    if together > 1:
+        lockstep.motion_ahead(waiting, store, together, notes.append)
+    if count:
         yield from share(waiting, count, store.folder)
     else:
         files = digests.Files(store.folder / "files")
