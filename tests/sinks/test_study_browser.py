@@ -165,7 +165,7 @@ def test_a_name_that_looks_like_code_stays_a_name(browser, page):
 
 def test_rows_of_a_long_table_can_be_sought(browser, tmp_path):
     rows = [[words(f"clip {k}"), figure(k / 40)] for k in range(40)]
-    text = page(
+    text = page_of(
         "many", [f"<div>{sorted_table('many', [Column('clip', text=True), Column('F')], rows)}</div>"], script=SCRIPT
     )
     path = tmp_path / "many.html"
