@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,25 +19,17 @@ if TYPE_CHECKING:
 COLUMNS = {
     "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
     "boxes": ("f1", "precision", "recall"),
-    "ranking": ("ap", "log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1"),
     "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
     "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
     "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
-    "still": ("false_blobs_per_frame", "alarmed"),
-    "location": ("located", "belongs"),
-    "metres": ("median_m", "mean_m", "p95_m", "in_ellipse", "relative_median_m", "relative_in_ellipse"),
 }
 
 TITLES = {
     "pixels": "Pixels",
     "boxes": "Boxes, IoU ≥ 0.5",
-    "ranking": "Boxes by score",
     "target": "One labelled target",
     "tracks": "Tracks",
     "target_track": "The labelled target's track, IoU ≥ 0.3",
-    "still": "Clips in which nothing moves",
-    "location": "Places",
-    "metres": "Errors of places; relative to the team of landmarks",
 }
 
 # Headings that fit a terminal of 80 columns beside the clips' names.
@@ -60,19 +51,6 @@ SHORT = {
     "same_identity": "same identity",
     "n_switches": "IDsw",
     "n_fragmentations": "frag.",
-    "ap": "AP",
-    "log_average_miss_rate": "LAMR",
-    "miss_rate_at_0.1": "miss at 0.1",
-    "miss_rate_at_1": "miss at 1",
-    "false_blobs_per_frame": "blobs a frame",
-    "alarmed": "frames with any",
-    "belongs": "somebody's",
-    "median_m": "median m",
-    "mean_m": "mean m",
-    "p95_m": "95 % m",
-    "in_ellipse": "in ellipse",
-    "relative_median_m": "rel. median m",
-    "relative_in_ellipse": "rel. in ellipse",
 }
 
 
@@ -233,15 +211,7 @@ def _table(report: dict[str, Any], group: str) -> "Table":
         table.add_section()
         for name in ("pooled", "mean"):
             table.add_row(name, "", *(_cell(report[name].get(group, {}).get(c, math.nan)) for c in COLUMNS[group]))
-        spans = report["pooled"].get("intervals", {}).get(group, {})
-        if any(spans.values()):
-            over = report["pooled"]["over"][group]
-            table.add_row(f"95 %, over {over}", "", *(_span(spans.get(c)) for c in COLUMNS[group]))
     return table
-
-
-def _span(ends: Sequence[float] | None) -> str:
-    return "" if ends is None else f"{ends[0]:.2f}–{ends[1]:.2f}"
 
 
 def _cell(value: float) -> str:
