@@ -20,7 +20,8 @@ def record() -> Scored:
 def test_what_was_kept_is_found_again_by_its_key_alone(tmp_path) -> None:
     Cache(tmp_path).put(KEY, record())
     again = Cache(tmp_path)
-    assert again.has(KEY) and (again.get(KEY).frames == np.arange(3)).all()
+    known = again.get(KEY)
+    assert again.has(KEY) and known is not None and (known.frames == np.arange(3)).all()
     assert not again.has(KEY[::-1]) and again.get(KEY[::-1]) is None
 
 
@@ -64,7 +65,8 @@ def test_what_travels_with_a_job_is_used_and_what_it_makes_comes_back() -> None:
     there.put(KEY, record())
     (content,) = there.made.values()
     back = Carried({KEY: content})
-    assert (back.get(KEY).frames == np.arange(3)).all() and back.made == {}
+    known = back.get(KEY)
+    assert known is not None and (known.frames == np.arange(3)).all() and back.made == {}
     assert Carried({KEY: content[:-1]}).get(KEY) is None
 
 

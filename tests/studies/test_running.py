@@ -69,8 +69,13 @@ def test_no_worker_is_started_where_all_is_kept(tmp_path, monkeypatch) -> None:
     for path in (tmp_path / "clips").rglob("*.*"):
         os.utime(path, (1e9, 1e9))
     first = run_study(spec, tmp_path, jobs=0, cache=tmp_path / "cache")
-    shared = []
-    monkeypatch.setattr(running, "share", lambda jobs, *more: shared.extend(jobs) or iter(()))
+    shared: list[str] = []
+
+    def share(jobs, *more):
+        shared.extend(job.clip.name for job in jobs)
+        yield from ()
+
+    monkeypatch.setattr(running, "share", share)
     again = run_study(spec, tmp_path, jobs=2, cache=tmp_path / "cache")
     assert shared == []
     assert again.facts["computed"] == 0 < first.facts["computed"]

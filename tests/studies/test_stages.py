@@ -49,7 +49,7 @@ def test_motion_is_what_the_loop_finds(clips) -> None:
         assert (found.box_px[rows] == scene.detections.box_px).all()
         assert (found.score[rows] == scene.detections.score).all()
         mask = decoded(found.masks[scene.frame.number], cv2.IMREAD_UNCHANGED)
-        assert ((mask > 0) == (scene.mask > 0)).all()
+        assert mask is not None and np.array_equal(mask > 0, scene.mask > 0)
 
 
 def test_masks_are_kept_of_frames_that_the_truth_labels_alone(clips) -> None:

@@ -9,13 +9,13 @@ import pytest
 from tests.studies import world
 from torchvision_dddas.datasets.kinds import read
 from torchvision_dddas.settings import load
-from torchvision_dddas.studies import working
+from torchvision_dddas.studies import digests, working
 from torchvision_dddas.studies.cache import Cache
 from torchvision_dddas.studies.digests import Files
-from torchvision_dddas.studies.record import Source
+from torchvision_dddas.studies.record import Source, Task
 from torchvision_dddas.studies.working import Job, kept, work
 
-TASKS = ("motion", "tracking", "association")
+TASKS: tuple[Task, ...] = ("motion", "tracking", "association")
 ALL = ["motion", "motion: score", "tracking", "tracking: score", "association", "association: score"]
 
 
@@ -89,7 +89,7 @@ def test_a_changed_truth_scores_again_and_finds_again_only_what_was_made_of_it(f
 
 
 def test_other_code_computes_all_again(folder, monkeypatch) -> None:
-    monkeypatch.setattr(working.digests, "code", lambda which, backend="": f"another {len(which)}")
+    monkeypatch.setattr(digests, "code", lambda which, backend="": f"another {len(which)}")
     assert computed(folder, job_of(folder)) == ALL
 
 
@@ -121,7 +121,7 @@ def test_a_fault_of_the_program_is_a_cause_with_its_trace(folder, monkeypatch) -
         raise KeyError("x")
 
     monkeypatch.setattr(working, "find", broken)
-    monkeypatch.setattr(working.digests, "code", lambda which, backend="": "third")
+    monkeypatch.setattr(digests, "code", lambda which, backend="": "third")
     done = work(job_of(folder), Cache(folder / "cache"), Files(None))
     assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
 

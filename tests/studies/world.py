@@ -14,7 +14,7 @@ def film(seed: int, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(seed)
     width, height = SIZE
     ground = cv2.GaussianBlur(rng.integers(0, 256, (height + 100, width + 100, 3), dtype=np.uint8), (0, 0), 1.5)
-    ground = cv2.normalize(ground, None, 20, 200, cv2.NORM_MINMAX)
+    ground = np.interp(ground, (ground.min(), ground.max()), (20, 200)).astype(np.uint8)
     places = rng.uniform((60, 40), (120, 90), (2, 2))
     speeds = np.array([[5.0, 0.0], [0.0, -4.0]])
     for k in range(frames):

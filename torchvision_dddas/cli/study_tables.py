@@ -83,9 +83,9 @@ def _worth(value: float | None, group: str) -> float:
     return -value if group in ("still", "metres") else value
 
 
-def cell(value: float | None) -> str:
+def cell(value: float | int | None) -> str:
     """A figure for a reader."""
-    if isinstance(value, int):
+    if type(value) is int:
         return str(value)
     return "–" if value is None or math.isnan(value) else f"{value:.3f}"
 

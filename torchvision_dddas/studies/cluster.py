@@ -131,7 +131,7 @@ class _Cluster:
 
     def _free(self) -> str:
         """The worker with the most threads that have nothing to do; empty where none has."""
-        busy = {address: 0 for address in self.ours}
+        busy = dict.fromkeys(self.ours, 0)
         for _, address in self.running.values():
             busy[address] = busy.get(address, 0) + 1
         idle = {address: threads - busy[address] for address, threads in self.ours.items()}
@@ -143,7 +143,7 @@ class _Cluster:
         keys = Keys(job, files)
         for task in ("motion", *job.tasks):
             try:
-                wanted = (keys.found(task), keys.scored(task))  # type: ignore[arg-type]
+                wanted = (keys.found(task), keys.scored(task))
             except InputError:
                 continue  # the worker will say so
             known |= {key: content for key in wanted if (content := self.cache.content(key)) is not None}

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +39,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def share(jobs: Sequence[Job], workers: int, cache: Path) -> Iterator[Event]:
+def share(jobs: Sequence[Job], workers: int, cache: Path) -> Generator[Event, None, None]:
     """Do jobs in the order given, so many at once, each in a process of its own; events as they come.
 
     cache: the folder where results are kept, and taken from. The results do not depend on the number of workers.
