@@ -1,0 +1,1 @@
+"""Tuning of knobs by gradient: examples of what is true, losses on them, descent, and what it was worth."""

@@ -1,0 +1,86 @@
+"""What a family of knobs has to offer to be tuned: examples of what is true, and a loss on them that has a gradient.
+
+A family is a stage of the pipeline together with those of its knobs that a gradient can move (`modules.tunable`). The
+loop of `descent` knows nothing else of it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.studies.record import Task
+
+Tick = Callable[[], object]
+
+FAMILIES: Mapping[str, str] = {
+    "motion": "masks",
+    "tracking": "identities",
+    "people": "recognition",
+    "location": "places",
+}
+"""Family, as `modules.tunable` names it -> the module of this folder whose function `family()` makes it."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One piece of what is true. clip, frame: what messages name. content: what the family's loss takes, on the CPU."""
+
+    clip: str
+    frame: int
+    content: Any
+
+
+class Family(Protocol):
+    """A stage of the pipeline, as far as it can be tuned."""
+
+    @property
+    def name(self) -> str:
+        """One of FAMILIES."""
+        ...
+
+    @property
+    def task(self) -> Task:
+        """The task of a study that its knobs matter for: its clips are tuned on, and it measures before and after."""
+        ...
+
+    @property
+    def measure(self) -> str:
+        """What is told before and after, as `dddas sweep --measure` takes it: motion.pixels.f. Hard operations."""
+        ...
+
+    @property
+    def softness(self) -> tuple[float, float]:
+        """At the first and the last step; the steps between go evenly in the logarithm. No unit: 1 is very soft."""
+        ...
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """What is true of some clips, each clip's in the order of its frames, prepared once by the hard operations.
+
+        tick: called once an example. Raises InputError in one line where a clip lacks the truth that the loss needs.
+        """
+        ...
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """How wrong each example is: (B,), least is best, with a gradient in the knobs; on the knobs' device.
+
+        knobs: values in the units of `settings`, scalars or (n,), by name: those tuned alone; what is not tuned is as
+        in the settings that the examples were prepared with. The result depends on nothing but the arguments.
+        """
+        ...
+
+
+def family_of(name: str) -> Family:
+    """The family of a name. Raises InputError where there is none."""
+    module = f"{__package__}.{FAMILIES[name]}" if name in FAMILIES else ""
+    if not module or find_spec(module) is None:
+        known = [known for known, file in FAMILIES.items() if find_spec(f"{__package__}.{file}") is not None]
+        raise InputError(f"'{name}' is no family of knobs that can be tuned; wanted one of {', '.join(known)}")
+    found: Family = import_module(module).family()
+    return found
