@@ -201,18 +201,29 @@ def test_an_ellipse_that_is_too_small_does_not_hold_the_truth(tmp_path):
 
 def test_the_error_relative_to_the_team_is_what_the_landmarks_do_not_share(tmp_path):
     clip, found = located(tmp_path, off=(3.0, 4.0))
-    truth = clip.truth.positions
+    assert clip.truth is not None
+    known = clip.truth.positions
+    fleet = Positions(*(column[known.identity == 9] for column in (known.frame, known.identity, known.east_north_m)))
     marks = [
-        f"{f},rover,{e + 3.0:.6f},{n + 3.0:.6f}"
-        for f, who, (e, n) in zip(truth.frame, truth.identity, truth.east_north_m, strict=True)
-        if who == 9
+        f"{f},rover,{e + 3.0:.6f},{n + 3.0:.6f}" for f, (e, n) in zip(fleet.frame, fleet.east_north_m, strict=True)
     ]
     (tmp_path / "landmarks.csv").write_text("frame,landmark,east_m,north_m\n" + "\n".join(marks) + "\n")
     found = replace(found, more={"relative_m2": np.broadcast_to(np.eye(2), (21, 2, 2))})
-    one = score(replace(clip, landmarks=tmp_path / "landmarks.csv"), "location", found)
+    clip = replace(clip, landmarks=tmp_path / "landmarks.csv")
+    assert np.isnan(score(clip, "location", found).samples["relative_error_m"]).all()  # nobody knows where it was
+    one = score(replace(clip, truth=replace(clip.truth, fleet=fleet)), "location", found)
     assert one.samples["error_m"] == pytest.approx(np.full(20, 5.0))
     assert one.samples["relative_error_m"] == pytest.approx(np.full(20, 1.0))
     assert one.samples["relative_inside"].tolist() == [1] * 20
+
+
+def test_a_place_of_a_target_that_does_not_count_is_neither_right_nor_nobodys(tmp_path):
+    clip, found = located(tmp_path)
+    assert clip.truth is not None
+    tracks = clip.truth.tracks
+    mine, other = (tracks.at(tracks.identity == who) for who in (1, 2))
+    one = score(replace(clip, truth=replace(clip.truth, tracks=mine, ignored=other)), "location", found)
+    assert counts(one, "location") == (10, 10, 1)
 
 
 def test_degrees_are_compared_where_both_sides_count_metres_from_origins_of_their_own(tmp_path):

@@ -61,18 +61,20 @@ def _truth(place: Path, frames: int) -> Truth:
     shown = Truth("masks", place, truths.load(place / "masks", 1).masks, {}) if (place / "masks").is_dir() else followed
     if not shown.masks and empty:
         raise InputError(f"{place}: nothing to find shows in the pictures")
+    positions, fleet = _positions(place / "positions.csv")
     return replace(
         shown,
         boxes=followed.boxes,
         tracks=followed.tracks,
         ignored=followed.ignored,
         length=frames,
-        positions=_positions(place / "positions.csv"),
+        positions=positions,
+        fleet=fleet,
     )
 
 
-def _positions(path: Path) -> Positions:
-    """The places of the targets that show, without the ground vehicles. Raises InputError."""
+def _positions(path: Path) -> tuple[Positions, Positions]:
+    """The places of the targets that show, and of the ground vehicles, which are the landmarks. Raises InputError."""
     said = read_positions(path)
     with opened(path, "positions") as (header, lines):
         if lacking := [name for name in ("kind", "visible_px") if name not in header]:
@@ -80,9 +82,14 @@ def _positions(path: Path) -> Positions:
         cells = [line.cells for line in lines]
     frame, kind, shown = (header.index(name) for name in ("frame", "kind", "visible_px"))
     cells.sort(key=lambda row: float(row[frame]))  # a stable sort, as that of the reader
-    kept = np.array([row[kind] != "ugv" and row[shown] not in ("", "0") for row in cells], bool)
-    degrees = None if said.lonlat_deg is None else said.lonlat_deg[kept]
-    return Positions(said.frame[kept], said.target[kept], said.east_north_m[kept], degrees)
+    fleet = np.array([row[kind] == "ugv" for row in cells], bool)
+    shows = np.array([row[shown] not in ("", "0") for row in cells], bool)
+
+    def only(rows: np.ndarray) -> Positions:
+        degrees = None if said.lonlat_deg is None else said.lonlat_deg[rows]
+        return Positions(said.frame[rows], said.target[rows], said.east_north_m[rows], degrees)
+
+    return only(shows & ~fleet), only(fleet)
 
 
 def _rate(path: Path) -> float | None:

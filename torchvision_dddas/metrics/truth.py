@@ -50,7 +50,8 @@ class Truth:
     """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
 
     tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
-    length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown.
+    length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown;
+    fleet: the same of the landmarks, by numbers of their own.
     ignoring: what becomes of a found box on an ignored one (see `matching.pair`). others: boxes that are neither true
     nor ignored but may take a found box in that. regions: where nobody labelled; identities mean nothing there. See
     `uncounted.counted` for all three.
@@ -65,6 +66,7 @@ class Truth:
     length: int = 0
     labels: Labels = Labels()
     positions: Positions | None = None
+    fleet: Positions | None = None
     ignoring: Ignoring = "dropped"
     others: TrackTable | None = None
     regions: TrackTable | None = None

@@ -6,8 +6,9 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import metres
+from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.metrics.metres import Located
-from torchvision_dddas.metrics.truth import Positions
+from torchvision_dddas.metrics.truth import Positions, Truth
 from torchvision_dddas.studies.scored import Scored
 from torchvision_dddas.targets import geodesy
 
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.datasets.record import Clip
     from torchvision_dddas.studies.record import Found
 
-MarkPlaces = tuple[np.ndarray, np.ndarray, np.ndarray]
+_NOBODY, _NOT_ASKED = -1, -2
+"""In place of a row: a place that is nobody's; one of a target that does not count."""
 
 
 def score_places(clip: "Clip", found: "Found") -> Scored:
@@ -23,49 +25,44 @@ def score_places(clip: "Clip", found: "Found") -> Scored:
 
     A place is that of the target whose true box its box is; without boxes, that of the target nearest to it. Degrees
     are compared where both sides have them, for each may count its metres from an origin of its own. The error
-    relative to the team is what is left without the mean error of the landmarks' own reports.
+    relative to the team is what is left without the mean error of the landmarks' own reports, where the truth knows
+    where they were.
     Raises InputError where the truth has no places, or none of a frame that was looked at.
     """
     truth = clip.truth
     if truth is None or truth.positions is None:
         raise InputError(f"{clip.name} has no true places; nothing can be scored in metres")
-    true_m, place_m, marks = _in_metres(clip, truth.positions, found)
+    origin = _origin(truth.positions, found)
+    true_m = _in_metres(truth.positions, origin)
+    place_m = found.east_north_m if origin is None else geodesy.east_north(found.more["lonlat_deg"], origin)
     seen = np.isin(truth.positions.frame, found.looked)
     if not seen.any():
         raise InputError(f"{clip.name}: no frame that was looked at has a true place")
     rows = np.flatnonzero(np.isfinite(place_m).all(axis=1))
-    frame, notes = found.frame[rows], []
-    boxes = truth.tracks if truth.tracks is not None and np.isfinite(found.box_px[rows]).all() else None
-    if boxes is not None and len(boxes.frame):
-        key = dict(zip(zip(truth.positions.frame.tolist(), truth.positions.identity.tolist(), strict=True),
-                       range(len(seen)), strict=True))  # fmt: skip
-        labelled = [key.get(pair, -1) for pair in zip(boxes.frame.tolist(), boxes.identity.tolist(), strict=True)]
-        row_of = np.append(np.array(labelled, np.int64), -1)
-        whose = row_of[metres.by_boxes(frame, found.box_px[rows], boxes)]
-        wanted = np.unique(row_of[row_of >= 0])  # what a picture shows; others nobody can locate
-        wanted = wanted[seen[wanted]]
+    frame, box_px, notes = found.frame[rows], found.box_px[rows], []
+    if truth.tracks is not None and len(truth.tracks.frame) and np.isfinite(box_px).all():
+        whose, shown = _by_boxes(truth, truth.tracks, truth.positions, frame, box_px)
+        wanted = shown[seen[shown]]  # what a picture shows; others nobody can locate
     else:
         whose = metres.by_places(frame, place_m[rows], truth.positions.frame, true_m)
         wanted = np.flatnonzero(seen)
         notes.append(f"{clip.name}: no boxes to tell targets by; the nearest within {metres.FARTHEST_M:g} m is taken")
-    mine = rows[whose >= 0]
-    off = place_m[mine] - true_m[whose[whose >= 0]]
+    mine, true_row = rows[whose >= 0], whose[whose >= 0]
+    off = place_m[mine] - true_m[true_row]
     relative, ellipse = np.full_like(off, np.nan), np.full((len(mine), 2, 2), np.nan)
-    if marks is not None:
-        at, shift = metres.shared_error(*marks, truth.positions.frame, truth.positions.identity, true_m)
-        if len(at):
-            shared = [np.interp(found.frame[mine], at, shift[:, k]) for k in range(2)]
-            relative = off - np.stack(shared, axis=1)
-            ellipse = found.more.get("relative_m2", np.full((len(found.frame), 2, 2), np.nan))[mine]
+    at, shift = _shared(clip, truth.fleet, origin)
+    if len(at):
+        relative = off - np.stack([np.interp(found.frame[mine], at, shift[:, k]) for k in range(2)], axis=1)
+        ellipse = found.more.get("relative_m2", np.full((len(found.frame), 2, 2), np.nan))[mine]
     frames = np.unique(found.looked)
     each = {
         "targets": _per_frame(frames, truth.positions.frame[wanted]),
         "told": _per_frame(frames, found.frame[mine]),
-        "strays": _per_frame(frames, frame[whose < 0]),
+        "strays": _per_frame(frames, frame[whose == _NOBODY]),
     }
     samples = {
         "frame": found.frame[mine],
-        "identity": truth.positions.identity[whose[whose >= 0]],
+        "identity": truth.positions.identity[true_row],
         "error_m": np.hypot(*off.T),
         "inside": metres.inside(off, found.covariance_m2[mine]),
         "relative_error_m": np.hypot(*relative.T),
@@ -73,7 +70,7 @@ def score_places(clip: "Clip", found: "Found") -> Scored:
         "east_m": off[:, 0],
         "north_m": off[:, 1],
     }
-    counts = Located(len(wanted), len(mine), int((whose < 0).sum()))
+    counts = Located(len(wanted), len(mine), int((whose == _NOBODY).sum()))
     return Scored(frames, {"location": counts}, {"location": each}, {}, samples, tuple(notes))
 
 
@@ -81,20 +78,41 @@ def _per_frame(frames: np.ndarray, found: np.ndarray) -> np.ndarray:
     return np.bincount(np.searchsorted(frames, found), minlength=len(frames))[: len(frames)].astype(float)
 
 
-def _in_metres(clip: "Clip", true: Positions, found: "Found") -> tuple[np.ndarray, np.ndarray, MarkPlaces | None]:
-    """True places (P, 2), told ones (N, 2) and what landmarks report, all from one origin."""
-    degrees = found.more.get("lonlat_deg")
-    marks = _marks(clip)
-    if true.lonlat_deg is not None and degrees is not None and len(true.lonlat_deg):
-        origin = float(true.lonlat_deg[0, 0]), float(true.lonlat_deg[0, 1])
-        if marks is not None:
-            frame, mark, place, geographic = marks
-            kept = (frame, mark, geodesy.east_north(place, origin)) if geographic else None
-        else:
-            kept = None
-        return geodesy.east_north(true.lonlat_deg, origin), geodesy.east_north(degrees, origin), kept
-    plain = None if marks is None or marks[3] else marks[:3]
-    return true.east_north_m, found.east_north_m, plain
+def _by_boxes(
+    truth: Truth, boxes: TrackTable, places: Positions, frame: np.ndarray, box_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) the row of the true place of each found box; and the rows of all places whose boxes count, in order."""
+    row = {key: i for i, key in enumerate(zip(places.frame.tolist(), places.identity.tolist(), strict=True))}
+    row_of = [row.get(key, _NOBODY) for key in zip(boxes.frame.tolist(), boxes.identity.tolist(), strict=True)]
+    labelled, ignored = boxes, truth.ignored
+    if ignored is not None:
+        labelled = TrackTable(*(np.concatenate(pair) for pair in zip(boxes, ignored, strict=True)))
+        row_of += [_NOT_ASKED] * len(ignored.frame)
+    rows = np.array([*row_of, _NOBODY], np.int64)  # the last is for boxes that are none of them: -1
+    return rows[metres.by_boxes(frame, box_px, labelled)], np.unique(rows[rows >= 0])
+
+
+def _origin(true: Positions, found: "Found") -> tuple[float, float] | None:
+    """Longitude and latitude from which metres are counted; None where both sides' own metres are compared."""
+    if true.lonlat_deg is None or "lonlat_deg" not in found.more or not len(true.lonlat_deg):
+        return None
+    return float(true.lonlat_deg[0, 0]), float(true.lonlat_deg[0, 1])
+
+
+def _in_metres(true: Positions, origin: tuple[float, float] | None) -> np.ndarray:
+    if origin is None or true.lonlat_deg is None:
+        return true.east_north_m
+    return geodesy.east_north(true.lonlat_deg, origin)
+
+
+def _shared(clip: "Clip", fleet: Positions | None, origin: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Frames, and how far the landmarks' reports are off in them together; none where it cannot be known."""
+    marks = None if fleet is None else _marks(clip)
+    if marks is None or fleet is None or marks[3] != (origin is not None):
+        return np.zeros(0), np.zeros((0, 2))
+    frame, mark, place, _ = marks
+    reported = place if origin is None else geodesy.east_north(place, origin)
+    return metres.shared_error(frame, mark, reported, fleet.frame, fleet.identity, _in_metres(fleet, origin))
 
 
 def _marks(clip: "Clip") -> tuple[np.ndarray, np.ndarray, np.ndarray, bool] | None:
