@@ -18,7 +18,7 @@ from tests.studies.test_jobs import contents, linux
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.studies import cluster
 from torchvision_dddas.studies.cache import Cache
-from torchvision_dddas.studies.cluster import spread
+from torchvision_dddas.studies.cluster import connected, spread
 from torchvision_dddas.studies.running import plan, run_study
 from torchvision_dddas.studies.spec import read_spec
 from torchvision_dddas.studies.summary import summary
@@ -76,6 +76,12 @@ def scheduler():
 
 
 @pytest.fixture
+def client(scheduler):
+    with connected(scheduler) as client:
+        yield client
+
+
+@pytest.fixture
 def study(tmp_path):
     return read_spec(world.three(tmp_path / "clips"))
 
@@ -91,13 +97,13 @@ def test_a_cluster_finds_what_one_machine_finds(scheduler, study, tmp_path) -> N
         there = run_study(study, tmp_path, scheduler=scheduler, cache=tmp_path / "there")
     assert summary(there) == summary(here)
     assert there.facts["computed"] == here.facts["computed"] > 0
-    # All is kept here: no worker is needed any more.
-    again = run_study(study, tmp_path, scheduler="tcp://127.0.0.1:9", cache=tmp_path / "there")
+    # All is kept here: no worker is needed any more, and there is none.
+    again = run_study(study, tmp_path, scheduler=scheduler, cache=tmp_path / "there")
     assert again.facts["computed"] == 0 and summary(again) == summary(here)
 
 
 @linux
-def test_a_killed_worker_costs_its_clip_s_time_only(scheduler, study, tmp_path) -> None:
+def test_a_killed_worker_costs_its_clip_s_time_only(scheduler, client, study, tmp_path) -> None:
     jobs = {job.clip.name: job for job in plan(study, tmp_path).jobs}
     wanted, _ = ended(_alone(list(jobs.values()), tmp_path))
     picture = jobs["tracks"].clip.pictures[4]
@@ -120,7 +126,7 @@ def test_a_killed_worker_costs_its_clip_s_time_only(scheduler, study, tmp_path) 
 
         thread = threading.Thread(target=trap, daemon=True)
         thread.start()
-        events = spread([jobs["tracks"], jobs["table"]], scheduler, Cache(tmp_path / "cache"))
+        events = spread([jobs["tracks"], jobs["table"]], client, Cache(tmp_path / "cache"))
         with process(WORKER, scheduler, "second"):
             done, notes = ended(events)
         thread.join()
@@ -142,20 +148,20 @@ def _alone(jobs, tmp_path):
     ("before", "words"), [(OTHER, "of this package it has version 0.0.9"), (NONE, "it has none that can be used")]
 )
 def test_a_worker_with_another_version_gets_no_clip_and_is_told_in_one_line(
-    scheduler, study, tmp_path, before, words
+    scheduler, client, study, tmp_path, before, words
 ) -> None:
     jobs = plan(study, tmp_path).jobs
     with process(WORKER, scheduler, "other", before=before) as (_, other), process(WORKER, scheduler, "same"):
-        done, notes = ended(spread(jobs, scheduler, Cache(tmp_path / "cache")))
+        done, notes = ended(spread(jobs, client, Cache(tmp_path / "cache")))
     assert all(d.cause == "" for each in done.values() for d in each)
     (line,) = notes
     assert line.startswith(other) and words in line and "\n" not in line
 
 
-def test_no_worker_with_this_version_is_one_line(scheduler, study, tmp_path) -> None:
+def test_no_worker_with_this_version_is_one_line(scheduler, client, study, tmp_path) -> None:
     jobs, words = plan(study, tmp_path).jobs, "has had no worker with this version of the package"
     with process(WORKER, scheduler, "other", before=OTHER), pytest.raises(InputError, match=words):
-        ended(spread(jobs, scheduler, Cache(tmp_path / "cache"), alone_s=0.0))
+        ended(spread(jobs, client, Cache(tmp_path / "cache"), alone_s=0.0))
 
 
 def test_a_scheduler_that_cannot_be_reached_is_one_line_within_seconds(study, tmp_path) -> None:

@@ -9,6 +9,7 @@ import queue
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
@@ -32,16 +33,12 @@ Identity = tuple[str, str]
 """Version and digest of the code of a package."""
 
 
-def spread(jobs: Sequence[Job], scheduler: str, cache: Cache, alone_s: float = ALONE_S) -> Iterator[Event]:
-    """Do jobs in the order given on the workers of a scheduler; events as they come.
+def spread(jobs: Sequence[Job], client: Any, cache: Cache, alone_s: float = ALONE_S) -> Iterator[Event]:
+    """Do jobs in the order given on the workers of a scheduler; events as they come. client: as `connected` gives it.
 
-    Raises InputError where Dask is missing, the scheduler cannot be reached, or no worker can take jobs for alone_s.
+    Raises InputError where no worker can take jobs for alone_s.
     """
-    client = _connected(scheduler)
-    try:
-        yield from _Cluster(client, scheduler, jobs, cache, alone_s).events()
-    finally:
-        client.close()
+    yield from _Cluster(client, client.scheduler.address, jobs, cache, alone_s).events()
 
 
 def identity(backend: str) -> Identity:
@@ -58,7 +55,17 @@ def remote(job: Job, known: dict[str, bytes]) -> tuple[list[Done], dict[str, byt
     return work(job, store, digests.Files(None)), store.made
 
 
-def _connected(scheduler: str) -> Any:
+@contextmanager
+def connected(scheduler: str) -> Iterator[Any]:
+    """A client of a scheduler. Raises InputError where Dask is missing, or the scheduler cannot be reached."""
+    client = _client(scheduler)
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _client(scheduler: str) -> Any:
     if find_spec("distributed") is None:
         raise InputError("--scheduler needs dask and distributed; pip install 'torchvision-dddas[distributed]'")
     from distributed import Client

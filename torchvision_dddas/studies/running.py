@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -162,28 +163,23 @@ def run_study(
     notes: list[str] = []
     store = Cache(cache or cache_folder(), notes.append)
     begun(planned)
-    events = _events(order(planned.jobs), count, scheduler, store, together, notes)
-    return _gathered(planned, spec, events, store, tell, notes)
+    ordered = order(planned.jobs)
+    if scheduler is None:
+        events = _events(ordered, count, store, together, notes)
+        return _gathered(planned, spec, events, store, tell, notes)
+    from torchvision_dddas.studies.cluster import connected, spread
+
+    with connected(scheduler) as client:
+        waiting: list[Job] = []
+        # What came from workers is known by this machine's own look at the files.
+        known = _known(ordered, store, digests.Files(store.folder / "files"), waiting)
+        return _gathered(planned, spec, chain(known, spread(waiting, client, store)), store, tell, notes)
 
 
-def _events(
-    jobs: Sequence[Job], count: int, scheduler: str | None, store: Cache, together: int, notes: list[str]
-) -> Iterator[Event]:
-    """What becomes of the jobs: those of which all is kept need no worker."""
-    # Files that were never read are read by the workers, which are many.
-    files = digests.Files(store.folder / "files", read=scheduler is not None)
+def _events(jobs: Sequence[Job], count: int, store: Cache, together: int, notes: list[str]) -> Iterator[Event]:
+    """What becomes of the jobs on this machine. Files that were never read are read by the workers, which are many."""
     waiting: list[Job] = []
-    for job in jobs:
-        done = kept(job, store, files)
-        if done is None:
-            waiting.append(job)
-        else:
-            yield Event(job, tuple(done))
-    if scheduler is not None:
-        from torchvision_dddas.studies.cluster import spread
-
-        yield from spread(waiting, scheduler, store)
-        return
+    yield from _known(jobs, store, digests.Files(store.folder / "files", read=False), waiting)
     if together > 1:
         lockstep.motion_ahead(waiting, store, together, notes.append)
     if count:
@@ -191,3 +187,13 @@ def _events(
     else:
         files = digests.Files(store.folder / "files")
         yield from (Event(job, tuple(work(job, store, files))) for job in waiting)
+
+
+def _known(jobs: Sequence[Job], store: Cache, files: digests.Files, waiting: list[Job]) -> Iterator[Event]:
+    """The jobs of which all is kept: they need no worker. The others are added to `waiting`."""
+    for job in jobs:
+        done = kept(job, store, files)
+        if done is None:
+            waiting.append(job)
+        else:
+            yield Event(job, tuple(done))
