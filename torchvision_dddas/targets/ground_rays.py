@@ -23,6 +23,23 @@ def by_rays(
     covariance: of the pose, in the order of Fix. sigma_px: standard deviation of u and of v each. up_m: height of what
     is seen above the ground: the plane up = 0 or the surface.
     """
+    place, by_pose, by_pixel = met_with_slopes(pose, camera, pixels, up_m, surface)
+    spread_m2 = by_pose @ covariance @ by_pose.swapaxes(1, 2)
+    spread_m2 += sigma_px**2 * by_pixel @ by_pixel.swapaxes(1, 2)
+    return place, spread_m2
+
+
+def met_with_slopes(
+    pose: CameraPose,
+    camera: Camera,
+    pixels: Float[np.ndarray, "N 2"],
+    up_m: float | Float[np.ndarray, "N"] = 0.0,
+    surface: Surface | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """East and north of what pixels show (N, 2), and their derivatives by the pose (N, 2, 7) and the pixel (N, 2, 2).
+
+    The pose in the order of Fix; up_m and surface as in `by_rays`.
+    """
     flat, by_pixel, by_focal = slopes_of_lift(pixels, pose.focal, camera)
     way = np.c_[flat, np.ones(len(flat))] @ pose.axes.T
     far, normal = _met(pose.place_m, way, np.broadcast_to(np.asarray(up_m, float), len(way)), surface)
@@ -36,10 +53,7 @@ def by_rays(
     by_pose[:, :, :3] = -along @ cross(offset)
     by_pose[:, :, 3:6] = along
     by_pose[:, :, 6] = (by_lift @ by_focal[:, :, None])[:, :, 0]
-    by_pixel = by_lift @ by_pixel
-    spread_m2 = by_pose @ covariance @ by_pose.swapaxes(1, 2)
-    spread_m2 += sigma_px**2 * by_pixel @ by_pixel.swapaxes(1, 2)
-    return (pose.place_m + offset)[:, :2], spread_m2
+    return (pose.place_m + offset)[:, :2], by_pose, by_lift @ by_pixel
 
 
 def _met(

@@ -1,5 +1,7 @@
 """From windows that score to people: one box each, drawn around the body, with a probability."""
 
+from typing import Any
+
 import numpy as np
 
 from torchvision_dddas.settings import PeopleKnobs
@@ -9,6 +11,10 @@ from torchvision_dddas.types import People
 
 # A body that comes so near to the picture's border, in its own heights, may be cut by it: twice what foot rows miss by.
 _NEAR = 0.05
+
+# Arrays here, tensors where knobs are tuned by gradient: one formula for both.
+Column = Any
+Share = Any
 
 
 def people_of(
@@ -36,13 +42,26 @@ def people_of(
 def body(window_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Float[np.ndarray, "N 4"]:
     """The body's box in a window, by ratios that were calibrated on true boxes."""
     x, y, width, height = window_px.T
-    wide, tall = knobs.width_share * width, knobs.height_share * height
-    return np.stack([x + (width - wide) / 2, y + knobs.feet_share * height - tall, wide, tall], axis=1)
+    sides = body_sides(x, y, width, height, knobs.height_share, knobs.width_share, knobs.feet_share)
+    return np.stack(sides, axis=1)
+
+
+def body_sides(
+    x: Column, y: Column, width: Column, height: Column, height_share: Share, width_share: Share, feet_share: Share
+) -> tuple[Column, Column, Column, Column]:
+    """The same by columns: left, top, width, height of the body, in the kind of number that is given."""
+    wide, tall = width_share * width, height_share * height
+    return x + (width - wide) / 2, y + feet_share * height - tall, wide, tall
 
 
 def probability(margin: Float[np.ndarray, " N"], knobs: PeopleKnobs) -> Float[np.ndarray, " N"]:
     """That a window of this score shows a person (Platt scaling)."""
-    return 1 / (1 + np.exp(-np.clip(knobs.probability_slope * (margin - knobs.probability_even), -50, 50)))
+    return 1 / (1 + np.exp(-np.clip(log_odds(margin, knobs.probability_slope, knobs.probability_even), -50, 50)))
+
+
+def log_odds(margin: Column, slope: Share, even: Share) -> Column:
+    """Of that probability, in the kind of number that is given."""
+    return slope * (margin - even)
 
 
 def cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarray:

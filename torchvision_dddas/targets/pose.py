@@ -186,6 +186,33 @@ def fit_pose(
     return Solution(state.pose, state.places, covariance, state.correction, corrected, state.cost, freedom)
 
 
+@dataclass(frozen=True)
+class Slopes:
+    """The sum of squares about a pose and landmarks' places, to first order in a step of the 7 + 2n of them.
+
+    missing: (2m,) px, u and v in turn of the m landmarks used: where the picture has them, less where they should be.
+    slopes: (2m, 7 + 2n) how the latter grow. correction: (7 + 2n,) what pose and places have beyond what telemetry and
+    landmarks report; by_turn: (3, 3) how its first three grow with a small rotation, the others with their own step.
+    """
+
+    missing: np.ndarray
+    slopes: np.ndarray
+    correction: np.ndarray
+    by_turn: np.ndarray
+
+
+def slopes_at(
+    marks: Marks,
+    camera: Camera,
+    expected: Expected,
+    pose: CameraPose,
+    places: Float[np.ndarray, "n 2"],
+    used: Bool[np.ndarray, "n"] | None = None,
+) -> Slopes | None:
+    """What `fit_pose` knows there; None where the camera cannot show a landmark."""
+    return _Problem(marks, camera, expected, np.ones(len(marks), bool) if used is None else used).slopes(pose, places)
+
+
 def moved(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
     """A pose after a step, in the order of Fix."""
     return replace(
@@ -231,7 +258,7 @@ class _Problem:
         nearer = self.at(state.pose, state.places + step.reshape(-1, 2))
         return nearer if nearer is not None and nearer.cost < state.cost else state
 
-    def at(self, pose: CameraPose, places: np.ndarray) -> _State | None:
+    def slopes(self, pose: CameraPose, places: np.ndarray) -> Slopes | None:
         points = np.column_stack([places, self.marks.up_m])[self.used]
         seen, by_pose, by_point = project_with_slopes(points, pose, self.camera)
         if not np.isfinite(seen).all():
@@ -250,12 +277,17 @@ class _Problem:
                 (places - self.marks.east_north_m).ravel(),
             ]
         )
-        apart = correction - self.expected.mean
         slopes = np.zeros((len(self.rows), len(self.expected.mean)))
         slopes[:, :7] = by_pose.reshape(-1, 7)
         slopes[self.rows, self.columns] = by_point[:, :, :2].reshape(-1, 2)
-        missing = self.image - seen.ravel()
-        information, by_turn = self.expected.information, slope_of_turn(turn_rad)
+        return Slopes(self.image - seen.ravel(), slopes, correction, slope_of_turn(turn_rad))
+
+    def at(self, pose: CameraPose, places: np.ndarray) -> _State | None:
+        here = self.slopes(pose, places)
+        if here is None:
+            return None
+        missing, slopes, by_turn = here.missing, here.slopes, here.by_turn
+        information, apart = self.expected.information, here.correction - self.expected.mean
         pull = information @ apart
         cost = float(apart @ pull + missing @ (self.weight * missing))
         bent = information.copy()
@@ -263,7 +295,7 @@ class _Problem:
         bent[:, :3] = bent[:, :3] @ by_turn
         pull[:3] = by_turn.T @ pull[:3]
         weighed = slopes.T * self.weight
-        return _State(pose, places, cost, weighed @ missing - pull, weighed @ slopes + bent, correction)
+        return _State(pose, places, cost, weighed @ missing - pull, weighed @ slopes + bent, here.correction)
 
 
 def _focal_of(hfov_rad: float, camera: Camera, knobs: AerialKnobs, known: bool) -> tuple[float, float]:
