@@ -1,0 +1,204 @@
+"""Descent on bowls: it gets to the bottom, repeats, goes on where it was, stops in time, says what is no number."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.tuning.toys import Bowl, pieces
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
+
+THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
+QUICK = Plan(steps=12, batch=4, rate=0.1, look_every=3)
+
+
+def knobs(threshold: float = 12.0) -> Knobs:
+    return Knobs(with_knobs(Settings(), {THRESHOLD: threshold}), [THRESHOLD, NOISE])
+
+
+class Stopped(Exception):
+    """The power is gone."""
+
+
+def after(steps: int):
+    """Something to tell a descent's steps to that stops it after some."""
+
+    def tell(step: Step) -> None:
+        if step.step == steps:
+            raise Stopped
+
+    return tell
+
+
+def same(one: Descended, other: Descended) -> bool:
+    states = [found.knobs.state_dict() for found in (one, other)]
+    histories = [
+        [replace(step, loss=0.0 if math.isnan(step.loss) else step.loss) for step in f.history] for f in (one, other)
+    ]
+    return histories[0] == histories[1] and all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+
+
+def test_it_gets_to_the_bottom() -> None:
+    found = descend(Bowl(), knobs(), pieces(spread=0.0), Plan(steps=150, rate=0.1))
+    assert found.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.02)
+    assert found.settings.difference.noise_levels == pytest.approx(1, rel=0.05)
+    assert found.failed == "" and found.idle == ()
+
+
+def test_the_same_arguments_give_the_same_steps_and_another_seed_gives_others() -> None:
+    first, again = (descend(Bowl(), knobs(), pieces(), QUICK) for _ in range(2))
+    other = descend(Bowl(), knobs(), pieces(), replace(QUICK, seed=1))
+    assert same(first, again)
+    assert first.history[-1].knobs != other.history[-1].knobs
+
+
+@pytest.mark.parametrize("stop", [0, 1, 5, 6, 12])
+def test_a_descent_that_was_broken_off_goes_on_as_if_it_had_not_been(tmp_path: Path, stop: int) -> None:
+    whole = descend(Bowl(), knobs(), pieces(), QUICK)
+    place = tmp_path / "here" / "checkpoint.pt"
+    with pytest.raises(Stopped):
+        descend(Bowl(), knobs(), pieces(), QUICK, tell=after(stop), place=place)
+    told = list[int]()
+    resumed = descend(Bowl(), knobs(), pieces(), QUICK, tell=lambda s: told.append(s.step), place=place, resume=True)
+    assert same(whole, resumed) and resumed.best == whole.best and resumed.ended == whole.ended
+    assert told == list(range(13))
+
+
+def test_a_descent_that_is_over_is_not_begun_again(tmp_path: Path) -> None:
+    place = tmp_path / "checkpoint.pt"
+    first, bowl = descend(Bowl(), knobs(), pieces(), QUICK, place=place), Bowl()
+    assert same(first, descend(bowl, knobs(), pieces(), QUICK, place=place, resume=True))
+    assert bowl.calls == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"plan": replace(QUICK, steps=13)}, "other steps, 12 and not 13"),
+        ({"plan": replace(QUICK, seed=2)}, "other seed, 0 and not 2"),
+        ({"examples": pieces(("one",))}, "other examples"),
+        ({"knobs": Knobs(Settings(), [THRESHOLD])}, "other knobs"),
+        ({"knobs": knobs(13.0)}, "other settings"),
+    ],
+)
+def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict, words: str) -> None:
+    place = tmp_path / "checkpoint.pt"
+    descend(Bowl(), knobs(), pieces(), QUICK, place=place)
+    asked = {"knobs": knobs(), "examples": pieces(), "plan": QUICK} | change
+    with pytest.raises(InputError, match=words):
+        descend(Bowl(), place=place, resume=True, **asked)
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint at all", b"PK\x03\x04 and then nothing"])
+def test_a_damaged_checkpoint_is_told_in_a_line(tmp_path: Path, content: bytes) -> None:
+    place = tmp_path / "checkpoint.pt"
+    place.write_bytes(content)
+    with pytest.raises(InputError, match="is no checkpoint, or is damaged"):
+        descend(Bowl(), knobs(), pieces(), QUICK, place=place, resume=True)
+
+
+def test_softness_goes_down_evenly_in_its_logarithm() -> None:
+    found = descend(Bowl(), knobs(), pieces(), QUICK)
+    softness = [step.softness for step in found.history[1:]]
+    assert softness[0] == pytest.approx(1) and softness[-1] == pytest.approx(0.1)
+    ratios = [b / a for a, b in pairwise(softness)]
+    assert max(ratios) == pytest.approx(min(ratios)) and max(ratios) < 1
+
+
+def test_it_stops_where_the_watched_examples_gain_no_more_and_keeps_their_best_state() -> None:
+    # What is learned from lies far above what is watched: every step beyond the watched ones' place is a loss.
+    seen = [replace(one, content=one.content + (2.0 if one.frame <= 6 else 0.0)) for one in pieces(spread=0.0)]
+    asked = Knobs(with_knobs(Settings(), {THRESHOLD: 12.0}), [THRESHOLD])
+    found = descend(Bowl(), asked, seen, Plan(steps=200, rate=0.1, look_every=2, patience=3))
+    assert "no gain" in found.ended and found.history[-1].step == found.best + 6 < 200
+    assert found.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.2)
+    assert found.history[-1].knobs[THRESHOLD] > found.settings.difference.threshold * 1.2
+
+
+def test_where_nothing_is_gained_the_settings_are_as_they_were() -> None:
+    start = with_knobs(Settings(), {THRESHOLD: 10.0, NOISE: 2.0})
+    away = [
+        replace(one, content=one.content + (5.0 if one.frame <= 6 else math.log(10) - 3)) for one in pieces(spread=0.0)
+    ]
+    found = descend(Bowl(), Knobs(start, [THRESHOLD]), away, replace(QUICK, patience=2))
+    assert found.best == 0 and found.settings == start
+
+
+def test_a_loss_that_is_no_number_names_clip_frame_and_knob_and_keeps_the_last_good_state() -> None:
+    bowl = Bowl(place=4.0, wrong=("two", 3), wrong_above=20.0)
+    found = descend(bowl, knobs(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=1))
+    assert "two, frame 3" in found.failed and f"{THRESHOLD} = 2" in found.failed and NOISE not in found.failed
+    assert 12 < found.settings.difference.threshold < 26
+    assert all(math.isfinite(value) for step in found.history for value in step.knobs.values())
+    assert found.best == found.history[-1].step or found.best > 0
+
+
+def test_a_watched_loss_that_is_no_number_stops_it_too() -> None:
+    bowl = Bowl(place=4.0, wrong=("one", 8), wrong_above=20.0)
+    found = descend(bowl, knobs(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=5))
+    assert "one, frame 8" in found.failed and "at step" in found.failed
+    assert found.settings.difference.threshold < 20 and found.history[-1].watched is None
+
+
+def test_a_slope_that_is_no_number_names_clip_frame_and_knob() -> None:
+    found = descend(Bowl(steep=("one", 2)), knobs(), pieces(), replace(QUICK, batch=99))
+    assert f"slope of the loss in {THRESHOLD}" in found.failed and "one, frame 2" in found.failed
+    assert found.best == 0
+
+
+def test_a_loss_that_is_no_number_from_the_start_is_bad_input() -> None:
+    bowl = Bowl(wrong=("two", 8))
+    with pytest.raises(InputError, match="two, frame 8, whatever the knobs, before the first step"):
+        descend(bowl, knobs(), pieces(), QUICK)
+
+
+def test_a_failed_descent_is_told_again_when_it_is_taken_up(tmp_path: Path) -> None:
+    bowl, place = Bowl(place=4.0, wrong=("two", 3), wrong_above=14.0), tmp_path / "checkpoint.pt"
+    first = descend(bowl, knobs(), pieces(spread=0.0), QUICK, place=place)
+    again = descend(bowl, knobs(), pieces(spread=0.0), QUICK, place=place, resume=True)
+    assert first.failed == again.failed != "" and same(first, again)
+
+
+def test_knobs_without_a_slope_are_named() -> None:
+    asked = Knobs(Settings(), [THRESHOLD, "gates.min_area_px"])
+    found = descend(Bowl(), asked, pieces(), QUICK)
+    assert found.idle == ("gates.min_area_px",)
+    assert found.settings.gates.min_area_px == Settings().gates.min_area_px
+
+
+def test_it_ends_when_its_time_is_over() -> None:
+    found = descend(Bowl(), knobs(), pieces(), replace(QUICK, most_s=0.0))
+    assert found.ended == "0 s are over" and len(found.history) == 1 and found.best == 0
+
+
+class Dear:
+    """A threshold that costs time."""
+
+    def term(self, values):
+        """The more the dearer."""
+        return values[THRESHOLD].log()
+
+
+def test_what_time_costs_moves_the_bottom() -> None:
+    plan = Plan(steps=150, rate=0.1)
+    free, charged = (descend(Bowl(), knobs(), pieces(spread=0.0), plan, cost) for cost in (None, Dear()))
+    # (x - 3)² + x is least at 2.5.
+    assert free.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.02)
+    assert charged.settings.difference.threshold == pytest.approx(math.exp(2.5), rel=0.02)
+
+
+def test_without_examples_there_is_one_line() -> None:
+    with pytest.raises(InputError, match="nothing to tune motion on"):
+        descend(Bowl(), knobs(), [], QUICK)
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch": 0}, {"rate": 0.0}, {"watched": 1.0}, {"patience": 0}])
+def test_a_plan_that_will_not_do_is_refused(wrong: dict) -> None:
+    with pytest.raises(InputError, match="wanted"):
+        replace(QUICK, **wrong)

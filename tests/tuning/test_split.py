@@ -1,0 +1,31 @@
+"""Which examples are learned from and which are watched."""
+
+from tests.tuning.toys import pieces
+from torchvision_dddas.tuning.split import batch_of, parted
+
+
+def test_the_last_part_of_each_clip_is_watched_and_never_learned_from() -> None:
+    learned, watched = parted(pieces(("one", "two"), 8), 0.25, 99)
+    assert [(one.clip, one.frame) for one in watched] == [("one", 7), ("one", 8), ("two", 7), ("two", 8)]
+    assert not {(one.clip, one.frame) for one in learned} & {(one.clip, one.frame) for one in watched}
+    assert len(learned) == 12
+
+
+def test_where_clips_are_too_short_all_are_learned_from_and_watched() -> None:
+    learned, watched = parted(pieces(("one", "two"), 2), 0.25, 99)
+    assert learned == watched and len(learned) == 4
+
+
+def test_of_many_some_are_watched_from_all_over() -> None:
+    _, watched = parted(pieces(("one", "two"), 40), 0.5, 8)
+    assert len(watched) == 8 and {one.clip for one in watched} == {"one", "two"}
+
+
+def test_every_example_has_its_turn_before_any_has_another() -> None:
+    taken = [i for step in range(5) for i in batch_of(step, 10, 4, seed=3)]
+    assert sorted(taken[:10]) == sorted(taken[10:]) == list(range(10))
+    assert taken[:10] != taken[10:]
+
+
+def test_a_batch_is_no_larger_than_what_there_is() -> None:
+    assert sorted(batch_of(7, 3, 8, seed=0)) == [0, 1, 2]

@@ -1,0 +1,68 @@
+"""The state of a descent on disk, whole or not at all, and whether it is that of the descent that is asked for."""
+
+import hashlib
+import io
+import json
+import pickle
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.settings import changes
+from torchvision_dddas.sinks.whole import cannot_write, write_whole
+
+FORMAT = 1
+
+
+def facts(family: str, knobs: Knobs, plan: Mapping[str, Any], seen: Sequence[str], cost: object) -> dict[str, Any]:
+    """What a descent depends on, in words and numbers. seen: its examples, in order."""
+    return {
+        "family": family,
+        "knobs": ", ".join(knobs.names),
+        "settings": json.dumps(changes(knobs.base), default=str),
+        **plan,
+        "examples": hashlib.sha256("\n".join(seen).encode()).hexdigest()[:16],
+        "cost": "" if cost is None else repr(cost),
+    }
+
+
+def write(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    """Write a state. Raises InputError where the disk refuses."""
+    content = io.BytesIO()
+    torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(place, content.getvalue())
+    except OSError as error:
+        raise cannot_write(place, error) from error
+
+
+def read(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """The state. Raises InputError where the file is none, or is of a descent that was asked for otherwise."""
+    try:
+        # No code is run: a checkpoint is tensors, numbers and words.
+        found = torch.load(place, weights_only=True, map_location="cpu")
+        told, state = dict(found["asked"]), dict(found["state"])
+        form = found["format"]
+    except OSError as error:
+        raise InputError(f"{place} cannot be read: {error.strerror}") from None
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError, AttributeError):
+        raise InputError(f"{place} is no checkpoint, or is damaged; begin again without --resume") from None
+    if form != FORMAT:
+        raise InputError(f"{place} is a checkpoint of another version; begin again without --resume")
+    for name, value in asked.items():
+        if told.get(name) != value:
+            raise InputError(
+                f"{place} is of a descent with other {name.replace('_', ' ')}, {_short(told.get(name))} and not "
+                f"{_short(value)}; ask for the same, or begin again without --resume"
+            )
+    return state
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 80 else f"{text[:79]}…"

@@ -1,0 +1,287 @@
+"""Adam in the unconstrained space of the knobs, softness annealed, stopped where what it does not learn from says so.
+
+The same arguments give the same steps to the last bit on one machine, and a descent that was broken off and is taken up
+from its checkpoint goes on as if it had not been.
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.tuning import checkpoint
+from torchvision_dddas.tuning.blame import blamed
+from torchvision_dddas.tuning.family import Example, Family
+from torchvision_dddas.tuning.split import batch_of, parted
+
+FADED = 0.1
+"""Of the rate, at the last step."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to descend. rate: of Adam, in units of which one is about a factor e of a knob.
+
+    look_every: steps from one look at the watched examples to the next. patience: looks without a gain that end the
+    descent. watched: share of each clip's examples, its last, that nothing is learned from. most_watched: of all clips
+    together. most_s: no step is begun after so many seconds.
+    """
+
+    steps: int = 100
+    batch: int = 8
+    rate: float = 0.05
+    seed: int = 0
+    look_every: int = 5
+    patience: int = 10
+    watched: float = 0.25
+    most_watched: int = 32
+    most_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Raises InputError for what will not do."""
+        for name in ("steps", "batch", "look_every", "patience", "most_watched"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name.replace('_', ' ')} is {getattr(self, name)}; wanted 1 or more")
+        if not 0 < self.rate <= 10:
+            raise InputError(f"the rate is {self.rate:g}; wanted more than 0, at most 10")
+        if not 0 <= self.watched <= 0.9:
+            raise InputError(f"the share of examples to watch is {self.watched:g}; wanted 0 to 0.9")
+
+
+class Cost(Protocol):
+    """What a loss is charged for time: see `costing`."""
+
+    def term(self, knobs: Mapping[str, Tensor]) -> Tensor:
+        """To be added to a loss, a number without axes."""
+        ...
+
+
+@dataclass(frozen=True)
+class Step:
+    """The knobs after a step, of which 0 is before the first, and the losses, which hold the cost.
+
+    loss: of the step's batch, NaN at step 0. watched: the mean of the watched examples, as hard as at the last step;
+    None where they were not looked at.
+    """
+
+    step: int
+    softness: float
+    loss: float
+    watched: float | None
+    knobs: Mapping[str, float]
+
+
+@dataclass
+class Descended:
+    """What became of it. knobs: in their best state, which is that after step `best`. ended: why, in words.
+
+    failed: in a line, which clip, frame and knob gave no number; empty where all went well.
+    """
+
+    knobs: Knobs
+    best: int
+    history: list[Step] = field(default_factory=list)
+    ended: str = ""
+    failed: str = ""
+    seconds: float = 0.0
+    idle: tuple[str, ...] = ()
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the best state, as every command takes them."""
+        return self.knobs.settings()
+
+
+def descend(
+    family: Family,
+    knobs: Knobs,
+    examples: Sequence[Example],
+    plan: Plan | None = None,
+    cost: Cost | None = None,
+    tell: Callable[[Step], object] = lambda step: None,
+    place: Path | None = None,
+    resume: bool = False,
+) -> Descended:
+    """Move knobs to where the family's loss is least. The knobs that are given are moved, and end in their best state.
+
+    place: the file of a checkpoint, written at every look. resume: go on from it if it is there; tell is then called
+    for the steps that it holds too. Raises InputError where there are no examples, where no knob has a say in the loss,
+    where the loss is no number before the first step, and for a checkpoint of another descent.
+    """
+    plan = plan or Plan()
+    if not examples:
+        raise InputError(f"there is nothing to tune {family.name} on; wanted clips with truth that it can learn from")
+    run = _Run(family, knobs, examples, plan, cost)
+    began = time.perf_counter()
+    if resume and place is not None and place.is_file():
+        run.load(place)
+    for known in run.history:
+        tell(known)
+    if not run.history:
+        tell(run.begin())
+        run.save(place)
+    while not (run.ended or run.failed):
+        if time.perf_counter() - began >= plan.most_s:
+            run.ended = f"{plan.most_s:g} s are over"
+            break
+        step = run.step()
+        if step is not None:
+            tell(step)
+        if step is None or step.watched is not None:
+            run.save(place)
+    return run.result(time.perf_counter() - began)
+
+
+class _Run:
+    """A descent under way."""
+
+    def __init__(
+        self, family: Family, knobs: Knobs, examples: Sequence[Example], plan: Plan, cost: Cost | None
+    ) -> None:
+        self._family, self._knobs, self._plan, self._cost = family, knobs, plan, cost
+        self._learned, self._watched = parted(examples, plan.watched, plan.most_watched)
+        self._adam = torch.optim.Adam(knobs.parameters(), lr=plan.rate, betas=(0.9, 0.99))
+        self._moved: set[str] = set()
+        self._best: dict[str, Tensor] = {}
+        self._least, self._best_step, self._since = math.inf, 0, 0
+        self.history: list[Step] = []
+        self.ended = self.failed = ""
+
+    def begin(self) -> Step:
+        """Look before the first step."""
+        with torch.no_grad():
+            values = self._knobs.values()
+        if cause := self._unfit(self._watched, values, self._hardest):
+            raise InputError(f"{cause}, before the first step")
+        return self._told(0, self._softness(1), math.nan, look=True)
+
+    def step(self) -> Step | None:
+        """One step; None where it could not be taken."""
+        number = self.history[-1].step + 1
+        softness = self._softness(number)
+        batch = [self._learned[i] for i in batch_of(number - 1, len(self._learned), self._plan.batch, self._plan.seed)]
+        values = self._knobs.values()
+        for value in values.values():
+            if value.requires_grad:
+                value.retain_grad()
+        losses = self._family.loss(values, batch, softness)
+        loss = losses.mean() + self._charge(values)
+        if not bool(torch.isfinite(loss)):
+            self._fail(number, batch, values, softness)
+            return None
+        if not loss.requires_grad:
+            raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(self._knobs.names)}")
+        self._adam.zero_grad()
+        loss.backward()
+        if any(value.grad is not None and not bool(torch.isfinite(value.grad).all()) for value in values.values()):
+            self._fail(number, batch, values, softness)
+            return None
+        self._moved |= {name for name, value in values.items() if value.grad is not None and bool(value.grad.any())}
+        for group in self._adam.param_groups:
+            group["lr"] = self._plan.rate * (1 - (1 - FADED) * (number - 1) / self._plan.steps)
+        self._adam.step()
+        last = number == self._plan.steps
+        told = self._told(number, softness, float(loss.detach()), last or number % self._plan.look_every == 0)
+        if last and not self.ended:
+            self.ended = f"all {number} steps were taken"
+        return None if self.failed else told
+
+    def load(self, place: Path) -> None:
+        """Take up what a checkpoint holds. Raises InputError for one of another descent."""
+        state = checkpoint.read(place, self._facts())
+        self._knobs.load_state_dict(state["knobs"])
+        self._adam.load_state_dict(state["adam"])
+        self._best, self._least, self._best_step = state["best"], state["least"], state["best_step"]
+        self._since, self._moved = state["since"], set(state["moved"])
+        self.history = [Step(**step) for step in state["history"]]
+        self.ended, self.failed = state["ended"], state["failed"]
+
+    def save(self, place: Path | None) -> None:
+        """Write a checkpoint, whole or not at all. Raises InputError where the disk refuses."""
+        if place is None:
+            return
+        state = {
+            "knobs": self._knobs.state_dict(),
+            "adam": self._adam.state_dict(),
+            "best": self._best,
+            "least": self._least,
+            "best_step": self._best_step,
+            "since": self._since,
+            "moved": sorted(self._moved),
+            "history": [asdict(step) for step in self.history],
+            "ended": self.ended,
+            "failed": self.failed,
+        }
+        checkpoint.write(place, self._facts(), state)
+
+    def result(self, seconds: float) -> Descended:
+        """The knobs in their best state, and how they came there."""
+        self._knobs.load_state_dict(self._best)
+        ended = self.ended or "a loss was no number"
+        idle = tuple(name for name in self._knobs.names if name not in self._moved) if len(self.history) > 1 else ()
+        return Descended(self._knobs, self._best_step, self.history, ended, self.failed, seconds, idle)
+
+    def _told(self, number: int, softness: float, loss: float, look: bool) -> Step:
+        """Take note of the knobs as they are now, and where they are looked at of how good they are."""
+        with torch.no_grad():
+            values = self._knobs.values()
+            watched = self._mean(values) if look else None
+        if watched is not None and not math.isfinite(watched):
+            self._fail(number, self._watched, values, self._hardest)
+            watched = None
+        step = Step(number, softness, loss, watched, {name: float(value) for name, value in values.items()})
+        if watched is not None:
+            self._judge(number, watched)
+        if not self.failed:
+            self.history.append(step)
+        return step
+
+    def _judge(self, number: int, watched: float) -> None:
+        if watched < self._least:
+            self._least, self._best_step, self._since = watched, number, 0
+            self._best = {name: value.clone() for name, value in self._knobs.state_dict().items()}
+            return
+        self._since += 1
+        if self._since >= self._plan.patience:
+            self.ended = f"no gain on the watched examples since step {self._best_step}"
+
+    def _mean(self, values: Mapping[str, Tensor]) -> float:
+        """The mean loss of the watched examples, as hard as at the last step, with the cost."""
+        size = self._plan.batch
+        parts = [self._watched[i : i + size] for i in range(0, len(self._watched), size)]
+        total = math.fsum(float(self._family.loss(values, part, self._hardest).sum()) for part in parts)
+        return total / len(self._watched) + float(self._charge(values))
+
+    def _charge(self, values: Mapping[str, Tensor]) -> Tensor:
+        return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
+
+    def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
+        self.failed = f"{self._unfit(batch, values, softness) or 'the cost is no number'}, at step {number}"
+
+    def _unfit(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
+        known = [self.history[i].knobs for i in (-1, self._best_step, 0)] if self.history else []
+        before = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
+        return blamed(self._family, batch, values, before, softness, self._plan.batch)
+
+    @property
+    def _hardest(self) -> float:
+        return self._family.softness[1]
+
+    def _softness(self, number: int) -> float:
+        first, last = self._family.softness
+        share = (number - 1) / max(self._plan.steps - 1, 1)
+        return first ** (1 - share) * last**share if first > 0 and last > 0 else first + (last - first) * share
+
+    def _facts(self) -> dict[str, Any]:
+        """What a descent depends on: of a checkpoint it has to be the same."""
+        plan = {name: value for name, value in asdict(self._plan).items() if name != "most_s"}
+        seen = [f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched)]
+        return checkpoint.facts(self._family.name, self._knobs, plan, seen, self._cost)
