@@ -259,6 +259,20 @@ class TrackKnobs(Group):
     agility: float = knob(0.009, "heights/frame", 1e-5, 1, meaning="change of velocity in one frame at that speed")
     scatter: float = knob(0.06, "heights", 1e-3, 1, meaning="scatter of a detection's centre")
     size_scatter: float = knob(0.1, "-", 1e-3, 10, meaning="scatter of the logarithm of a detection's height")
+    prior: float = knob(4.0, "-", -20, 20, meaning="what any link is worth before it is compared: opens the gate")
+    tail: float = knob(
+        4.0, "-", 0.1, 100, meaning="freedom of the distance's law: a small one forgives sharp turns and stops"
+    )
+    upright: float = knob(
+        0.6, "-", 0.1, 2, meaning="distances of standing targets up and down count as larger by one over this"
+    )
+    rest_drift: float = knob(
+        0.03, "heights", 1e-4, 1, meaning="drift in one frame of a target that may stand still unseen"
+    )
+    rest_price: float = knob(1.0, "-", 0, 20, meaning="price of taking a lost target to have stood still")
+    missed: float = knob(0.5, "-", 0, 20, meaning="price of a gap in a track")
+    border: float = knob(4.0, "-", 0, 20, meaning="price of a return after a gap at the picture's border")
+    left: float = knob(2.0, "-", 0, 20, meaning="price of a return after a gap of who was last seen at the border")
     births: float = knob(2.0, "-", 0, 10, meaning="price of a return after a gap where targets keep appearing")
     own_scatter: float = knob(0.2, "heights", 1e-3, 1, meaning="scatter for the moving targets found in a clip")
     own_size_scatter: float = knob(1.0, "-", 1e-3, 10, meaning="size_scatter for those, which part and join")

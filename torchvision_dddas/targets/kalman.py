@@ -4,12 +4,15 @@ The velocity is constant in the world, not in the picture: what comes nearer by 
 faster the larger it is. With a growth of γ a frame, after g frames a height h is h / (1 − γ g) and the displacement is
 v g / (1 − γ g), exactly for a straight walk at constant speed towards a pinhole camera, or past a camera that drives.
 
-A state is a (N, COLUMNS) float64 array, one row a target, in pixels and frames. Its variances are those of each of the
-two axes, which are alike and independent, in squares of the target's height: near targets move as far in their own
-heights as distant ones. Those of the size are of the logarithm of the height.
+A state is a (N, COLUMNS) float64 array, one row a target, in pixels and frames; but for the camera's motion a tensor
+will do as well, with axes before N. Its variances are those of each of the two axes, which are alike and independent,
+in squares of the target's height: near targets move as far in their own heights as distant ones. Those of the size are
+of the logarithm of the height.
 """
 
 import numpy as np
+
+from torchvision_dddas.targets.namespace import namespace
 
 X, Y, VX, VY, WIDTH, HEIGHT, GROWTH, SEEN = range(8)
 PP, PV, VV = 8, 9, 10  # position, velocity: variances and covariance
@@ -25,6 +28,9 @@ _GROWTH_CHANGE = 0.01  # sd of its change in one frame
 _WIDTH_GAIN = 0.5
 _FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: nothing is predicted to come nearer than half its distance
 
+Variances = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Of a value, of it and its rate, of the rate: (N,) each."""
+
 
 def started(
     box_px: np.ndarray, frame: int, scatter: float, speed: float, size_scatter: float = SIZE_SCATTER
@@ -34,34 +40,41 @@ def started(
     box_px: (N, 4) x, y, width, height. scatter, speed: sd of the centre in heights, and of the velocity per frame.
     size_scatter: sd of the logarithm of the height.
     """
-    state = np.zeros((len(box_px), COLUMNS))
-    state[:, X : Y + 1] = box_px[:, :2] + box_px[:, 2:] / 2
-    state[:, WIDTH : HEIGHT + 1] = box_px[:, 2:]
-    state[:, SEEN] = frame
-    state[:, PP], state[:, VV] = scatter**2, speed**2
-    state[:, SS], state[:, GG] = size_scatter**2, (_GROWTH * speed / USUAL_SPEED) ** 2
-    return state
+    nothing = 0 * box_px[..., 0]
+    return _table(
+        box_px[..., :2] + box_px[..., 2:] / 2,
+        0 * box_px[..., :2],
+        box_px[..., 2:],
+        nothing,
+        nothing + frame,
+        (nothing + scatter**2, nothing, nothing + speed**2),
+        (nothing + size_scatter**2, nothing, nothing + (_GROWTH * speed / USUAL_SPEED) ** 2),
+    )
 
 
 def predicted(state: np.ndarray, frame: int, agility: float) -> np.ndarray:
     """The states at a later frame. agility: sd of the change of velocity in one frame, heights/frame."""
-    gap = frame - state[:, SEEN]
-    later = state.copy()
-    stretch = 1 / (1 - np.clip(gap * state[:, GROWTH], _FARTHEST, _NEAREST))
-    later[:, X : Y + 1] += (gap * stretch)[:, None] * state[:, VX : VY + 1]
-    later[:, VX : VY + 1] *= (stretch**2)[:, None]
-    later[:, WIDTH : HEIGHT + 1] *= stretch[:, None]
-    later[:, GROWTH] *= stretch
-    _spread(later, PP, PV, VV, gap, agility**2)
-    _spread(later, SS, SG, GG, gap, (_GROWTH_CHANGE / 0.009 * agility) ** 2)
-    return later
+    gap = frame - state[..., SEEN]
+    stretch = 1 / (1 - namespace(state).clip(gap * state[..., GROWTH], _FARTHEST, _NEAREST))
+    return _table(
+        state[..., X : Y + 1] + (gap * stretch)[..., None] * state[..., VX : VY + 1],
+        state[..., VX : VY + 1] * (stretch**2)[..., None],
+        state[..., WIDTH : HEIGHT + 1] * stretch[..., None],
+        state[..., GROWTH] * stretch,
+        state[..., SEEN],
+        _spread(state, PP, gap, agility**2),
+        _spread(state, SS, gap, (_GROWTH_CHANGE / 0.009 * agility) ** 2),
+    )
 
 
-def _spread(later: np.ndarray, place: int, both: int, rate: int, gap: np.ndarray, power: float) -> None:
-    """Let the variances of a value and its rate grow over a gap (N,), the rate being a random walk of this power."""
-    later[:, place] += gap * (2 * later[:, both] + gap * (later[:, rate] + power / 3 * gap))
-    later[:, both] += gap * (later[:, rate] + power / 2 * gap)
-    later[:, rate] += power * gap
+def _spread(state: np.ndarray, first: int, gap: np.ndarray, power: float) -> Variances:
+    """The variances of a value and its rate after a gap (N,), the rate being a random walk of this power."""
+    place, both, rate = state[..., first], state[..., first + 1], state[..., first + 2]
+    return (
+        place + gap * (2 * both + gap * (rate + power / 3 * gap)),
+        both + gap * (rate + power / 2 * gap),
+        rate + power * gap,
+    )
 
 
 def updated(
@@ -71,31 +84,49 @@ def updated(
 
     The velocity's gain is held to two over the gap: one surprise after a long absence tells little of the speed now.
     """
-    gap = np.maximum(frame - later[:, SEEN], 1)
-    new = later.copy()
-    gain, turn = _gains(new, PP, PV, VV, scatter**2, 2 / gap)
-    miss = box_px[:, :2] + box_px[:, 2:] / 2 - later[:, : Y + 1]
-    new[:, : Y + 1] += gain[:, None] * miss
-    new[:, VX : VY + 1] += turn[:, None] * miss
-    gain, turn = _gains(new, SS, SG, GG, size_scatter**2, np.inf)
-    grown = np.log(box_px[:, 3] / later[:, HEIGHT])
-    new[:, HEIGHT] *= np.exp(gain * grown)
-    new[:, GROWTH] += turn * grown
-    new[:, WIDTH] += _WIDTH_GAIN * (box_px[:, 2] - later[:, WIDTH])
-    new[:, SEEN] = frame
-    return new
+    functions = namespace(later)
+    gap = functions.clip(frame - later[..., SEEN], 1, None)
+    (gain, turn), of_place = _gains(later, PP, scatter**2, 2 / gap)
+    miss = box_px[..., :2] + box_px[..., 2:] / 2 - later[..., : Y + 1]
+    (grow, growing), of_size = _gains(later, SS, size_scatter**2, None)
+    grown = functions.log(box_px[..., 3] / later[..., HEIGHT])
+    width = later[..., WIDTH] + _WIDTH_GAIN * (box_px[..., 2] - later[..., WIDTH])
+    return _table(
+        later[..., : Y + 1] + gain[..., None] * miss,
+        later[..., VX : VY + 1] + turn[..., None] * miss,
+        functions.stack([width, later[..., HEIGHT] * functions.exp(grow * grown)], -1),
+        later[..., GROWTH] + growing * grown,
+        0 * later[..., SEEN] + frame,
+        of_place,
+        of_size,
+    )
 
 
 def _gains(
-    new: np.ndarray, place: int, both: int, rate: int, noise: float, most: np.ndarray | float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Gains (N,) of a value and its rate; the variances shrink in place. most: bound of the second gain."""
-    certain = new[:, place] + noise
-    gain, turn = new[:, place] / certain, np.minimum(new[:, both] / certain, most)
-    new[:, rate] -= turn * new[:, both]
-    new[:, both] *= 1 - gain
-    new[:, place] *= 1 - gain
-    return gain, turn
+    later: np.ndarray, first: int, noise: float, most: np.ndarray | None
+) -> tuple[tuple[np.ndarray, np.ndarray], Variances]:
+    """Gains (N,) of a value and its rate, and the variances that are left. most: bound of the second gain."""
+    place, both, rate = later[..., first], later[..., first + 1], later[..., first + 2]
+    certain = place + noise
+    gain, turn = place / certain, both / certain
+    if most is not None:
+        turn = namespace(later).minimum(turn, most)
+    return (gain, turn), (place * (1 - gain), both * (1 - gain), rate - turn * both)
+
+
+def _table(
+    centre: np.ndarray,
+    velocity: np.ndarray,
+    size: np.ndarray,
+    growth: np.ndarray,
+    seen: np.ndarray,
+    of_place: Variances,
+    of_size: Variances,
+) -> np.ndarray:
+    """States (N, COLUMNS) of their parts: (N, 2) the first three, (N,) the others."""
+    functions = namespace(centre)
+    rest = functions.stack([growth, seen, *of_place, *of_size], -1)
+    return functions.concatenate([centre, velocity, size, rest], -1)
 
 
 def carried(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from torchvision_dddas.settings import TrackKnobs
+from torchvision_dddas.targets.namespace import namespace
 
 _HOPELESS, _CLOSE = -8.0, 7.0  # links that no look can save, and apart by more than looks can turn
 _WORST = -1.0  # light, shadow and turning change a look at once: little of it speaks against a link for long
@@ -13,12 +14,23 @@ def likeness_scores(
 ) -> np.ndarray:
     """(N, M) scores from histograms (N, D) of tracks and (M, D) of detections, each of sum 1 or, where unknown, 0.
 
-    The likeness is the Bhattacharyya coefficient; what is unknown scores 0. other_visible: (M,) shares of the boxes.
+    What is unknown scores 0. other_visible: (M,) shares of the boxes.
     """
-    likeness = np.sqrt(signature) @ np.sqrt(other).T
+    return scores_of(likeness(signature, other), other_visible, knobs)
+
+
+def likeness(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN where either is unknown."""
     known = np.any(signature, axis=1).reshape(-1, 1) & np.any(other, axis=1)
-    score = knobs.appearance_weight * (likeness - knobs.appearance_offset)
-    return np.where(known, np.maximum(score, _WORST) * np.sqrt(other_visible), 0.0)
+    return np.where(known, np.sqrt(signature) @ np.sqrt(other).T, np.nan)
+
+
+def scores_of(likeness: np.ndarray, visible: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
+    """(N, M) scores of likenesses, 0 for NaN. visible: (M,) shares of the boxes. Arrays or tensors."""
+    functions = namespace(likeness)
+    known = likeness == likeness
+    score = knobs.appearance_weight * (functions.where(known, likeness, 1.0) - knobs.appearance_offset)
+    return functions.where(known, functions.clip(score, _WORST, None) * functions.sqrt(visible)[..., None, :], 0.0)
 
 
 def in_doubt(links: np.ndarray, signature: np.ndarray) -> bool:

@@ -4,6 +4,7 @@ Scores of links add up, and a target without a link scores 0: no dummy has to be
 (appendix C gives dummies an affinity of their own, and its optimum is then to link nothing).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +12,10 @@ import numpy as np
 from torchvision_dddas.settings import TrackKnobs
 from torchvision_dddas.targets import kalman
 from torchvision_dddas.targets.kalman import HEIGHT, PP, SEEN, SS, USUAL_SPEED, WIDTH, X, Y
+from torchvision_dddas.targets.namespace import namespace
 
-_PRIOR = 4.0  # what a detection that continues a track is worth before anything is compared
-_TAIL = 4.0  # freedom of the distance's distribution: people turn and stop more than a normal law allows
-_UPRIGHT = 0.6  # standing people move less up and down in the picture than across it
 _WORST_SIZE = 8.0
-_MISSED, _MISSED_FRAMES = 0.5, 5.0  # the price of a gap, and how it grows
-_REST_DRIFT = 0.03  # heights per square root of a frame
-_REST_PRICE = 1.0
-_COME_BACK_AT_BORDER, _LEFT_AT_BORDER = 4.0, 2.0  # a target seen at the border after a gap is more likely another one
+_MISSED_FRAMES = 5.0  # how the price of a gap grows
 _USUAL_BIRTHS = 0.002  # per detection and frame
 _MOST_BIRTHS = 6.0  # their price at most: who comes back at once and on the spot is no newcomer, whatever else appears
 
@@ -47,9 +43,9 @@ class Sight:
 
 def near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.ndarray:
     """(N,) whether boxes (N, 4) are so close to the picture's border that a target may come or go there."""
+    x, y, width, height = (box_px[..., side] for side in range(4))
     if size is None:
-        return np.zeros(len(box_px), bool)
-    x, y, width, height = box_px.T
+        return namespace(box_px).zeros_like(x, dtype=bool)
     margin = 0.15 * height
     return (x < margin) | (y < margin) | (x + width > size[0] - margin) | (y + height > size[1] - margin)
 
@@ -59,41 +55,51 @@ def link_scores(
 ) -> np.ndarray:
     """(N, M) scores of the links from tracks to the detections of a look, appearance left out.
 
-    state: (N, kalman.COLUMNS) as last seen. left_at_border: (N,) whether they were seen at the border then.
+    state: (N, kalman.COLUMNS) as last seen. left_at_border: (N,) whether they were seen at the border then. box_px:
+    (M, 4). Arrays, or tensors with a gradient in the knobs.
     """
+    functions = namespace(state)
     later = kalman.predicted(state, sight.frame, sight.agility(knobs))
-    centre, height = box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 3])
-    score = _closeness(later, later[:, PP] + knobs.scatter**2, centre)
-    score -= _misfit(later, height, sight.doubt, knobs.size_scatter)
-    missed = sight.frame - state[:, SEEN] > sight.interval
-    if missed.any():
-        was, gap = state[missed], sight.frame - state[missed, SEEN]
-        # Who was lost may have stood still behind something: that tells where better than any velocity.
-        rest = _closeness(was, knobs.scatter**2 + _REST_DRIFT**2 * gap, centre)
-        rest -= _misfit(was, height, sight.doubt, knobs.size_scatter)
-        lost = np.maximum(score[missed], rest - _REST_PRICE)
-        lost -= (_MISSED + 0.5 * np.log1p((gap - sight.interval) / _MISSED_FRAMES))[:, None]
-        lost -= _COME_BACK_AT_BORDER * near_border(box_px, sight.size) + _LEFT_AT_BORDER * left_at_border[missed, None]
-        # Where targets keep appearing out of nowhere, this is one more rather than one come back.
-        lost -= min(knobs.births * np.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
-        score[missed] = lost
-    return score
+    centre, height = box_px[..., :2] + box_px[..., 2:] / 2, functions.log(box_px[..., 3])
+    score = _closeness(later, later[..., PP] + knobs.scatter**2, centre, knobs)
+    score = score - _misfit(later, height, sight.doubt, knobs.size_scatter)
+    gap = sight.frame - state[..., SEEN]
+    missed = gap > sight.interval
+    if not missed.any():
+        return score
+    # Who was lost may have stood still behind something: that tells where better than any velocity.
+    rest = _closeness(state, knobs.scatter**2 + knobs.rest_drift**2 * gap, centre, knobs)
+    rest = rest - _misfit(state, height, sight.doubt, knobs.size_scatter)
+    lost = functions.maximum(score, rest - knobs.rest_price)
+    late = functions.clip(gap - sight.interval, 0, None)
+    lost = lost - (knobs.missed + 0.5 * functions.log1p(late / _MISSED_FRAMES))[..., None]
+    # A target seen at the border after a gap is more likely another one.
+    lost = lost - (
+        knobs.border * near_border(box_px, sight.size)[..., None, :] + knobs.left * left_at_border[..., None]
+    )
+    # Where targets keep appearing out of nowhere, this is one more rather than one come back.
+    lost = lost - min(knobs.births * math.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
+    return functions.where(missed[..., None], lost, score)
 
 
-def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
     """(N, M) logarithm of the density of centres around places, and the prior. variance: (N,) in squared heights."""
-    upright = np.where(place[:, HEIGHT] > place[:, WIDTH], _UPRIGHT, 1.0)
-    unit = (place[:, HEIGHT] ** 2 * variance)[:, None]
-    across = centre_px[:, 0] - place[:, X : X + 1]
-    along = (centre_px[:, 1] - place[:, Y : Y + 1]) / upright[:, None]
+    functions = namespace(place)
+    # Standing people move less up and down in the picture than across it.
+    upright = functions.where(place[..., HEIGHT] > place[..., WIDTH], knobs.upright, 1.0)
+    unit = (place[..., HEIGHT] ** 2 * variance)[..., None]
+    across = centre_px[..., None, :, 0] - place[..., X : X + 1]
+    along = (centre_px[..., None, :, 1] - place[..., Y : Y + 1]) / upright[..., None]
     away = (across * across + along * along) / unit
-    peak = _PRIOR - np.log(2 * np.pi * variance * upright)
-    return peak[:, None] - (1 + _TAIL / 2) * np.log1p(away / _TAIL)
+    peak = knobs.prior - functions.log(2 * math.pi * variance * upright)
+    return peak[..., None] - (1 + knobs.tail / 2) * functions.log1p(away / knobs.tail)
 
 
 def _misfit(state: np.ndarray, height: np.ndarray, doubt: float, scatter: float) -> np.ndarray:
     """(N, M) price of a height other than expected. height: (M,) its logarithm."""
+    functions = namespace(state)
     usual = scatter * (1 + 0.5 * doubt)
-    variance = usual**2 + state[:, SS]
-    change = height - np.log(state[:, HEIGHT : HEIGHT + 1])
-    return np.minimum(0.5 * change**2 / variance[:, None], _WORST_SIZE) + 0.5 * np.log(variance / usual**2)[:, None]
+    variance = usual**2 + state[..., SS]
+    change = height[..., None, :] - functions.log(state[..., HEIGHT : HEIGHT + 1])
+    wrong = functions.clip(0.5 * change**2 / variance[..., None], None, _WORST_SIZE)
+    return wrong + 0.5 * functions.log(variance / usual**2)[..., None]

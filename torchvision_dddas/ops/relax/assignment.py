@@ -1,0 +1,75 @@
+"""One-to-one assignment of two frames' targets, softened: odds of all assignments at once, and their likelihood.
+
+An assignment pairs targets of a frame with targets of another; who stays alone scores 0, the dummy that is used any
+number of times. Its probability is exp(sum of its scores / softness) over that of all assignments: the partition
+function. Exactly that is a permanent, beyond reach; what stands here is Bethe's approximation, whose fixed point is
+found by passing messages between rows and columns (Williams and Lau, 2014: it always converges; Vontobel, 2013: it is
+the least of a convex function). As the softness goes to 0 the shares become the best assignment, and softness times the
+logarithm becomes its score.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+ROUNDS = 200
+"""Rounds of messages at most."""
+_CLOSE = 1e-10  # change of any message's logarithm that ends the rounds
+
+
+def shares(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS) -> Float[Tensor, "*B N M"]:
+    """The share of each pair in all assignments, in [0, 1]; rows and columns add up to 1 less the dummy's share.
+
+    score: -inf forbids a pair. softness: above 0, in the unit of the scores. The gradient is that of the last message,
+    taken as constant but for the scores themselves; for likelihoods use `log_partition`, whose gradient is exact.
+    """
+    scaled = score / softness
+    from_column = _from_columns(scaled.detach(), rounds)
+    return torch.softmax(torch.cat([scaled + from_column, torch.zeros_like(scaled[..., :1])], -1), -1)[..., :-1]
+
+
+def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS) -> Float[Tensor, "*B"]:
+    """softness · log Σ exp(sum of scores / softness), over all assignments, as Bethe has it.
+
+    score: -inf forbids a pair. The gradient in the scores is `shares`: at the fixed point messages have no slope, so
+    that they need none. Exact where no target of both frames has a choice, and never more than half a factor of two a
+    target off (Gurvits).
+    """
+    scaled = score / softness
+    with torch.no_grad():
+        from_column = _from_columns(scaled, rounds)
+        from_row = scaled - _log_sum_of_others(scaled + from_column, -1)
+        # Of the columns and the pairs; the rows have the slope.
+        columns = torch.logaddexp(torch.logsumexp(from_row, -2), torch.zeros_like(from_row[..., 0, :])).sum(-1)
+        pairs = torch.nn.functional.softplus(from_row + from_column).sum((-1, -2))
+    alone = torch.zeros_like(scaled[..., :1])
+    rows = torch.logsumexp(torch.cat([scaled + from_column, alone], -1), -1).sum(-1)
+    return softness * (rows + columns - pairs)
+
+
+def _from_columns(scaled: Float[Tensor, "*B N M"], rounds: int) -> Float[Tensor, "*B N M"]:
+    """Logarithms of the messages from columns to their pairs: how free a column is, would the pair not be."""
+    message = torch.zeros_like(scaled)
+    for _ in range(rounds):
+        from_row = scaled - _log_sum_of_others(scaled + message, -1)
+        new = -_log_sum_of_others(from_row, -2)
+        far = (new - message).abs().amax() if new.numel() else new.new_zeros(())
+        message = new
+        if far < _CLOSE:
+            break
+    return message
+
+
+def _log_sum_of_others(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "*B N M"]:
+    """log(1 + Σ of exp over the others of the axis), for each: the largest is left out exactly, not subtracted."""
+    if not x.numel():
+        return x
+    largest = torch.nn.functional.one_hot(x.argmax(axis), x.shape[axis]).bool()
+    if axis == -2:
+        largest = largest.transpose(-1, -2)
+    zero = torch.zeros_like(x.sum(axis, keepdim=True))
+    without = torch.logaddexp(torch.logsumexp(x.masked_fill(largest, -torch.inf), axis, keepdim=True), zero)
+    whole = torch.logaddexp(torch.logsumexp(x, axis, keepdim=True), zero)
+    # An element that is not the largest is at most half of the sum: what is left loses no more than a bit.
+    less = whole + torch.log1p(-torch.exp((x - whole).clamp(max=-0.6931471805599453)))
+    return torch.where(largest, without, less)
