@@ -1,0 +1,111 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests import airborne
+from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.targets.plane import ground_points
+from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.tuning.descent import Plan, descend
+from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.looks import SPREADS, look_at, of_settings, only_noise
+from torchvision_dddas.tuning.places import UNPLACED, family
+from torchvision_dddas.vision import load_solver
+
+HFOV = float(np.radians(70.0))
+
+
+def looks(count: int, settings: Settings, **how) -> list[Example]:
+    found = []
+    for seed in range(count):
+        look = airborne.look(seed, **how)
+        n = len(look.marks)
+        marks = replace(
+            look.marks,
+            sigma_m=np.full(n, settings.landmarks.sigma_m),
+            pixel_sigma=np.full(n, settings.landmarks.pixel_sigma),
+        )
+        flight = replace(look.flight, hfov_rad=HFOV)
+        own = np.ones(n, bool)
+        one = look_at(airborne.CAMERA, flight, marks, look.targets_px, look.targets, settings, own)
+        found.append(Example("looks", seed, (one, settings)))
+    return found
+
+
+def values(settings: Settings, names=SPREADS) -> dict[str, torch.Tensor]:
+    return {name: value for name, value in of_settings(settings).items() if name in names}
+
+
+def test_the_loss_is_that_of_the_hard_registrar():
+    settings = with_knobs(Settings(), {"aerial.correlation_s": 0.0, "aerial.tilt_sigma_deg": 1.7})
+    found = family().loss({}, looks(3, settings), 1.0)
+    for seed in range(3):
+        look = airborne.look(seed)
+        flight = replace(look.flight, hfov_rad=HFOV)
+        fix = Registrar(airborne.CAMERA, settings, load_solver("onboard")).step(1, 0.0, flight, look.marks)
+        place, covariance = ground_points(fix, airborne.CAMERA, look.targets_px, 1.0)
+        off = place - look.targets
+        squared = np.einsum("ti,tij,tj->t", off, np.linalg.inv(covariance), off)
+        wanted = (squared + np.log(np.linalg.det(covariance))) / 2 + np.log(2 * np.pi)
+        assert float(found[seed]) == pytest.approx(wanted.mean(), rel=1e-3)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
+def test_the_gradient_is_that_of_the_hard_loss(tilt_deg):
+    settings = with_knobs(Settings(), {"landmarks.sigma_m": 1.0, "aerial.heading_sigma_deg": 3.0})
+    batch = looks(4, settings, tilt_deg=tilt_deg)
+    knobs = {name: value.requires_grad_() for name, value in values(settings).items() if float(value) > 0}
+    family().loss(knobs, batch, 1.0).sum().backward()
+    checked = 0
+    for name, value in knobs.items():
+        with torch.no_grad():
+            step = 1e-3 * value
+            more, less = (family().loss({**knobs, name: value + s}, batch, 1.0).sum() for s in (step, -step))
+        # By the knob's logarithm, so that all are alike.
+        slope = float(more - less) / 2e-3
+        mine = 0.0 if value.grad is None else float(value.grad * value.detach())
+        assert mine == pytest.approx(slope, rel=0.03, abs=0.03), name
+        checked += abs(slope) > 0.1
+    assert checked >= 3
+
+
+def test_pictures_of_several_shapes_share_a_batch():
+    settings = Settings()
+    batch = [*looks(1, settings), *looks(1, settings, n=6), *looks(2, settings)]
+    together = family().loss({}, batch, 1.0)
+    assert together.tolist() == pytest.approx([float(family().loss({}, [one], 1.0)) for one in batch])
+
+
+def test_a_picture_that_no_pose_explains_costs_and_has_no_slope():
+    settings = Settings()
+    (example,) = looks(1, settings)
+    look, _ = example.content
+    upward = replace(look, targets_px=np.full_like(look.targets_px, 1e7))
+    knob = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    found = family().loss({"aerial.tilt_sigma_deg": knob}, [Example("looks", 0, (upward, settings))], 1.0)
+    found.sum().backward()
+    assert float(found) == UNPLACED
+    assert knob.grad is not None
+    assert float(knob.grad) == 0
+
+
+def test_swapped_landmarks_are_no_matter_of_noise():
+    settings = Settings()
+    (example,) = looks(1, settings, sigma_m=0.02)
+    look, _ = example.content
+    probability = settings.aerial.gate_probability
+    assert only_noise(look, values(settings), probability)
+    pixels = look.marks.image_px[[1, 0, 2, 3]]
+    swapped = replace(look, marks=replace(look.marks, image_px=pixels))
+    assert not only_noise(swapped, values(settings), probability)
+
+
+def test_noise_that_was_thought_too_small_is_found():
+    thought = with_knobs(Settings(), {"landmarks.sigma_m": 0.5})
+    batch = looks(40, thought)
+    knobs = Knobs(thought, ["landmarks.sigma_m"])
+    done = descend(family(), knobs, batch, Plan(steps=30, batch=16, rate=0.15, watched=0))
+    assert done.settings.landmarks.sigma_m == pytest.approx(airborne.GPS_M, rel=0.3)

@@ -1,0 +1,81 @@
+"""Places on the ground: how surprising their errors are under their ellipses, which calibrates these.
+
+The loss is the negative log-likelihood of the true places, in nats a target: smaller ellipses gain, until errors fall
+outside of them more often than they should. Frames stand alone: what the registrar remembers from frame to frame
+(aerial.correlation_s) makes its ellipses smaller than those tuned here, and is judged by the study's figures.
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.modules.places import Linear, laid, stepped, surprise
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.studies.record import Task
+from torchvision_dddas.targets.pose import EXACT_M
+from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.tuning.looks import Laid, Look, joined, of_settings
+from torchvision_dddas.tuning.looks import laid as hard_laid
+
+UNPLACED = 25.0
+"""Nats that a picture costs which no pose of the camera explains, or whose rays miss the ground: no slope, no NaN."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """The family `location`."""
+
+    name: str = "location"
+    task: Task = "location"
+    measure: str = "location.metres.mean_m"
+    softness: tuple[float, float] = (1.0, 1.0)
+    """Without effect: nothing here is hard."""
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """Looks of clips that are located along their pictures. See `family.Family`."""
+        raise NotImplementedError
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,) nats a target. See `family.Family`."""
+        found: list[Tensor] = [torch.zeros(())] * len(batch)
+        groups: dict[tuple[int, int], list[tuple[int, Look, dict[str, Tensor], Laid]]] = defaultdict(list)
+        for row, example in enumerate(batch):
+            look, settings = example.content
+            values = {**of_settings(settings), **knobs}
+            here = hard_laid(look, values)
+            if here is None:
+                found[row] = torch.full((), UNPLACED, dtype=torch.float64) + 0 * sum(knobs.values())
+            else:
+                groups[len(look.marks), len(look.true_m)].append((row, look, values, here))
+        for members in groups.values():
+            lost = _lost([look for _, look, _, _ in members], members[0][2], [here for *_, here in members])
+            for (row, *_), value in zip(members, lost, strict=True):
+                found[row] = value
+        return torch.stack(found)
+
+
+def family() -> Places:
+    """See `family.family_of`."""
+    return Places()
+
+
+def _lost(looks: Sequence[Look], knobs: dict[str, Tensor], here: Sequence[Laid]) -> Tensor:
+    """(B,) of looks with as many landmarks and targets each."""
+    parts = ("missing", "slopes", "correction", "by_turn", "known")
+    problem = Linear(*(torch.stack([getattr(one.problem, part) for one in here]) for part in parts))
+    places = joined([look.places for look in looks]).variance(knobs).clamp(min=EXACT_M**2)
+    pixels = joined([look.pixels for look in looks]).variance(knobs)
+    prior = joined([look.prior for look in looks]).variance(knobs)
+    variance = torch.cat([prior, places.repeat_interleave(2, dim=1)], dim=1)
+    step, covariance = stepped(problem, pixels.repeat_interleave(2, dim=1), variance)
+    off_m, by_pose, by_pixel = (
+        torch.stack([getattr(one, part) for one in here]) for part in ("off_m", "by_pose", "by_pixel")
+    )
+    spot = joined([look.spot for look in looks]).variance(knobs)
+    off_m, spread = laid(off_m, by_pose, by_pixel, step, covariance, spot)
+    shared = knobs["landmarks.common_sigma_m"] ** 2 * torch.eye(2, dtype=spread.dtype)
+    return surprise(off_m, spread + shared).mean(dim=1)
