@@ -175,12 +175,18 @@ class Locator:
             fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, look.marks, moved, spent
         )
 
+    def points(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (N, 2) that stand for targets under a fix, and how high above the ground those are (N,) m."""
+        height = self.settings.aerial.target_height_m
+        pixels, lift = points_of(targets, self.settings.aerial, fix.pose is not None)
+        if targets.bodies and lift.any() and (feet := self.feet(pixels, fix, height)) is not None:
+            return feet, np.zeros(len(feet))
+        return pixels, lift
+
     def _laid(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
         knobs = self.settings.aerial
-        pixels, lift = points_of(targets, knobs, fix.pose is not None)
-        if targets.bodies and lift.any() and (feet := self.feet(pixels, fix, knobs.target_height_m)) is not None:
-            pixels, lift = feet, np.zeros(len(pixels))
+        pixels, lift = self.points(fix, targets)
         place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
         _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
         variance = sigma_of(targets, knobs) ** 2

@@ -40,13 +40,12 @@ def score_places(clip: "Clip", found: "Found") -> Scored:
         raise InputError(f"{clip.name}: no frame that was looked at has a true place")
     rows = np.flatnonzero(np.isfinite(place_m).all(axis=1))
     frame, box_px, notes = found.frame[rows], found.box_px[rows], []
-    if truth.tracks is not None and len(truth.tracks.frame) and np.isfinite(box_px).all():
-        whose, shown = _by_boxes(truth, truth.tracks, truth.positions, frame, box_px)
-        wanted = shown[seen[shown]]  # what a picture shows; others nobody can locate
-    else:
-        whose = metres.by_places(frame, place_m[rows], truth.positions.frame, true_m)
+    whose, shown = whose_places(truth, truth.positions, true_m, frame, box_px, place_m[rows])
+    if shown is None:
         wanted = np.flatnonzero(seen)
         notes.append(f"{clip.name}: no boxes to tell targets by; the nearest within {metres.FARTHEST_M:g} m is taken")
+    else:
+        wanted = shown[seen[shown]]  # what a picture shows; others nobody can locate
     mine, true_row = rows[whose >= 0], whose[whose >= 0]
     off = place_m[mine] - true_m[true_row]
     relative, ellipse = np.full_like(off, np.nan), np.full((len(mine), 2, 2), np.nan)
@@ -72,6 +71,19 @@ def score_places(clip: "Clip", found: "Found") -> Scored:
     }
     counts = Located(len(wanted), len(mine), int((whose == _NOBODY).sum()))
     return Scored(frames, {"location": counts}, {"location": each}, {}, samples, tuple(notes))
+
+
+def whose_places(
+    truth: Truth, places: Positions, true_m: np.ndarray, frame: np.ndarray, box_px: np.ndarray, place_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """(N,) the row of the true place of each located box, below 0 for none; and the rows whose boxes count.
+
+    The latter None where the truth has no boxes, and the nearest places are taken. true_m: of all places, (P, 2), in
+    the metres of place_m, (N, 2).
+    """
+    if truth.tracks is not None and len(truth.tracks.frame) and np.isfinite(box_px).all():
+        return _by_boxes(truth, truth.tracks, places, frame, box_px)
+    return metres.by_places(frame, place_m, places.frame, true_m), None
 
 
 def _per_frame(frames: np.ndarray, found: np.ndarray) -> np.ndarray:
