@@ -23,6 +23,7 @@ from torchvision_dddas.cli.settings import settings
 from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
+from torchvision_dddas.cli.tune import tune
 
 app = typer.Typer(
     name="dddas",
@@ -33,7 +34,7 @@ app = typer.Typer(
 )
 for command in (
     *(run, detect, people, track, confirm, calibrate, colours),
-    *(evaluate, compare, sweep, simulate, export, demo, settings),
+    *(evaluate, compare, sweep, tune, simulate, export, demo, settings),
 ):
     app.command()(command)
 app.add_typer(locate, name="locate")

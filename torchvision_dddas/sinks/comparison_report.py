@@ -10,7 +10,7 @@ from torchvision_dddas.sinks.page import SCRIPT, page
 from torchvision_dddas.sinks.page_tables import Cell, Column, figure, number, sorted_table, words
 from torchvision_dddas.sinks.study_report.words import GROUPS, TITLES, measure
 
-_MEANING = (
+MEANING = (
     "Better and worse are beyond noise: p below 0.05 after Holm's correction for all that is asked here. "
     "“On these clips” is by blocks of their frames and says nothing of other clips; "
     "“too little to tell”: so few frames or clips could not show any change."
@@ -23,13 +23,13 @@ def comparison_report(found: Mapping[str, Any]) -> str:
     """The HTML. found: as `studies.comparing.compare` has it, NaN as None."""
     first, second = str(found["first"]), str(found["second"])
     title = f"{first} and {second}: comparison"
-    parts = [f"<h1>{escape(first)} → {escape(second)} <span>comparison</span></h1>", f'<p class="soft">{_MEANING}</p>']
+    parts = [f"<h1>{escape(first)} → {escape(second)} <span>comparison</span></h1>", f'<p class="soft">{MEANING}</p>']
     parts += ['<div class="cards">', *(_card(task, mine) for task, mine in found["tasks"].items()), "</div>"]
     if found["notes"]:
         items = "".join(f"<li>{escape(note)}</li>" for note in found["notes"])
         parts.append(f"<details open><summary>Not compared ({len(found['notes'])})</summary><ul>{items}</ul></details>")
     for task, mine in found["tasks"].items():
-        parts += _task(task, mine, first, second)
+        parts += compared(task, TITLES.get(task, task), mine, first, second)
     return page(title, parts, script=SCRIPT)
 
 
@@ -49,8 +49,12 @@ def _card(task: str, mine: Mapping[str, Any]) -> str:
     return f'<section class="card">{"".join(parts)}</section>'
 
 
-def _task(task: str, mine: Mapping[str, Any], first: str, second: str) -> list[str]:
-    parts = [f'<h2 id="{escape(task)}">{escape(TITLES.get(task, task))}</h2>']
+def compared(anchor: str, title: str, mine: Mapping[str, Any], first: str, second: str) -> list[str]:
+    """The section of a task: plots clip by clip, all clips together, single clips. mine: found["tasks"][task].
+
+    anchor: what a link to the section names; first, second: what the columns are called.
+    """
+    parts = [f'<h2 id="{escape(anchor)}">{escape(title)}</h2>']
     if plots := _plots(mine["clips"], mine["same"]):
         parts += ['<div class="plots">', *plots, "</div>"]
     rows = [

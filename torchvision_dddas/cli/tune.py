@@ -1,0 +1,351 @@
+"""`dddas tune`: knobs fitted by gradient on the clips of a study, and what that was worth on clips held out."""
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.cli.progress import EVERY_S
+from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from torchvision_dddas.tuning.costing import TimeCost
+    from torchvision_dddas.tuning.descent import Descended, Plan, Step
+    from torchvision_dddas.tuning.preparing import Prepared
+    from torchvision_dddas.tuning.verdict import Side, Verdict
+
+CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
+
+
+@explained
+def tune(
+    study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as of dddas evaluate.")],
+    knobs: Annotated[
+        str, typer.Option(metavar="KNOB,...", help="What to tune, such as difference.threshold or 'difference.*'.")
+    ],
+    steps: Annotated[int, typer.Option(metavar="N", help="Steps at most.")] = 100,
+    holdout: Annotated[
+        str | None,
+        typer.Option(metavar="PATTERN,...", help="Clips that nothing is learned from, measured before and after."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the order in which examples are learned from.")] = 0,
+    cost: Annotated[
+        float | None,
+        typer.Option(metavar="WEIGHT", help="The loss that a frame of twice the time is worth. [default: none]"),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    batch: Annotated[int, typer.Option(metavar="N", help="Examples of a step.")] = 8,
+    rate: Annotated[float, typer.Option(help="Of a step: 0.05 is about 5 % of a knob.")] = 0.05,
+    patience: Annotated[int, typer.Option(metavar="N", help="Looks, one every 5 steps, without a gain.")] = 10,
+    minutes: Annotated[float | None, typer.Option(help="No step is begun after so many.")] = None,
+    device: Annotated[str, typer.Option(help="Where the steps are computed: cpu, cuda, cuda:1.")] = "cpu",
+    measure: Annotated[
+        str | None,
+        typer.Option(metavar="TASK.GROUP.MEASURE", help="Told before and after. [default: that of the knobs' family]"),
+    ] = None,
+    clips: Annotated[
+        str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", help="Processes that measure before and after. [default: one a core]")
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
+    ] = None,
+    config: Config = None,
+    set_: Overrides = None,
+    backend: Annotated[
+        Backend | None, typer.Option(help="The engine that measures before and after. [default: as STUDY says]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for tuned.toml, report.html and run.json.")] = Path("dddas-tune"),
+    quiet: Quiet = False,
+) -> None:
+    """Tune knobs by gradient on the clips of a study, and measure before and after, held-out clips apart.
+
+    Writes tuned.toml, which every command takes as --config, report.html and run.json.
+    """
+    _need_torch()
+    from torchvision_dddas.cli.study import asked
+    from torchvision_dddas.tuning.descent import Plan
+
+    if jobs is not None and jobs < 0:
+        raise InputError(f"--jobs is {jobs}; wanted 0 or more processes")
+    if minutes is not None and not minutes > 0:
+        raise InputError(f"--minutes is {minutes:g}; wanted more than 0")
+    longest_s = float("inf") if minutes is None else 60 * minutes
+    plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s)
+    spec = asked(study, config, set_ or [], backend and backend.value, None)
+    _Tuning(out, plan, quiet, jobs, cache).run(
+        partial(
+            _prepared,
+            spec,
+            study.parent,
+            _words(knobs),
+            _words(holdout),
+            _words(clips),
+            measure,
+            _device(device),
+            quiet,
+        ),
+        cost,
+        resume,
+        spec.backend,
+    )
+
+
+class _Tuning:
+    """A run of the command, and its files."""
+
+    def __init__(self, folder: Path, plan: "Plan", quiet: bool, jobs: int | None, cache: Path | None) -> None:
+        self._folder, self._plan, self._quiet, self._jobs, self._cache = folder, plan, quiet, jobs, cache
+        self._seconds: dict[str, float] = {}
+        self._said, self._least = 0.0, (float("inf"), 0)
+
+    def run(self, prepared: Any, weight: float | None, resume: bool, backend: str) -> None:
+        """All of it. Raises InputError, at the end too where a loss was no number."""
+        from torchvision_dddas.tuning.descent import descend
+
+        began = time.perf_counter()
+        ready: Prepared = prepared()
+        self._clock("examples", began)
+        self._begin(ready)
+        cost = None if weight is None else self._cost(ready, weight, backend, resume)
+        before = _values(ready)
+        began = time.perf_counter()
+        place = self._folder / CHECKPOINT
+        tell = (lambda step: None) if self._quiet else self._tell
+        found = descend(ready.family, ready.knobs, ready.examples, self._plan, cost, tell, place, resume)
+        self._clock("descent", began)
+        self._toml(ready, found, None)
+        verdict = self._judged(ready)
+        self._toml(ready, found, verdict)
+        record = self._record(ready, found, cost, before, verdict)
+        self._report(record)
+        self._write(RUN, _json(record))
+        if not self._quiet:
+            show(verdict, self._folder, before, _values(ready))
+        if found.failed:
+            raise InputError(f"{found.failed}; {self._folder / TUNED} holds the last good state, of step {found.best}")
+
+    def _begin(self, ready: "Prepared") -> None:
+        if not self._quiet:
+            told = f"{ready.family.name}: {len(ready.examples)} examples of {_clips(len(ready.tuned))}"
+            held = f", {_clips(len(ready.held))} held out" if ready.held else ""
+            print(told + held, file=sys.stderr, flush=True)
+        self._write(RUN, _json({"state": "running", "study": ready.spec.name}))
+
+    def _cost(self, ready: "Prepared", weight: float, backend: str, resume: bool) -> "TimeCost":
+        """What the knobs cost, measured on the shortest clip; of a descent that is taken up, as it was measured."""
+        from torchvision_dddas.cli.progress import progress
+        from torchvision_dddas.tuning import costing
+
+        place = self._folder / COST
+        if resume and place.is_file():
+            return costing.read(place)
+        began = time.perf_counter()
+        clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
+        names, settings = ready.knobs.names, ready.knobs.base
+        count = costing.REPEATS * len(costing.points(settings, names))
+        with progress("what time costs", count, self._quiet) as tick:
+            cost = costing.measured(clip, ready.goal.task, settings, names, weight, backend, tick=tick)
+        costing.write(place, cost)
+        self._clock("cost", began)
+        return cost
+
+    def _tell(self, step: "Step") -> None:
+        """A line for each look, and every few seconds."""
+        now = time.monotonic()
+        if step.watched is None and now - self._said < EVERY_S:
+            return
+        self._said = now
+        told = f"step {step.step} of {self._plan.steps}"
+        told += f": loss {step.loss:.4f}" if step.step else ""
+        if step.watched is not None:
+            self._least = min(self._least, (step.watched, step.step))
+            told += f"{',' if step.step else ':'} watched {step.watched:.4f}"
+            told += f" (least {self._least[0]:.4f} at step {self._least[1]})"
+        print(told, file=sys.stderr, flush=True)
+
+    def _judged(self, ready: "Prepared") -> "Verdict":
+        from torchvision_dddas.cli.study import shown
+        from torchvision_dddas.tuning.verdict import judge
+
+        began, hidden = time.perf_counter(), partial(shown, self._quiet)
+        jobs, cache = self._jobs, self._cache
+        after = _values(ready)
+        found = judge(ready.spec, ready.base, ready.goal, after, ready.tuned, ready.held, jobs, cache, hidden)
+        self._clock("before and after", began)
+        return found
+
+    def _toml(self, ready: "Prepared", found: "Descended", verdict: "Verdict | None") -> None:
+        from torchvision_dddas.studies.sweep import as_toml
+
+        about = [f"dddas tune: {', '.join(ready.knobs.names)} on {', '.join(ready.tuned)}, step {found.best}."]
+        if verdict is not None:
+            about += [f"{line}." for line in _told(verdict)]
+        self._write(TUNED, as_toml(found.settings, about))
+
+    def _record(
+        self,
+        ready: "Prepared",
+        found: "Descended",
+        cost: "TimeCost | None",
+        before: Mapping[str, Any],
+        verdict: "Verdict",
+    ) -> dict[str, Any]:
+        """What run.json holds, and the page shows."""
+        from torchvision_dddas.modules.tunable import TUNABLE
+        from torchvision_dddas.settings import all_knobs
+        from torchvision_dddas.sinks.journal import versions
+
+        spec, after = ready.spec, _values(ready)
+        meaning = {knob.name: knob.meaning for knob in all_knobs()}
+        charged = None
+        if cost is not None:
+            expected = float(cost.expected({name: value.detach() for name, value in ready.knobs.values().items()}))
+            charged = {**asdict(cost), "expected": expected}
+        return {
+            "state": "failed" if found.failed else "complete",
+            "versions": versions(),
+            "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
+            "family": ready.family.name,
+            "plan": asdict(self._plan),
+            "examples": len(ready.examples),
+            "knobs": {
+                name: {
+                    "before": before[name],
+                    "after": after[name],
+                    "unit": TUNABLE[name].unit,
+                    "range": TUNABLE[name].range,
+                    "meaning": meaning[name],
+                    "idle": name in found.idle,
+                }
+                for name in ready.knobs.names
+            },
+            "best": found.best,
+            "ended": found.ended,
+            "failed": found.failed,
+            "history": [asdict(step) for step in found.history],
+            "cost": charged,
+            "verdict": verdict.told(),
+            "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},
+        }
+
+    def _report(self, record: dict[str, Any]) -> None:
+        from torchvision_dddas.sinks.journal import finite
+        from torchvision_dddas.sinks.tuning_report import tuning_report
+
+        self._write(REPORT, tuning_report(finite(record)))
+
+    def _clock(self, what: str, began: float) -> None:
+        self._seconds[what] = time.perf_counter() - began
+
+    def _write(self, name: str, text: str) -> None:
+        from torchvision_dddas.sinks.whole import cannot_write, write_whole
+
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self._folder / name, text.encode())
+        except OSError as error:
+            raise cannot_write(self._folder / name, error) from error
+
+
+def show(verdict: "Verdict", folder: Path, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+    """Print the knobs, what they were worth, and where the rest is."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    table = Table(title=f"Tuned: {verdict.goal.name}, {'less' if verdict.goal.least else 'more'} is better")
+    for column in ("knob", "before", "after"):
+        table.add_column(column, justify="left" if column == "knob" else "right")
+    for name in after:
+        table.add_row(name, f"{before[name]:g}", f"{after[name]:g}")
+    console.print(table)
+    for line in _told(verdict):
+        console.print(line, markup=False, highlight=False)
+    for side in (verdict.tuned, verdict.held):
+        for note in () if side is None else side.notes:
+            console.print(f"note: {note}", markup=False, highlight=False)
+    typer.echo(f"{folder}: {TUNED} (for --config), {REPORT}, {RUN}")
+
+
+def _told(verdict: "Verdict") -> list[str]:
+    """What tuning was worth, a line for each set of clips."""
+    lines = [_line("Tuned on", verdict.tuned, verdict)]
+    return lines if verdict.held is None else [*lines, _line("Held out", verdict.held, verdict)]
+
+
+def _line(what: str, side: "Side", verdict: "Verdict") -> str:
+    from torchvision_dddas.studies.swept import number
+
+    goal = verdict.goal
+    told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {number(side.pooled[0])} -> {number(side.pooled[1])}"
+    entry = side.changes and side.changes["tasks"].get(goal.task, {}).get("pooled", {}).get(goal.group, {})
+    says = entry.get(goal.measure, {}).get("says", "") if entry else ""
+    mean = f", mean of clips {number(side.mean[0])} -> {number(side.mean[1])}" if len(side.clips) > 1 else ""
+    return told + mean + (f": {says}" if says else "")
+
+
+def _prepared(
+    spec: Any,
+    base: Path,
+    names: list[str],
+    holdout: list[str],
+    clips: list[str],
+    measure: str | None,
+    device: Any,
+    quiet: bool,
+) -> "Prepared":
+    from torchvision_dddas.cli.progress import progress
+    from torchvision_dddas.tuning.preparing import prepare
+
+    with progress("examples", None, quiet) as tick:
+        ready = prepare(spec, base, names, holdout, clips, measure, tick)
+    ready.knobs.to(device)
+    return ready
+
+
+def _values(ready: "Prepared") -> dict[str, Any]:
+    """The knobs as settings have them."""
+    dumped = ready.knobs.settings().model_dump()
+    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.knobs.names}
+
+
+def _device(name: str) -> Any:
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"--device {name} will not do: {str(error).splitlines()[0]}; wanted cpu or cuda") from None
+    return device
+
+
+def _need_torch() -> None:
+    if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
+        raise InputError(f"dddas tune needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]'")
+
+
+def _words(text: str | None) -> list[str]:
+    return [word.strip() for word in (text or "").split(",") if word.strip()]
+
+
+def _clips(count: int) -> str:
+    return f"{count} clip{'s' * (count != 1)}"
+
+
+def _json(content: Any) -> str:
+    from torchvision_dddas.sinks.journal import finite
+
+    return json.dumps(finite(content), indent=2) + "\n"

@@ -1,0 +1,166 @@
+"""What a frame's time is expected to be, knob by knob: measured once by the hard pipeline, then a term of the loss."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median, stdev
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.modules.tunable import TUNABLE
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.sinks.whole import cannot_write, write_whole
+from torchvision_dddas.studies.record import Found, Task
+from torchvision_dddas.studies.stages import find, upstream
+
+FACTORS = (0.5, 2.0)
+"""A knob is measured at its value, and at these parts and multiples of it, within its range."""
+
+REPEATS = 3
+NOISE = 2.0
+"""A change of the time that is no larger than so many times what repeats differ by is none."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """How many times as long a frame takes at some values of a knob, which ascend; 1 at the value that it has."""
+
+    knob: str
+    values: tuple[float, ...]
+    times: tuple[float, ...]
+
+    def factor(self, value: Tensor) -> Tensor:
+        """Between the values in straight lines over the knob's scale, beyond them as at the last."""
+        tunable = TUNABLE[self.knob]
+        values = torch.tensor(self.values, dtype=value.dtype, device=value.device)
+        places, here = (((x + tunable.offset).log() if tunable.log else x) for x in (values, value))
+        found = value.new_tensor(self.times[0]) + 0 * value
+        for k in range(1, len(self.values)):
+            share = ((here - places[k - 1]) / (places[k] - places[k - 1])).clamp(0, 1)
+            found = found + share * (self.times[k] - self.times[k - 1])
+        return found
+
+
+@dataclass(frozen=True)
+class TimeCost:
+    """A loss of `weight` for every more time of the seconds that a frame takes with the settings as they are."""
+
+    weight: float
+    seconds: float
+    curves: tuple[Curve, ...]
+
+    def term(self, knobs: Mapping[str, Tensor]) -> Tensor:
+        """Weight × (expected seconds / seconds with the settings as they are − 1)."""
+        return self.weight * (self.expected(knobs) / self.seconds - 1)
+
+    def expected(self, knobs: Mapping[str, Tensor]) -> Tensor:
+        """Seconds a frame: the knobs' factors multiplied, as if none changed what another costs."""
+        found = torch.tensor(self.seconds, dtype=torch.float64)
+        for curve in self.curves:
+            if curve.knob in knobs:
+                found = found * curve.factor(knobs[curve.knob])
+        return found
+
+
+def measured(
+    clip: Clip,
+    task: Task,
+    settings: Settings,
+    names: Sequence[str],
+    weight: float,
+    backend: str = "auto",
+    repeats: int = REPEATS,
+    timed: Callable[[Settings], float] | None = None,
+    tick: Callable[[], object] = lambda: None,
+) -> TimeCost:
+    """Time a task on a clip with each knob in turn at other values, in turns. timed: in place of the hard pipeline.
+
+    tick: called after each of `points` × repeats. Raises InputError for a weight below 0, and as the task does.
+    """
+    if not (math.isfinite(weight) and weight >= 0):
+        raise InputError(f"the cost is {weight:g}; wanted 0 or more: the loss that a frame of twice the time is worth")
+    timed = timed or _timer(clip, task, settings, backend)
+    todo = points(settings, names)
+    took: dict[tuple[str, float], list[float]] = {point: [] for point in todo}
+    for turn in range(repeats):
+        for point in todo if turn % 2 == 0 else reversed(todo):
+            took[point].append(timed(_at(settings, point)))
+            tick()
+    base = median(took["", 0.0])
+    # Logarithms, as times differ by factors; what repeats of the same settings differ by is noise.
+    spread = median(stdev(map(math.log, ts)) for ts in took.values()) if repeats > 1 else 0.0
+    curves = []
+    for name in names:
+        start = _value(settings, name)
+        known = {value: median(ts) / base for (of, value), ts in took.items() if of == name}
+        if any(abs(math.log(factor)) > NOISE * spread for factor in known.values()):
+            both = sorted({**known, start: 1.0}.items())
+            curves.append(Curve(name, tuple(v for v, _ in both), tuple(f for _, f in both)))
+    return TimeCost(weight, base, tuple(curves))
+
+
+def points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
+    """What is timed: a knob and its value, and first no knob at all."""
+    found = [("", 0.0)]
+    for name in names:
+        tunable, start = TUNABLE[name], _value(settings, name)
+        for factor in FACTORS:
+            value = tunable.rounded((start + tunable.offset) * factor - tunable.offset)
+            point = (name, float(value))
+            if value != start and point not in found and _possible(settings, point):
+                found.append(point)
+    return found
+
+
+def write(place: Path, cost: TimeCost) -> None:
+    """Keep what was measured: another time it would be a little other. Raises InputError where the disk refuses."""
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(place, (json.dumps(asdict(cost), indent=2) + "\n").encode())
+    except OSError as error:
+        raise cannot_write(place, error) from error
+
+
+def read(place: Path) -> TimeCost:
+    """Read it back. Raises InputError where it is damaged."""
+    try:
+        told = json.loads(place.read_text(encoding="utf-8"))
+        curves = [Curve(str(c["knob"]), tuple(c["values"]), tuple(c["times"])) for c in told["curves"]]
+        return TimeCost(float(told["weight"]), float(told["seconds"]), tuple(curves))
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        raise InputError(f"{place} does not tell the cost of the knobs; begin again without --resume") from None
+
+
+def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
+    need = upstream(clip, task)
+    before: Found | None = None if need is None else find(clip, need, settings, backend)
+
+    def timed(changed: Settings) -> float:
+        found = find(clip, task, changed, backend, before=before)
+        return sum(found.seconds.values()) / max(len(found.looked), 1)
+
+    timed(settings)  # what is only slow the first time
+    return timed
+
+
+def _at(settings: Settings, point: tuple[str, float]) -> Settings:
+    name, value = point
+    return with_knobs(settings, {name: TUNABLE[name].rounded(value)}) if name else settings
+
+
+def _possible(settings: Settings, point: tuple[str, float]) -> bool:
+    try:
+        _at(settings, point)
+    except InputError:
+        return False
+    return True
+
+
+def _value(settings: Settings, name: str) -> float:
+    group, key = name.split(".")
+    return float(getattr(getattr(settings, group), key))
