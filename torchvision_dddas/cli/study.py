@@ -54,7 +54,7 @@ def study_into(
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder, "run.json", {"state": "running", "study": spec.name})
         try:
-            with _shown(quiet) as (begun, tell):
+            with shown(quiet) as (begun, tell):
                 results = run_study(spec, base, jobs, scheduler, place, clips, tell, begun, together)
         except BaseException:
             _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
@@ -136,7 +136,7 @@ def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Event], None]]]":
+def shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Event], None]]]":
     """How far a study is, on stderr: a bar on a terminal, elsewhere a line for each clip and every few seconds."""
     if quiet:
         yield lambda planned: None, lambda event: None
