@@ -1,7 +1,7 @@
 """What changed between registered frames, apart from the light (appendix B, step S4)."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from .blur import box_sum
@@ -64,6 +64,32 @@ def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Fl
     middle = (mask.sum(1, keepdim=True) - 1) // 2
     ordered = values.masked_fill(~mask, torch.inf).sort(1).values
     return torch.where(middle >= 0, ordered.gather(1, middle.clamp(min=0)), torch.zeros_like(ordered[:, :1]))
+
+
+def noise_weight(
+    texture: Float[Tensor, "B 1 H W"], noise_levels: float | Tensor, gradient_share: float | Tensor
+) -> Float[Tensor, "B 1 H W"]:
+    """One over the noise expected of a pixel, in grey levels: that of a flat region, and a share of the gradient.
+
+    texture: 4 x grey levels a pixel, as `gradient` gives it.
+    """
+    # In place where that keeps the gradient of the knobs.
+    return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()
+
+
+def noise_units(
+    z: UInt8[Tensor, "B 1 H W"], textured: Bool[Tensor, "B 1 H W"], scale: float, least: int = 500
+) -> Float[Tensor, "B"]:
+    """The median of z / scale over textured pixels where that is above 1, else 1; 1 too where they are too few."""
+    units = []
+    for one, here in zip(z, textured, strict=True):
+        counts = torch.bincount(one[here], minlength=256).cumsum(0)
+        total = int(counts[-1])
+        # The mean of the two in the middle, as NumPy takes it.
+        ranks = torch.tensor([(total - 1) // 2, total // 2], device=z.device)
+        median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > least else 0.0
+        units.append(max(1.0, median / scale))
+    return torch.tensor(units, dtype=torch.float64, device=z.device)
 
 
 def gradient(levels: Float[Tensor, "B 1 H W"], block: int = 5) -> Float[Tensor, "B 1 H W"]:

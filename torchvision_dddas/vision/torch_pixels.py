@@ -10,6 +10,8 @@ from torchvision_dddas.settings import DifferenceKnobs, SmallKnobs
 from torchvision_dddas.vision.protocol import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, View, Window
 
 LEVEL = 255.0
+# Pixels of more gradient, 4 x grey levels each, have texture: they tell how well the registration fits.
+TEXTURED = 16
 
 
 def levels_of(view: View, device: torch.device) -> Tensor:
@@ -36,14 +38,13 @@ def evidence(
     """The largest evidence over the near pairs, and that of the wide pair, uint8."""
     width = grey.shape[-1]
     if knobs.kind == "normalized":
-        noise = texture.square().mul_((knobs.gradient_share / 4) ** 2).add_(knobs.noise_levels**2)
-        weight, textured = noise.rsqrt_().mul_(EVIDENCE_SCALE), texture > 16
-    distance = {k: apart(grey, warped[k]) for k in _used(window)} if knobs.kind != "between_later" else {}
+        weight = difference.noise_weight(texture, knobs.noise_levels, knobs.gradient_share).mul_(EVIDENCE_SCALE)
+        textured = texture > TEXTURED
+    distance = distances(window, grey, warped, knobs)
 
     def of(pair: tuple[int, int]) -> Tensor:
-        a, b = pair
-        both = seen_by_both(seen[a], seen[b], width)
-        least = apart(warped[a], warped[b]) if not distance else torch.minimum(distance[a], distance[b])
+        both = seen_by_both(seen[pair[0]], seen[pair[1]], width)
+        least = least_of(pair, distance, warped)
         if knobs.kind != "normalized":
             return blur.gaussian_levels(least, knobs.blur_px) * both
         z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
@@ -90,20 +91,23 @@ def _used(window: Window) -> set[int]:
     return {k for pair in (*window.near, *([window.wide] if window.wide else [])) for k in pair}
 
 
+def distances(window: Window, grey: Tensor, warped: list[Tensor], knobs: DifferenceKnobs) -> dict[int, Tensor]:
+    """How far each neighbour that counts is from the reference; none where neighbours are compared to each other."""
+    return {k: apart(grey, warped[k]) for k in _used(window)} if knobs.kind != "between_later" else {}
+
+
+def least_of(pair: tuple[int, int], distance: dict[int, Tensor], warped: list[Tensor]) -> Tensor:
+    """The difference that both neighbours of a pair show."""
+    a, b = pair
+    return apart(warped[a], warped[b]) if not distance else torch.minimum(distance[a], distance[b])
+
+
 def _in_units(z: Tensor, textured: Tensor) -> Tensor:
     """Evidence divided by its median over textured pixels, where that is above one noise unit."""
-    units = []
-    for one, here in zip(z, textured, strict=True):
-        counts = torch.bincount(one[here], minlength=256).cumsum(0)
-        total = int(counts[-1])
-        # The mean of the two in the middle, as NumPy takes it.
-        ranks = torch.tensor([(total - 1) // 2, total // 2], device=z.device)
-        median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > 500 else 0.0
-        units.append(max(1.0, median / EVIDENCE_SCALE))
-    if max(units) == 1.0:
+    units = difference.noise_units(z, textured, EVIDENCE_SCALE)
+    if bool((units == 1.0).all()):
         return z
-    per_unit = torch.tensor([1 / unit for unit in units], device=z.device).reshape(-1, 1, 1, 1)
-    return z.float().mul_(per_unit).round_().to(torch.uint8)
+    return z.float().mul_(units.reciprocal().to(torch.float32).reshape(-1, 1, 1, 1)).round_().to(torch.uint8)
 
 
 def exposed(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:

@@ -5,7 +5,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +24,19 @@ Item = TypeVar("Item")
 
 # Pixels of warped neighbours in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
 PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
+
+
+class Registered(NamedTuple):
+    """A batch of references and what their neighbours show of them.
+
+    grey: (B, 1, H, W) uint8; warped: the same for each neighbour; seen: for each the first and last column of every row
+    that it shows (see `warp.seen_columns`); texture: (B, 1, H, W) float, 4 x grey levels a pixel.
+    """
+
+    grey: Tensor
+    warped: list[Tensor]
+    seen: list[tuple[Tensor, Tensor]]
+    texture: Tensor
 
 
 class TorchVision:
@@ -69,8 +82,9 @@ class TorchVision:
             for result in self._foreground_at_once(windows[first : first + step])
         ]
 
-    def _foreground_at_once(self, windows: list[Window]) -> list[Foreground]:
-        knobs, morph, one = self.knobs.difference, self.knobs.morphology, windows[0]
+    def registered(self, windows: list[Window]) -> Registered:
+        """Windows of equal structure with their neighbours warped to the references, in the references' light."""
+        knobs, one = self.knobs.difference, windows[0]
         (width, height), count = one.reference.size, len(one.neighbours)
         grey = torch.cat([torch.from_numpy(window.reference.grey)[None, None] for window in windows]).to(self.device)
         levels = joined([levels_of(window.reference, self.device) for window in windows])
@@ -93,6 +107,11 @@ class TorchVision:
         # Without either nobody asks for the texture.
         wanted = knobs.kind == "normalized" or self.knobs.refine.on
         texture = difference.gradient(levels) if wanted else torch.zeros_like(levels)
+        return Registered(grey, warped, seen, texture)
+
+    def _foreground_at_once(self, windows: list[Window]) -> list[Foreground]:
+        knobs, morph, one = self.knobs.difference, self.knobs.morphology, windows[0]
+        grey, warped, seen, texture = self.registered(windows)
         near, wide = evidence(one, grey, warped, seen, texture, knobs)
         scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
         core = (near > int(knobs.threshold * scale)).to(torch.uint8) * 255
