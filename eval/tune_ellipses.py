@@ -129,7 +129,7 @@ def study(seed: int, count: int, steps: int) -> dict[str, Any]:
     held_out = [_rows(batch, slice(k, None)) for batch, k in zip(all_scenes, half, strict=True)]
     start = off_by(seed)
     knobs = Knobs(start, TUNED)
-    plan = Plan(steps=steps, batch=32, rate=0.1, seed=seed, patience=1000, watched=0.2, most_watched=64)
+    plan = Plan(steps=steps, batch=32, rate=0.1, seed=seed, look_every=10, patience=1000, most_watched=160)
     began = time.perf_counter()
     done = descend(family(), knobs, examples(tuned_on, start), plan)
     found: dict[str, Any] = {"seed": seed, "seconds": time.perf_counter() - began, "best": done.best}

@@ -87,7 +87,7 @@ def test_a_picture_that_no_pose_explains_costs_and_has_no_slope():
     knob = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     found = family().loss({"aerial.tilt_sigma_deg": knob}, [Example("looks", 0, (upward, settings))], 1.0)
     found.sum().backward()
-    assert float(found) == UNPLACED
+    assert float(found.detach()) == UNPLACED
     assert knob.grad is not None
     assert float(knob.grad) == 0
 
@@ -105,7 +105,7 @@ def test_swapped_landmarks_are_no_matter_of_noise():
 
 def test_noise_that_was_thought_too_small_is_found():
     thought = with_knobs(Settings(), {"landmarks.sigma_m": 0.5})
-    batch = looks(40, thought)
+    batch = looks(24, thought)
     knobs = Knobs(thought, ["landmarks.sigma_m"])
-    done = descend(family(), knobs, batch, Plan(steps=30, batch=16, rate=0.15, watched=0))
+    done = descend(family(), knobs, batch, Plan(steps=20, batch=12, rate=0.2, look_every=10, watched=0))
     assert done.settings.landmarks.sigma_m == pytest.approx(airborne.GPS_M, rel=0.3)

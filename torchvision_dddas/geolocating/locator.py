@@ -66,7 +66,7 @@ class Locator:
             )
         self.site, self.camera, self.settings, self.rate_hz = site, camera, settings, rate_hz
         self.courses = Courses(site.landmarks, settings.landmarks, rate_hz)
-        self._solver, self._focal_known = solver, focal_known
+        self._solver, self.focal_known = solver, focal_known
         self._registrar = Registrar(camera, settings, solver, focal_known, site.landmarks.names)
         self._movers = Movers()
         self._use = LandmarkUse()
@@ -74,7 +74,7 @@ class Locator:
 
     def anew(self) -> "Locator":
         """The same, as before its first frame."""
-        return Locator(self.site, self.camera, self.settings, self._solver, self.rate_hz, self._focal_known)
+        return Locator(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
 
     def learn(self, site: Site) -> None:
         """What landmarks and vehicle have reported by now, in the metres of the site so far."""

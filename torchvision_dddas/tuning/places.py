@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.modules.places import Linear, laid, stepped, surprise
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.studies.record import Task
@@ -20,6 +21,8 @@ from torchvision_dddas.targets.pose import EXACT_M
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.looks import Laid, Look, joined, of_settings
 from torchvision_dddas.tuning.looks import laid as hard_laid
+from torchvision_dddas.tuning.pictured import looks_of
+from torchvision_dddas.tuning.ranged import Sighted, person_lost, sightings_of
 
 UNPLACED = 25.0
 """Nats that a picture costs which no pose of the camera explains, or whose rays miss the ground: no slope, no NaN."""
@@ -36,15 +39,30 @@ class Places:
     """Without effect: nothing here is hard."""
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """Looks of clips that are located along their pictures. See `family.Family`."""
-        raise NotImplementedError
+        """Looks from the air of clips with landmarks, sightings of those with a camera on the ground alone.
+
+        See `family.Family`.
+        """
+        found: list[Example] = []
+        for clip in clips:
+            mine = sightings_of(clip, settings) if clip.landmarks is None else looks_of(clip, settings)
+            before = len(found)
+            for example in mine:
+                found.append(example)
+                tick()
+            if len(found) == before:
+                raise InputError(f"{clip.name}: no target was located whose true place is known; nothing can be tuned")
+        return found
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) nats a target. See `family.Family`."""
-        found: list[Tensor] = [torch.zeros(())] * len(batch)
+        found: list[Tensor] = [torch.zeros(0)] * len(batch)
         groups: dict[tuple[int, int], list[tuple[int, Look, dict[str, Tensor], Laid]]] = defaultdict(list)
         for row, example in enumerate(batch):
             look, settings = example.content
+            if isinstance(look, Sighted):
+                found[row] = person_lost(look, settings, knobs, UNPLACED)
+                continue
             values = {**of_settings(settings), **knobs}
             here = hard_laid(look, values)
             if here is None:
