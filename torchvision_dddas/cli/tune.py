@@ -81,6 +81,8 @@ def tune(
         raise InputError(f"--jobs is {jobs}; wanted 0 or more processes")
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes is {minutes:g}; wanted more than 0")
+    if cost is not None and not 0 <= cost < float("inf"):
+        raise InputError(f"--cost is {cost:g}; wanted 0 or more: the loss that a frame of twice the time is worth")
     longest_s = float("inf") if minutes is None else 60 * minutes
     plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s)
     spec = asked(study, config, set_ or [], backend and backend.value, None)
@@ -290,10 +292,8 @@ def _line(what: str, side: "Side", verdict: "Verdict") -> str:
 
     goal = verdict.goal
     told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {number(side.pooled[0])} -> {number(side.pooled[1])}"
-    entry = side.changes and side.changes["tasks"].get(goal.task, {}).get("pooled", {}).get(goal.group, {})
-    says = entry.get(goal.measure, {}).get("says", "") if entry else ""
     mean = f", mean of clips {number(side.mean[0])} -> {number(side.mean[1])}" if len(side.clips) > 1 else ""
-    return told + mean + (f": {says}" if says else "")
+    return told + mean + (f": {side.says}" if side.says else "")
 
 
 def _prepared(

@@ -66,16 +66,15 @@ def _gain(name: str, side: Mapping[str, Any]) -> str:
     if before is None or after is None:
         return f"<p>no {escape(measure(short).name)} before and after</p>"
     parts.append(
-        f'<div class="big">{number(before, digits)} → {number(after, digits)} '
-        f"<span>{escape(measure(short).name)}, {escape(GROUPS.get(group, group))}, all together</span></div>"
+        f'<div class="big">{number(after, digits)} <span>{escape(measure(short).name)}, '
+        f"{escape(GROUPS.get(group, group))}, all together; before {number(before, digits)}</span></div>"
     )
     tasks = list(((side["changes"] or {}).get("tasks") or {}).values())
     entry = tasks[0]["pooled"].get(group, {}).get(short) if tasks else None
-    if entry is not None:
-        spans = [way["interval"] for over in ("over_clips", "over_frames") if (way := entry.get(over))]
-        span = next((span for span in spans if span), None)
-        interval = "" if span is None else f", 95 %: {_signed(span[0], digits)} to {_signed(span[1], digits)}"
-        parts.append(f"<p>{_signed(after - before, digits)}{interval}: <b>{escape(entry['says'])}</b></p>")
+    spans = [way["interval"] for over in ("over_clips", "over_frames") if entry and (way := entry.get(over))]
+    span = next((span for span in spans if span), None)
+    interval = "" if span is None else f", 95 %: {_signed(span[0], digits)} to {_signed(span[1], digits)}"
+    parts.append(f"<p>{_signed(after - before, digits)}{interval}: <b>{escape(side['says'])}</b></p>")
     mean = side["mean"]
     if mean["before"] is not None and mean["after"] is not None and len(side["clips"]) > 1:
         means = [number(mean[when], digits) for when in ("before", "after")]

@@ -80,10 +80,8 @@ def measured(
 ) -> TimeCost:
     """Time a task on a clip with each knob in turn at other values, in turns. timed: in place of the hard pipeline.
 
-    tick: called after each of `points` × repeats. Raises InputError for a weight below 0, and as the task does.
+    tick: called after each of `points` × repeats. Raises InputError as the task does.
     """
-    if not (math.isfinite(weight) and weight >= 0):
-        raise InputError(f"the cost is {weight:g}; wanted 0 or more: the loss that a frame of twice the time is worth")
     timed = timed or _timer(clip, task, settings, backend)
     todo = points(settings, names)
     took: dict[tuple[str, float], list[float]] = {point: [] for point in todo}

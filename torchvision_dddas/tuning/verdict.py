@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.studies.comparing import compare
+from torchvision_dddas.studies.comparing import LEVEL, compare
 from torchvision_dddas.studies.goals import Goal, value_of
 from torchvision_dddas.studies.jobs import Event
 from torchvision_dddas.studies.record import Case, Spec
@@ -26,13 +26,15 @@ Shown = Callable[[], AbstractContextManager[tuple[Callable[[Plan], object], Call
 class Side:
     """One set of clips. pooled, mean: the goal before and after, over all counts and over the clips' values.
 
-    changes: every measure and clip, as `comparing.compare` tells it; None where nothing can be compared. frame_ms: what
-    a frame took before and after, where it was computed. notes: clips without a result, and why.
+    says: of the pooled goal, the one question that was asked: better or worse beyond noise, or not. changes: every
+    measure and clip, as `comparing.compare` tells it, corrected for all of them; None where nothing can be compared.
+    frame_ms: what a frame took before and after, where it was computed. notes: clips without a result, and why.
     """
 
     clips: tuple[str, ...]
     pooled: tuple[float, float]
     mean: tuple[float, float]
+    says: str
     changes: Mapping[str, Any] | None
     frame_ms: tuple[float, float]
     notes: tuple[str, ...] = ()
@@ -102,14 +104,30 @@ def _side(goal: Goal, before: Sequence[Case], after: Sequence[Case], clips: Sequ
         for when, cases in zip((BEFORE, AFTER), pairs, strict=True)
     ]
     took = [_frame_ms(cases) for cases in pairs]
+    changes = compare(*studies) if both else None
     return Side(
         tuple(clips),
         (pooled[0], pooled[1]),
         (mean[0], mean[1]),
-        compare(*studies) if both else None,
+        _says(goal, changes),
+        changes,
         (took[0], took[1]),
         tuple(sorted(notes)),
     )
+
+
+def _says(goal: Goal, changes: Mapping[str, Any] | None) -> str:
+    """As `comparing` says it, but not corrected for measures that nobody asked about."""
+    entry = (changes or {"tasks": {}})["tasks"].get(goal.task, {"pooled": {}})["pooled"].get(goal.group, {})
+    entry = entry.get(goal.measure)
+    if entry is None or not entry["change"]:
+        return "the same" if entry else ""
+    word = "better" if (entry["change"] < 0) == goal.least else "worse"
+    ways = [(over, way) for over in ("over_clips", "over_frames") if (way := entry.get(over)) is not None]
+    for over, way in ways:
+        if way["p"] < LEVEL:
+            return word if over == "over_clips" else f"{word} on these clips"
+    return "within noise" if any(way["enough"] for _, way in ways) else "too little to tell"
 
 
 def _value(goal: Goal, cases: Sequence[Case]) -> float:
@@ -127,6 +145,7 @@ def _told(side: Side) -> dict[str, Any]:
         "clips": side.clips,
         "pooled": dict(zip((BEFORE, AFTER), side.pooled, strict=True)),
         "mean": dict(zip((BEFORE, AFTER), side.mean, strict=True)),
+        "says": side.says,
         "frame_ms": dict(zip((BEFORE, AFTER), side.frame_ms, strict=True)),
         "changes": side.changes,
         "notes": side.notes,

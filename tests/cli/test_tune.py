@@ -1,0 +1,146 @@
+"""`dddas tune` on small clips with a family that is known: what it writes, that it goes on, and bad input."""
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.cli.mistakes import bad
+from tests.studies.world import filmed, study
+from tests.tuning.toys import Bowl
+from torchvision_dddas.cli import app
+from torchvision_dddas.metrics import paired
+from torchvision_dddas.settings import load
+from torchvision_dddas.tuning import costing, preparing
+
+THRESHOLD = "difference.threshold"
+ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "0")
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory) -> Path:
+    """A study of three small clips."""
+    place = tmp_path_factory.mktemp("tune") / "clips"
+    for seed, name in enumerate(("one", "two", "held")):
+        filmed(place, name, seed, frames=7)
+    return study(place, 'config = "fast"')
+
+
+def asked(clips: Path, *words: str, bowl: Bowl | None = None):
+    """Run the command with a bowl as the family of motion."""
+    with pytest.MonkeyPatch.context() as here:
+        # Fewer samples than in earnest: what is tested here is no interval.
+        here.setattr(paired, "effects", partial(paired.effects, resamples=40, most=40))
+        here.setattr(preparing, "family_of", lambda name: bowl or Bowl(place=math.log(6)))
+        return CliRunner().invoke(app, ["tune", str(clips), "--cache", str(clips.parent / "cache"), *words])
+
+
+@pytest.fixture(scope="module")
+def tuned(clips) -> tuple[Path, str]:
+    """The folder of a run, and what it said."""
+    out = clips.parent / "first"
+    result = asked(clips, *ASKED, "--holdout", "h*", "--out", str(out))
+    assert result.exit_code == 0, result.output
+    return out, result.output
+
+
+def test_the_tuned_settings_are_written_for_config_and_keep_what_was_not_tuned(tuned) -> None:
+    settings, before = load(tuned[0] / "tuned.toml"), load("fast")
+    assert settings.difference.threshold == pytest.approx(6, rel=0.4) != before.difference.threshold
+    assert settings.registration == before.registration and settings.refine == before.refine
+
+
+def test_before_and_after_are_measured_on_clips_tuned_on_and_held_out_apart(tuned) -> None:
+    told = json.loads((tuned[0] / "run.json").read_text())
+    assert told["state"] == "complete" and told["family"] == "motion"
+    for side, names in (("tuned", ["one", "two"]), ("held_out", ["held"])):
+        found = told["verdict"][side]
+        assert found["clips"] == names
+        entry = found["changes"]["tasks"]["motion"]["pooled"]["pixels"]["f"]
+        assert found["pooled"] == {"before": entry["first"], "after": entry["second"]}
+        assert 0 <= entry["first"] <= 1 and entry["first"] != entry["second"]
+    assert "Tuned on (2 clips): f" in tuned[1] and "Held out (1 clip): f" in tuned[1]
+
+
+def test_the_figures_are_those_of_the_study_with_the_tuned_settings(clips, tuned) -> None:
+    words = ["evaluate", "--dataset", str(clips), "--config", str(tuned[0] / "tuned.toml"), "--clips", "held"]
+    out = clips.parent / "again"
+    result = CliRunner().invoke(app, [*words, "--out", str(out), "--cache", str(clips.parent / "cache"), "--jobs", "1"])
+    assert result.exit_code == 0, result.output
+    measured = json.loads((out / "metrics.json").read_text())["tasks"]["motion"]["pooled"]["pixels"]["f"]
+    told = json.loads((tuned[0] / "run.json").read_text())
+    assert told["verdict"]["held_out"]["pooled"]["after"] == measured
+
+
+def test_every_step_is_recorded_and_its_losses_are_told_on_the_way(tuned) -> None:
+    told = json.loads((tuned[0] / "run.json").read_text())
+    assert [step["step"] for step in told["history"]] == list(range(11))
+    assert "step 10 of 10: loss" in tuned[1] and "watched" in tuned[1]
+
+
+def test_the_page_shows_the_knob_and_both_sets_of_clips(tuned) -> None:
+    page = (tuned[0] / "report.html").read_text()
+    assert THRESHOLD in page and "Clips tuned on" in page and "Clips held out" in page and "http" not in page
+
+
+def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tuned, tmp_path) -> None:
+    bowl = Bowl(place=math.log(6))
+    out = clips.parent / "first"
+    before = json.loads((out / "run.json").read_text())
+    result = asked(clips, *ASKED, "--holdout", "h*", "--out", str(out), "--resume", bowl=bowl)
+    after = json.loads((out / "run.json").read_text())
+    assert result.exit_code == 0 and bowl.calls == []
+    assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
+
+
+def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_path, monkeypatch) -> None:
+    calls = list[float]()
+
+    def timed(settings) -> float:
+        calls.append(settings.difference.threshold)
+        return settings.difference.threshold
+
+    monkeypatch.setattr(costing, "_timer", lambda *_: timed)
+    words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
+    assert asked(clips, *words).exit_code == 0
+    count = len(calls)
+    told = json.loads((tmp_path / "run.json").read_text())["cost"]
+    assert told["weight"] == 0.5 and [curve["knob"] for curve in told["curves"]] == [THRESHOLD]
+    assert asked(clips, *words, "--resume").exit_code == 0
+    assert len(calls) == count > 0
+    assert "What time costs" in (tmp_path / "report.html").read_text()
+
+
+def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_settings(clips, tmp_path) -> None:
+    bowl = Bowl(place=math.log(60), wrong=("one", 2), wrong_above=12)
+    result = asked(clips, *ASKED, "--clips", "one", "--set", f"{THRESHOLD}=10", "--out", str(tmp_path), bowl=bowl)
+    assert result.exit_code == 2 and "Traceback" not in result.output
+    last = result.output.strip().splitlines()[-1]
+    assert last.startswith("dddas: ") and "one, frame 2" in last and THRESHOLD in last
+    assert load(tmp_path / "tuned.toml").difference.threshold <= 12
+    assert json.loads((tmp_path / "run.json").read_text())["state"] == "failed"
+    assert "Stopped" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--knobs", "difference.absent"), "difference.threshold (0.1 to"),
+        (("--knobs", "registration.keypoints"), "is no knob that can be tuned"),
+        (("--knobs", ""), "no knob to tune"),
+        (("--knobs", f"{THRESHOLD},track.speed"), "several families"),
+        (("--knobs", THRESHOLD, "--steps", "0"), "steps is 0"),
+        (("--knobs", THRESHOLD, "--holdout", "none*"), "fits no clip"),
+        (("--knobs", THRESHOLD, "--holdout", "*"), "leaves no clip"),
+        (("--knobs", THRESHOLD, "--cost", "-1"), "--cost is -1"),
+        (("--knobs", THRESHOLD, "--device", "nowhere"), "--device nowhere"),
+        (("--knobs", THRESHOLD, "--minutes", "0"), "--minutes is 0"),
+        (("--knobs", THRESHOLD, "--measure", "motion.pixels"), "is no measure"),
+    ],
+)
+def test_bad_input_is_one_line(clips, tmp_path, words: tuple[str, ...], said: str) -> None:
+    result = asked(clips, *words, "--out", str(tmp_path / "out"))
+    assert said in bad(result)
