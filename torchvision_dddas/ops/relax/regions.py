@@ -40,5 +40,5 @@ def gates(
 
 def of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]) -> Float[Tensor, "B 1 H W"]:
     """Each pixel's gate; 0 where its label is 0."""
-    none = torch.zeros_like(gate[:, :1])
+    none = gate.new_zeros(gate.shape[0], 1)  # there may be no region at all
     return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
