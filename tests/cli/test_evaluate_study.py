@@ -35,6 +35,42 @@ def test_clips_that_are_left_out_are_named_at_the_end(dddas, study, tmp_path) ->
     assert any(x.startswith("left out: bare") and "no truth" in x for x in done.stdout.splitlines())
 
 
+def test_a_line_is_not_broken_however_long(dddas, study, tmp_path) -> None:
+    world.filmed(tmp_path / "clips", "a_clip_whose_name_alone_is_longer_than_half_a_line_of_a_terminal", masks=False)
+    done = dddas("evaluate", "--dataset", study, "--jobs", 1, "--out", tmp_path / "out")
+    assert any(x.startswith("left out: a_clip") and x.endswith("can be scored") for x in done.stdout.splitlines())
+
+
+def test_what_lacks_of_clips_that_are_scored_is_a_note_and_not_left_out(dddas, tmp_path) -> None:
+    world.followed(tmp_path / "clips", "bare", 3, pictures=False)
+    film = world.filmed(tmp_path / "own", "film", 4)
+    (film / "frames" / "000004.png").write_bytes(b"no picture")
+    tables = (("motchallenge", "clips"), ("folder", "own"))
+    text = "".join(f'[[dataset]]\nkind = "{kind}"\nfolder = "{folder}"\n' for kind, folder in tables)
+    (tmp_path / "study.toml").write_text(text)
+    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    done = dddas("evaluate", "--dataset", tmp_path / "study.toml", *words)
+    assert done.exit_code == 0 and "left out:" not in done.output
+    told = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
+    assert told[0].startswith("note: bare: no pictures, which belong in ")
+    assert any(line.startswith("note: film, motion: ") and "000004.png" in line for line in told[1:])
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["left_out"] == [] and [f"note: {line}" for line in run["notes"]] == told
+    assert "no pictures, which belong in" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_study_that_could_score_nothing_fails_and_says_why(dddas, tmp_path) -> None:
+    film = world.filmed(tmp_path / "clips", "film", 4)
+    (film / "masks" / "000004.png").write_bytes(b"no picture")
+    study = world.study(tmp_path / "clips")
+    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    done = dddas("evaluate", "--dataset", study, *words)
+    assert done.exit_code == 2 and done.stderr.splitlines()[-1].startswith(
+        "dddas: nothing could be scored; film, motion: "
+    )
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
 def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
     words = ("--clips", "ta*", "--set", "track.memory_frames=7", "--interval", 2, "--jobs", 1, "--quiet")
     done = dddas("evaluate", "--dataset", study, *words, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
@@ -52,7 +88,10 @@ def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
         (("--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "wanted one"),
         (("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler answers at tcp://127.0.0.1:1"),
         (("--scheduler", "nonsense"), "no Dask scheduler answers at nonsense"),
-        (("--clips", "nobody"), "no clip is left to evaluate"),
+        (("--clips", "nobody"), "nobody fits none; there are other, table"),
+        (("--clips", ""), "--clips '' names no clip"),
+        (("--together", "2"), "--together is of use with --backend torch alone"),
+        (("--interval", "1001"), "wanted a whole number of frames, 1 to 1000"),
         (("--set", "no.knob=1"), "unknown knob"),
         (("--first-frame", "0"), "--first-frame is of no use with --dataset"),
         (("--interval", "0"), "interval is 0"),
@@ -64,6 +103,14 @@ def test_a_mistake_is_one_line_and_exit_2(dddas, study, tmp_path, words, told) -
     done = dddas("evaluate", "--dataset", study, "--quiet", "--out", tmp_path / "out", *words)
     assert done.exit_code == 2
     assert told in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_bad_input_leaves_an_earlier_study_of_the_folder_as_it_was(dddas, study, tmp_path) -> None:
+    words = ("evaluate", "--dataset", study, "--jobs", 1, "--quiet", "--out", tmp_path / "out")
+    assert dddas(*words).exit_code == 0
+    before = (tmp_path / "out" / "run.json").read_bytes()
+    assert dddas(*words, "--clips", "nobody").exit_code == 2
+    assert (tmp_path / "out" / "run.json").read_bytes() == before
 
 
 def test_options_of_a_study_need_one(dddas, tmp_path) -> None:

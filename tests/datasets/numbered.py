@@ -12,7 +12,7 @@ def numbered(folder: Path, count: int, name: str = "{:06d}.png", first: int = 1,
 
 
 def line_of(found: Dataset) -> str:
-    """The one line that tells what is missing."""
-    (line,) = found.missing
+    """The one line that a data set tells beside its clips."""
+    (line,) = (*found.missing, *found.notes)
     assert line.isprintable()
     return line

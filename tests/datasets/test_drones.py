@@ -74,7 +74,8 @@ def test_clips_of_visdrone_without_truth_or_pictures_are_told(tmp_path: Path) ->
     text(tmp_path / "val/annotations/c.txt", PEDESTRIAN)
     found = read("visdrone", tmp_path / "val")
     assert [(clip.name, len(clip.pictures)) for clip in found.clips] == [("a", 2), ("c", 0)]
-    assert [line.split(",")[0] for line in found.missing] == ["b: no truth", "c: what needs pictures"]
+    assert [line.split(",")[0] for line in found.missing] == ["b: no truth"]
+    assert [line.split(",")[0] for line in found.notes] == ["c: no pictures"]
     with pytest.raises(InputError, match="'dog' is no class of VisDrone; wanted some of pedestrian, people"):
         read("visdrone", tmp_path / "val", classes=["dog"])
 
@@ -159,7 +160,8 @@ def test_labels_can_be_asked_for_and_folders_may_be_flat(tmp_path: Path) -> None
     text(tmp_path / "sdd/SDD-quad-video0/annotations.txt", WALKERS)
     found = read("sdd", tmp_path / "sdd", classes=["Biker"])
     (clip,) = found.clips
-    assert clip.name == "SDD-quad-video0" and "what needs pictures" in line_of(found)
+    assert clip.name == "SDD-quad-video0" and found.missing == ()
+    assert "no pictures; its video belongs in" in line_of(found)
     assert clip.truth and clip.truth.tracks and clip.truth.tracks.identity.tolist() == [3]
 
 

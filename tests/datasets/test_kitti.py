@@ -78,7 +78,8 @@ def test_without_calibration_there_are_no_places_and_that_is_told(tmp_path: Path
     (tmp_path / "kitti/training/calib/0000.txt").unlink()
     found = read("kitti", tmp_path / "kitti")
     assert found.clips[0].truth and found.clips[0].truth.positions is None
-    assert line_of(found).startswith("0000: places in metres, which need ")
+    assert line_of(found).startswith("0000: no places in metres, which need ")
+    assert found.missing == ()  # it is read all the same
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_a_video_stands_for_pictures_and_without_either_the_boxes_are_left(tmp_p
     found = read("motchallenge", tmp_path / "mot")
     assert [len(clip.pictures) for clip in found.clips] == [1, 0]
     assert [clip.frames for clip in found.clips] == [3, 3]
-    assert line_of(found).startswith("B: what needs pictures, which belong in ")
+    assert line_of(found).startswith("B: no pictures, which belong in ") and found.missing == ()
 
 
 def test_only_what_is_asked_for_is_read(tmp_path: Path) -> None:

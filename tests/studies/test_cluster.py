@@ -15,6 +15,7 @@ import pytest
 
 from tests.studies import world
 from tests.studies.test_jobs import contents, linux
+from tests.studies.test_running import command
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.studies import cluster
 from torchvision_dddas.studies.cache import Cache
@@ -179,6 +180,13 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_within_seconds(study, tm
 def test_an_address_that_is_none_is_one_line(study, tmp_path, address) -> None:
     with pytest.raises(InputError, match="wanted an address as tcp://host:8786"):
         run_study(study, tmp_path, scheduler=address, cache=tmp_path / "cache")
+
+
+def test_nothing_follows_the_line_about_an_address_that_is_none(tmp_path) -> None:
+    world.three(tmp_path / "clips")
+    words = command(tmp_path / "study.toml", tmp_path / "out", tmp_path / "cache", "--scheduler", "nonsense")
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
 
 
 def test_without_dask_the_line_says_what_to_install(study, tmp_path, monkeypatch) -> None:

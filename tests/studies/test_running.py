@@ -105,7 +105,7 @@ def test_a_damaged_entry_is_told_and_computed_again(tmp_path) -> None:
 def test_clips_are_picked_by_patterns(tmp_path) -> None:
     spec = read_spec(world.three(tmp_path / "clips"))
     assert [job.clip.name for job in plan(spec, tmp_path, ["ta*", "masks"]).jobs] == ["masks", "table"]
-    with pytest.raises(InputError, match="no clip is left to evaluate by study and nobody"):
+    with pytest.raises(InputError, match="by study: nobody fits none; there are masks, table, tracks"):
         plan(spec, tmp_path, ["nobody"])
 
 

@@ -130,16 +130,20 @@ def evaluate(
             raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
         if together is not None and (together < 1 or scheduler is not None):
             raise InputError(f"--together is {together}; wanted 1 or more clips, and no --scheduler")
+        if interval is not None and not 1 <= interval <= 1000:
+            raise InputError(f"--interval is {interval}; wanted a whole number of frames, 1 to 1000")
         if jobs is not None and scheduler is not None:
             raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
         folder = out or Path("dddas-study")
         spec = whole.asked(dataset, config, set_ or [], backend and backend.value, interval)
-        patterns = [text.strip() for text in (clips or "").split(",") if text.strip()]
+        if together is not None and together > 1 and spec.backend != "torch":
+            raise InputError(f"--together is of use with --backend torch alone; the study's is {spec.backend}")
         results, measures = whole.study_into(
-            folder, spec, dataset.parent, jobs, scheduler, cache, patterns, quiet, together or 1
+            folder, spec, dataset.parent, jobs, scheduler, cache, whole.patterns(clips, "--clips"), quiet, together or 1
         )
         if not quiet:
             whole.show(results, measures, folder)
+        whole.refuse_nothing(results)
         return
     _refuse(study, "is for a study; give --dataset FILE too")
     if truth is None or result is None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from torchvision_dddas.cli.progress import EVERY_S
+from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.studies.jobs import Event
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.studies.running import Plan
 
 FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", "scores.bin", "report.html", "run.json")
+MOST_NOTES = 12
 
 
 def asked(
@@ -31,6 +33,14 @@ def asked(
     spec = read_spec(file)
     spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
     return replace(spec, backend=backend or spec.backend, interval=spec.interval if interval is None else interval)
+
+
+def patterns(text: str | None, option: str) -> list[str]:
+    """The patterns of names that an option gives between commas. Raises InputError where it was given without any."""
+    words = [word.strip() for word in (text or "").split(",") if word.strip()]
+    if text is not None and not words:
+        raise InputError(f"{option} '{text}' names no clip; wanted patterns of names, such as 'bms_*'")
+    return words
 
 
 def study_into(
@@ -52,12 +62,20 @@ def study_into(
     began, place = time.perf_counter(), cache or cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write(folder, "run.json", {"state": "running", "study": spec.name})
+        running = False
+
+        def begin(planned: "Plan") -> None:
+            nonlocal running
+            _write(folder, "run.json", {"state": "running", "study": spec.name})
+            running = True
+            begun(planned)
+
         try:
             with shown(quiet) as (begun, tell):
-                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begun, together)
+                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin, together)
         except BaseException:
-            _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
+            if running:  # else nothing of an earlier study in this folder has been touched
+                _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
             raise
         measures = _measures(results)
         _write(folder, "metrics.json", measures)
@@ -169,7 +187,7 @@ def _on(bar: Any) -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
         frames += event.frames
         bar.update(task, advance=event.done is not None, frames=frames, description=event.job.clip.name)
         if event.note:
-            bar.console.print(event.note, markup=False, highlight=False)
+            bar.console.print(event.note, markup=False, highlight=False, soft_wrap=True)
 
     return begun, tell
 
@@ -215,8 +233,20 @@ def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
     for table in tables(measures):
         console.print(table)
     for line in results.left_out:
-        console.print(f"left out: {line}", markup=False, highlight=False)
+        console.print(f"left out: {line}", markup=False, highlight=False, soft_wrap=True)
+    notes = list(dict.fromkeys(results.facts["notes"]))
+    for line in notes[:MOST_NOTES]:
+        console.print(f"note: {line}", markup=False, highlight=False, soft_wrap=True)
+    if len(notes) > MOST_NOTES:
+        typer.echo(f"note: {len(notes) - MOST_NOTES} more in run.json")
     kept = sum(1 for case in results.cases if not case.cause)
     typer.echo(f"{kept} of {len(results.cases)} cases scored, {results.facts['computed']} stages computed")
     made = [name for name in FILES if (folder / name).is_file()]
     typer.echo(f"{folder}: {', '.join(made)}")
+
+
+def refuse_nothing(results: "Results") -> None:
+    """Raises InputError where no case was scored."""
+    if all(case.cause for case in results.cases):
+        case = results.cases[0]
+        raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")

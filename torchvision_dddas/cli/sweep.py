@@ -66,7 +66,7 @@ def sweep(
 
     Results are kept as those of dddas evaluate --dataset: a sweep that is asked for again goes on where it was.
     """
-    from torchvision_dddas.cli.study import asked
+    from torchvision_dddas.cli.study import asked, patterns
     from torchvision_dddas.settings import load
     from torchvision_dddas.studies import axes
     from torchvision_dddas.studies import sweep as sweeping
@@ -86,7 +86,7 @@ def sweep(
     points = optuna if optuna is not None else sum(1 for _ in axes.points(choices))
     if optuna is not None:
         sweeping.need_optuna()
-    tuned, held = parted(spec, dataset.parent, _patterns(clips), _patterns(holdout))
+    tuned, held = parted(spec, dataset.parent, patterns(clips, "--clips"), patterns(holdout, "--holdout"))
     tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache)
     search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
     swept = Swept(out, settings, goal, search, tuned, held)
@@ -120,10 +120,6 @@ def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] 
         raise InputError("--optuna has nothing to draw; give --range knob=low:high")
     if optuna is not None and not 1 <= optuna <= MOST_PROPOSED:
         raise InputError(f"--optuna is {optuna}; wanted 1 to {MOST_PROPOSED} points")
-
-
-def _patterns(text: str | None) -> list[str]:
-    return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 def show(swept: "Swept") -> None:

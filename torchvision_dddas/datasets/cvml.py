@@ -54,12 +54,12 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         frames = agreed(pictures, 0, "")
         truth = read_truth(path, frames)
         if not pictures:
-            notes.append(f"{name}: what needs pictures, which belong in {homes[0]}")
+            notes.append(f"{name}: no pictures, which belong in {homes[0]}")
         frames = frames or truth.frames[-1]
         return Clip(name, path, pictures, rate_hz, frames, truth, shows=("people",))
 
     found = gather("cvml", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    return replace(found, notes=tuple(notes))
 
 
 def read_truth(path: Path, length: int = 0) -> Truth:

@@ -83,8 +83,8 @@ def read(source: Asked, base: Path) -> Dataset:
         asked = "" if "*" in source.clips else f" by the name {' or '.join(source.clips)}"
         found = replace(found, missing=(f"{folder} holds no clip{asked}; wanted {KINDS[source.kind]}",))
     # A name that a file gives a clip, or a file's own, may hold anything; so may what was found in it.
-    told = tuple(str(InputError(line)) for line in found.missing)
-    return replace(found, clips=clips, missing=told)
+    missing, notes = (tuple(str(InputError(line)) for line in lines) for lines in (found.missing, found.notes))
+    return replace(found, clips=clips, missing=missing, notes=notes)
 
 
 def known(kind: str) -> None:

@@ -53,10 +53,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     home = folder / "training" if (folder / "training").is_dir() else folder
     places = {path.stem: path for path in sorted((home / "label_02").glob("*.txt"))}
     if not places:
-        lacking = f"{folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
-        return Dataset("kitti", folder, (), TERMS, (lacking,))
+        nothing = f"{folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
+        return Dataset("kitti", folder, (), TERMS, (nothing,))
     named = folders_in(home / "image_02") if (home / "image_02").is_dir() else []
-    notes = [
+    notes: list[str] = []
+    lacking = [
         f"{name}: no truth, which belongs in {home / 'label_02' / name}.txt"
         for name in named
         if name not in places and wanted(name)
@@ -65,16 +66,16 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     def clip_of(name: str) -> Clip:
         pictures = whole(images_in(home / "image_02" / name), 0)
         calibration, flight = home / "calib" / f"{name}.txt", home / "oxts" / f"{name}.txt"
-        lacking = [str(path) for path in (calibration, flight) if not path.is_file()]
-        truth = read_truth(places[name], classes, len(pictures), None if lacking else (calibration, flight))
-        if lacking:
-            notes.append(f"{name}: places in metres, which need {' and '.join(lacking)}")
+        unsure = [str(path) for path in (calibration, flight) if not path.is_file()]
+        truth = read_truth(places[name], classes, len(pictures), None if unsure else (calibration, flight))
+        if unsure:
+            notes.append(f"{name}: no places in metres, which need {' and '.join(unsure)}")
         if not pictures:
-            notes.append(f"{name}: what needs pictures, which belong in {home / 'image_02' / name}")
+            notes.append(f"{name}: no pictures, which belong in {home / 'image_02' / name}")
         return Clip(name, places[name], pictures, RATE_HZ, agreed(pictures, 0, "") or truth.frames[-1], truth)
 
-    found = gather("kitti", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    found = gather("kitti", folder, TERMS, filter(wanted, places), clip_of, lacking)
+    return replace(found, notes=tuple(notes))
 
 
 def read_truth(

@@ -63,11 +63,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     def clip_of(name: str) -> Clip:
         clip = sequence(places[name], given["benchmark"], given["least_visibility"])
         if not clip.pictures:
-            notes.append(f"{name}: what needs pictures, which belong in {places[name] / 'img1'}")
+            notes.append(f"{name}: no pictures, which belong in {places[name] / 'img1'}")
         return replace(clip, name=name)
 
     found = gather("motchallenge", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    return replace(found, notes=tuple(notes))
 
 
 def sequences(folder: Path) -> dict[str, Path]:

@@ -37,7 +37,8 @@ class Clip:
 class Dataset:
     """Clips of one kind. terms: of use, as its makers state them.
 
-    missing: in words, what is not there and where it belongs; clips that cannot be read are told here.
+    missing: in words, clips that are left out and why, or what belongs in the folder. notes: in words, what else lacks,
+    and where it belongs; its clips are read all the same.
     """
 
     kind: str
@@ -45,3 +46,4 @@ class Dataset:
     clips: tuple[Clip, ...]
     terms: str = ""
     missing: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()

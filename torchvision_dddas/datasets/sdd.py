@@ -53,11 +53,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         frames = agreed(video, 0, "")
         truth = read_truth(place / ANNOTATIONS, classes, frames)
         if not video:
-            notes.append(f"{name}: what needs pictures, whose video belongs in {place}")
+            notes.append(f"{name}: no pictures; its video belongs in {place}")
         return Clip(name, place, video, frames=frames or truth.frames[-1], truth=truth)
 
     found = gather("sdd", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    return replace(found, notes=tuple(notes))
 
 
 def clips_in(folder: Path) -> dict[str, Path]:

@@ -58,11 +58,12 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     asked(np.zeros(0), given["attributes"], ATTRIBUTES, "UAVDT's sequences")
     truths = next((t for name in _TRUTHS if any((t := folder / name).glob(f"*{_WHOLE}"))), None)
     if truths is None:
-        lacking = f"{folder} holds no {_TRUTHS[0]}/M0101{_WHOLE}: the truth of UAVDT belongs there"
-        return Dataset("uavdt", folder, (), TERMS, (lacking,))
+        nothing = f"{folder} holds no {_TRUTHS[0]}/M0101{_WHOLE}: the truth of UAVDT belongs there"
+        return Dataset("uavdt", folder, (), TERMS, (nothing,))
     places = {path.name.removesuffix(_WHOLE): path for path in sorted(truths.glob(f"*{_WHOLE}"))}
     homes = [folder / name for name in _PICTURES if (folder / name).is_dir()]
-    notes = [
+    notes: list[str] = []
+    lacking = [
         f"{name}: no truth, which belongs in {truths / name}{_WHOLE}"
         for name in folders_in(folder / _PICTURES[0] if (folder / _PICTURES[0]).is_dir() else folder)
         if name[:1] == "M" and name[1:].isdecimal() and name not in places and wanted(name)
@@ -72,14 +73,14 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         pictures = whole(next((p for home in homes if (p := images_in(home / name))), ()), 1)
         truth = read_truth(places[name], given["classes"], len(pictures))
         if not pictures:
-            notes.append(f"{name}: what needs pictures, which belong in {folder / _PICTURES[0] / name}")
+            notes.append(f"{name}: no pictures, which belong in {folder / _PICTURES[0] / name}")
         return Clip(name, places[name], pictures, RATE_HZ, len(pictures) or truth.frames[-1], truth)
 
     def has(name: str) -> bool:
-        return not given["attributes"] or set(given["attributes"]) <= set(_attributes(folder, name, notes))
+        return not given["attributes"] or set(given["attributes"]) <= set(_attributes(folder, name, lacking))
 
-    found = gather("uavdt", folder, TERMS, [n for n in places if wanted(n) and has(n)], clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    found = gather("uavdt", folder, TERMS, [n for n in places if wanted(n) and has(n)], clip_of, lacking)
+    return replace(found, notes=tuple(notes))
 
 
 def read_truth(path: Path, classes: list[str], length: int = 0) -> Truth:
@@ -108,7 +109,7 @@ def read_attributes(path: Path) -> list[str]:
     return [name for name, cell in zip(ATTRIBUTES, cells, strict=True) if cell == "1"]
 
 
-def _attributes(folder: Path, name: str, notes: list[str]) -> list[str]:
+def _attributes(folder: Path, name: str, lacking: list[str]) -> list[str]:
     paths = [folder / "M_attr" / part / f"{name}_attr.txt" for part in ("train", "test", ".")]
     path = next((p for p in paths if p.is_file()), None)
     try:
@@ -116,5 +117,5 @@ def _attributes(folder: Path, name: str, notes: list[str]) -> list[str]:
             raise InputError(f"no attributes, which belong in {paths[0]}")
         return read_attributes(path)
     except InputError as error:
-        notes.append(f"{name}: {error}")
+        lacking.append(f"{name}: {error}")
         return []

@@ -52,10 +52,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     asked(np.zeros(0), classes, CATEGORIES, "VisDrone")
     splits = [s for s in (folder, *(folder / n for n in folders_in(folder))) if (s / "annotations").is_dir()]
     if not splits:
-        lacking = f"{folder} holds no annotations/; wanted a split of VisDrone-MOT, or a folder of them"
-        return Dataset("visdrone", folder, (), TERMS, (lacking,))
+        nothing = f"{folder} holds no annotations/; wanted a split of VisDrone-MOT, or a folder of them"
+        return Dataset("visdrone", folder, (), TERMS, (nothing,))
     places = {path.stem: path for split in splits for path in sorted((split / "annotations").glob("*.txt"))}
-    notes = [
+    notes: list[str] = []
+    lacking = [
         f"{name}: no truth, which belongs in {split / 'annotations' / name}.txt"
         for split in splits
         if (split / "sequences").is_dir()
@@ -68,11 +69,11 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         pictures = whole(images_in(folder), 1)
         truth = read_truth(places[name], classes, len(pictures))
         if not pictures:
-            notes.append(f"{name}: what needs pictures, which belong in {folder}")
+            notes.append(f"{name}: no pictures, which belong in {folder}")
         return Clip(name, places[name], pictures, frames=len(pictures) or truth.frames[-1], truth=truth)
 
-    found = gather("visdrone", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, missing=(*found.missing, *notes))
+    found = gather("visdrone", folder, TERMS, filter(wanted, places), clip_of, lacking)
+    return replace(found, notes=tuple(notes))
 
 
 def read_truth(path: Path, classes: list[str], length: int = 0) -> Truth:

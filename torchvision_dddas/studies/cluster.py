@@ -69,9 +69,16 @@ def _client(scheduler: str) -> Any:
     if find_spec("distributed") is None:
         raise InputError("--scheduler needs dask and distributed; pip install 'torchvision-dddas[distributed]'")
     from distributed import Client
+    from distributed.comm.addressing import parse_address, parse_host_port
+    from distributed.comm.registry import get_backend
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes; so do we
     try:
+        # Seen before there is a client: one of what is no address complains again when it goes.
+        scheme, host = parse_address(scheduler)
+        get_backend(scheme)
+        if scheme in ("tcp", "tls"):
+            parse_host_port(host)
         return Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError, ImportError) as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

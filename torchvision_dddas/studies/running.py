@@ -29,11 +29,12 @@ def cache_folder() -> Path:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a study will do. left_out: in words, what it will not. facts: of the data sets."""
+    """What a study will do. left_out: in words, what it will not; notes: what lacks beside. facts: of the data sets."""
 
     settings: Settings
     jobs: tuple[Job, ...]
     left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -57,11 +58,15 @@ def plan(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
         raise InputError(f"the interval is {spec.interval} frames; wanted 1 or more")
     jobs: list[Job] = []
     left_out: list[str] = []
+    notes: list[str] = []
+    there: list[str] = []
     sets: list[dict[str, Any]] = []
     taken: set[str] = set()
     for source in spec.sources:
         found = read(source, base)
         left_out += found.missing
+        notes += found.notes
+        there += [clip.name for clip in found.clips]
         sets.append({"kind": found.kind, "folder": found.folder, "terms": found.terms, "clips": len(found.clips)})
         for clip in found.clips:
             if clips and not any(fnmatchcase(clip.name, pattern) for pattern in clips):
@@ -75,12 +80,19 @@ def plan(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
             if tasks:
                 jobs.append(Job(len(jobs), clip, tasks, settings, backend, spec.interval))
     if not jobs:
-        wanted = f" and {', '.join(clips)}" if clips else ""
-        first = f": {left_out[0]}" if left_out else ""
-        more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
-        raise InputError(f"no clip is left to evaluate by {spec.name}{wanted}{first}{more}")
+        raise InputError(f"no clip is left to evaluate by {spec.name}{_why_none(clips, there, left_out)}")
     facts = {"datasets": sets, "backend": backend, "code": digests.code(digests.FINDS, backend)}
-    return Plan(settings, tuple(jobs), tuple(left_out), facts)
+    return Plan(settings, tuple(jobs), tuple(left_out), tuple(notes), facts)
+
+
+def _why_none(clips: Sequence[str], there: Sequence[str], left_out: Sequence[str]) -> str:
+    """Why no clip is left. clips: patterns that were asked for; there: names of the clips that could be read."""
+    if clips and there and not any(fnmatchcase(name, pattern) for name in there for pattern in clips):
+        more = f" and {len(there) - 9} more" if len(there) > 10 else ""
+        names = ", ".join(there[:9] if more else there)
+        return f": {' and '.join(clips)} {'fits' if len(clips) == 1 else 'fit'} none; there are {names}{more}"
+    more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
+    return f": {left_out[0]}{more}" if left_out else ""
 
 
 def _tasks(spec: Spec, clip: Clip) -> tuple[tuple[Task, ...], list[str]]:
@@ -122,6 +134,8 @@ def _gathered(
             found = cache.get(done.found) if done.found else None
             scored = cache.get(done.scored) if done.scored else None
             cause = done.cause
+            if found is not None:
+                notes += [f"{job.clip.name}, {done.task}: {note}" for note in found.notes]
             if not cause and (found is None or scored is None):
                 cause = "what was kept of it is gone or damaged; run the study again"
             cases.append(Case(job.clip, done.task, found, scored, cause))
@@ -160,16 +174,17 @@ def run_study(
     if count < 0:
         raise InputError(f"--jobs is {count}; wanted 1 or more processes")
     planned = plan(spec, base, clips)
-    notes: list[str] = []
+    notes = list(planned.notes)
     store = Cache(cache or cache_folder(), notes.append)
-    begun(planned)
     ordered = order(planned.jobs)
     if scheduler is None:
+        begun(planned)
         events = _events(ordered, count, store, together, notes)
         return _gathered(planned, spec, events, store, tell, notes)
     from torchvision_dddas.studies.cluster import connected, spread
 
     with connected(scheduler) as client:
+        begun(planned)
         waiting: list[Job] = []
         # What came from workers is known by this machine's own look at the files.
         known = _known(ordered, store, digests.Files(store.folder / "files"), waiting)

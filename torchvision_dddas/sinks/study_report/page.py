@@ -23,6 +23,7 @@ MOST_LEFT_OUT = 200
 """Lines; run.json has them all."""
 
 
+_ELSEWHERE = ("faults", "notes")  # facts that are not told among the others
 _NAVIGATION = '<nav><a href="#costs">costs</a><a href="#settings">what was run, settings, versions</a></nav>'
 
 
@@ -41,7 +42,7 @@ def report(metrics: Mapping[str, Any], results: Results) -> str:
     for task, mine in told_of.items():
         parts.append(card(task, mine, costs, sum(case.cause != "" for case in by_task[task])))
     parts.append("</div>")
-    parts.append(_left_out(failed, results.left_out))
+    parts += [_left_out(failed, results.left_out), _notes(results.facts.get("notes", ()))]
     for task, mine in told_of.items():
         parts += _task(task, mine, by_task[task])
     parts += _costs(costs)
@@ -72,9 +73,7 @@ def _task(task: str, mine: Told, cases: Sequence[Case]) -> list[str]:
     if seen := [*maps(cases), *error_clouds(cases)]:
         parts += ["<h3>Maps</h3>", '<div class="plots">', *(_plot(one) for one in seen), "</div>"]
     notes = [f"{case.clip.name}: {note}" for case in cases if case.scored for note in case.scored.notes]
-    if notes:
-        items = "".join(f"<li>{escape(note)}</li>" for note in dict.fromkeys(notes))
-        parts.append(f"<details><summary>Notes ({len(notes)})</summary><ul>{items}</ul></details>")
+    parts.append(_notes(notes))
     return parts
 
 
@@ -110,6 +109,13 @@ def _figure(one: Worst) -> str:
     return f'<figure><div class="pair">{sides}</div>{words_of_it}</figure>'
 
 
+def _notes(notes: Sequence[str]) -> str:
+    if not notes:
+        return ""
+    items = "".join(f"<li>{escape(line)}</li>" for line in dict.fromkeys(notes))
+    return f"<details><summary>Notes ({len(dict.fromkeys(notes))})</summary><ul>{items}</ul></details>"
+
+
 def _left_out(failed: Sequence[Case], left_out: Sequence[str]) -> str:
     lines = list(left_out)
     lines += [f"{c.clip.name}, {c.task}: {c.cause}" for c in failed if not any(c.cause in line for line in lines)]
@@ -142,7 +148,7 @@ def _facts(results: Results) -> list[str]:
         "configuration": spec.config or "defaults",
         "set": spec.overrides or "nothing",
         "interval": f"{spec.interval} frames, of tracking and association",
-        **{name.replace("backend", "back end"): fact for name, fact in results.facts.items() if name != "faults"},
+        **{name.replace("backend", "back end"): fact for name, fact in results.facts.items() if name not in _ELSEWHERE},
         "versions": versions(),
     }
     said["datasets"] = [_of_set(one) for one in results.facts.get("datasets", ())] or said["datasets"]
