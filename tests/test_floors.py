@@ -105,6 +105,10 @@ FLOORS: dict[str, set[str]] = {
     "evaluate": {"numpy", "cv2", "metrics", "sources", "errors"},
     # Knobs as parameters, and the steps that they steer, softened.
     "modules": {"torch", "ops", "settings", "errors", "types"},
+    # The body in a window and its odds: the same formulas on tensors.
+    "modules.people": {"torch", "ops", "targets.persons"},
+    # The tracker's own formulas, on tensors.
+    "modules.links": {"torch", "ops", "targets", "settings"},
     "tuning": {"torch", "*"},
     "exporting": {"torch", "*"},
     "onboard": {"*"},

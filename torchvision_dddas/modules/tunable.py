@@ -87,8 +87,9 @@ def _from_settings(
     return found
 
 
-# Not here: switches and choices; what decides how many points, levels or frames are looked at, which changes the graph;
-# and what acts on single blobs by counting (persistence), for which a mask's pixels give no slope.
+# Not here: switches and choices; scores from which detections count, which decide what there is to link; what decides
+# how many points, levels or frames are looked at, which changes the graph; and what acts on single blobs by counting
+# (persistence), for which a mask's pixels give no slope.
 TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "noise_levels threshold"),
     **_from_settings("motion", "difference", "gradient_share", offset=0.02),
@@ -97,8 +98,10 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "morphology", "erode_px close_px", rounding="whole"),
     **_from_settings("motion", "gates", "min_area_px", rounding="whole"),
     **_from_settings("tracking", "track", "speed agility scatter size_scatter own_scatter own_size_scatter"),
+    **_from_settings("tracking", "track", "tail upright rest_drift"),
     **_from_settings("tracking", "track", "births own_births appearance_weight", offset=0.1),
-    **_from_settings("tracking", "track", "min_score birth_score appearance_offset", log=False),
+    **_from_settings("tracking", "track", "rest_price missed border left", offset=0.1),
+    **_from_settings("tracking", "track", "prior appearance_offset", log=False),
     **_from_settings("tracking", "paper", "weight lowest_dispersion location_cut appearance_cut threshold", log=False),
     **_from_settings("people", "people", "threshold probability_even height_share width_share feet_share", log=False),
     **_from_settings("people", "people", "probability_slope"),

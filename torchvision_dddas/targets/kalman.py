@@ -134,12 +134,10 @@ def carried(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
 
     Velocities turn and stretch with the picture around each target, and sizes with its scale there.
     """
-    place, turn = _mapped(state[:, : Y + 1], now_from_before)
-    new = state.copy()
-    new[:, : Y + 1] = place
-    new[:, VX : VY + 1] = np.einsum("nij,nj->ni", turn, state[:, VX : VY + 1])
-    new[:, WIDTH : HEIGHT + 1] *= _scale(turn)
-    return new
+    place, turn = _mapped(state[..., : Y + 1], now_from_before)
+    velocity = namespace(state).einsum("...nij,...nj->...ni", turn, state[..., VX : VY + 1])
+    size = state[..., WIDTH : HEIGHT + 1] * _scale(turn)
+    return namespace(state).concatenate([place, velocity, size, state[..., GROWTH:]], -1)
 
 
 def carried_boxes(box_px: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
@@ -151,10 +149,12 @@ def carried_boxes(box_px: np.ndarray, now_from_before: np.ndarray) -> np.ndarray
 
 def _mapped(point: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 2) under a homography, and its derivative there, (N, 2, 2)."""
-    depth = (point @ h[2, :2] + h[2, 2])[:, None]
-    place = (point @ h[:2, :2].T + h[:2, 2]) / depth
-    return place, (h[None, :2, :2] - place[:, :, None] * h[2, :2]) / depth[:, :, None]
+    straight = namespace(point).swapaxes(h[..., :2], -1, -2)
+    depth = point @ straight[..., 2:] + h[..., 2:, 2:]
+    place = (point @ straight[..., :2] + h[..., None, :2, 2]) / depth
+    return place, (h[..., None, :2, :2] - place[..., None] * h[..., None, 2:, :2]) / depth[..., None]
 
 
 def _scale(turn: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.abs(turn[:, 0, 0] * turn[:, 1, 1] - turn[:, 0, 1] * turn[:, 1, 0]))[:, None]
+    area = turn[..., 0, 0] * turn[..., 1, 1] - turn[..., 0, 1] * turn[..., 1, 0]
+    return namespace(turn).sqrt(abs(area))[..., None]

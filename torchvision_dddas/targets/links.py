@@ -16,6 +16,8 @@ from torchvision_dddas.targets.namespace import namespace
 
 _WORST_SIZE = 8.0
 _MISSED_FRAMES = 5.0  # how the price of a gap grows
+_ENOUGH = 30  # detections before the rate of births means anything
+_NO_BIRTHS = 10  # detections without a birth, times the interval, that the rate starts from
 _USUAL_BIRTHS = 0.002  # per detection and frame
 _MOST_BIRTHS = 6.0  # their price at most: who comes back at once and on the spot is no newcomer, whatever else appears
 
@@ -39,6 +41,14 @@ class Sight:
     def agility(self, knobs: TrackKnobs) -> float:
         """Sd of the change of velocity in a frame, heights/frame: who is fast turns fast."""
         return knobs.agility * self.speed / USUAL_SPEED
+
+
+def births_of(births: int, seen: int, doubt: float, interval: int) -> float:
+    """Targets that begin inside the picture per detection and frame, from counts of both.
+
+    Who misses targets loses tracks and begins new ones for them: such births are no sign of new targets.
+    """
+    return births / ((seen + _NO_BIRTHS * interval) * interval * (1 + 2 * doubt)) if seen > _ENOUGH else 0.0
 
 
 def near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.ndarray:
@@ -78,7 +88,8 @@ def link_scores(
         knobs.border * near_border(box_px, sight.size)[..., None, :] + knobs.left * left_at_border[..., None]
     )
     # Where targets keep appearing out of nowhere, this is one more rather than one come back.
-    lost = lost - min(knobs.births * math.log(max(sight.births / _USUAL_BIRTHS, 1.0)), _MOST_BIRTHS)
+    crowding = functions.log(functions.clip(sight.births / _USUAL_BIRTHS, 1.0, None))
+    lost = lost - functions.clip(knobs.births * crowding, None, _MOST_BIRTHS)
     return functions.where(missed[..., None], lost, score)
 
 

@@ -20,6 +20,7 @@ class Pace:
     def __init__(self, speed: float) -> None:
         """speed: where nothing has been seen yet."""
         self.start = self.speed = speed
+        self.usual = speed  # of the steps that are remembered
         self.steps: deque[float] = deque(maxlen=_STEPS)
 
     def add(self, before_px: np.ndarray, now_px: np.ndarray, frames: int) -> None:
@@ -31,7 +32,17 @@ class Pace:
         nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
         mutual = np.flatnonzero(back[nearest] == np.arange(len(before_px)))
         self.steps.extend(distance[mutual, nearest[mutual]] / (before_px[mutual, 3] * frames))
-        if (known := len(self.steps)) >= _LEAST_STEPS:
-            usual = max(1.25 * sorted(self.steps)[(3 * known) // 4], _LEAST_SPEED)
-            weighted = _PRIOR_STEPS * np.log(self.start) + known * np.log(usual)
-            self.speed = float(np.exp(weighted / (_PRIOR_STEPS + known)))
+        if (known := self.known) >= _LEAST_STEPS:
+            self.usual = max(1.25 * sorted(self.steps)[(3 * known) // 4], _LEAST_SPEED)
+            self.speed = speed_of(self.start, self.usual, known)
+
+    @property
+    def known(self) -> int:
+        """Steps remembered."""
+        return len(self.steps)
+
+
+def speed_of(start: float, usual: float, known: int) -> float:
+    """The speed where so many steps are known, and what they say; the start is worth some. Numbers, or tensors."""
+    share = known / (_PRIOR_STEPS + known) * (known >= _LEAST_STEPS)
+    return start ** (1 - share) * usual**share

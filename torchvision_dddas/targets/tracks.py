@@ -8,18 +8,15 @@ import numpy as np
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.targets import kalman
 from torchvision_dddas.targets.assignment import pairs
-from torchvision_dddas.targets.kalman import SEEN, VX, VY, X, Y, carried_boxes
+from torchvision_dddas.targets.forgetting import remembered
+from torchvision_dddas.targets.kalman import SEEN, carried_boxes
 from torchvision_dddas.targets.ledger import FILLED, Ledger
 from torchvision_dddas.targets.likeness import blended, in_doubt, likeness_scores, visible_share
-from torchvision_dddas.targets.links import Sight, link_scores, near_border
+from torchvision_dddas.targets.links import Sight, births_of, link_scores, near_border
 from torchvision_dddas.targets.lookahead import best_links, plausible
 from torchvision_dddas.targets.pace import Pace
 from torchvision_dddas.targets.roster import Roster, widened
 from torchvision_dddas.types import Detections, Tracks
-
-_LEAVING = 15  # frames for which a target is taken to go on as it went
-_ENOUGH = 30  # detections before the rate of births means anything
-_NO_BIRTHS = 10  # detections without a birth, times the interval, that the rate starts from
 
 
 @dataclass
@@ -136,12 +133,7 @@ class Tracker:
 
     def _sight(self, look: _Look) -> Sight:
         doubt = self.doubtful / max(self.seen, 1)
-        # Who misses targets loses tracks and begins new ones for them: such births are no sign of new targets.
-        births = (
-            self.births / ((self.seen + _NO_BIRTHS * self.interval) * self.interval * (1 + 2 * doubt))
-            if self.seen > _ENOUGH
-            else 0.0
-        )
+        births = births_of(self.births, self.seen, doubt, self.interval)
         return Sight(look.frame, look.interval, self.pace.speed, births, doubt, self.size)
 
     def _scores(self, roster: Roster, look: _Look, box_px: np.ndarray) -> np.ndarray:
@@ -196,15 +188,8 @@ class Tracker:
 
     def _forget(self, look: _Look) -> None:
         """Drop the tracks that were lost too long ago, or left, or were seen too seldom to be anything."""
-        state = self.roster.state
-        age = look.frame - state[:, SEEN]
-        keep = age <= self.knobs.memory_frames
-        if self.size is not None:
-            # Later a target may as well have stopped or turned before it reached the border.
-            place = state[:, X : Y + 1] + np.minimum(age, _LEAVING)[:, None] * state[:, VX : VY + 1]
-            outside = ((place < 0) | (place > np.array(self.size))).any(axis=1)
-            keep &= ~outside | (age <= max(self.knobs.memory_outside_frames, look.interval))
-        late = age > (FILLED + 1) * look.interval
+        keep = remembered(self.roster.state, look.frame, look.interval, self.size, self.knobs)
+        late = look.frame - self.roster.state[:, SEEN] > (FILLED + 1) * look.interval
         if late.any():
             keep &= ~late | self.ledger.confirmed(self.roster.number)
         if not keep.all():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -73,6 +73,15 @@ class Family(Protocol):
         knobs: values in the units of `settings`, scalars or (n,), by name: those tuned alone; what is not tuned is as
         in the settings that the examples were prepared with. The result depends on nothing but the arguments.
         """
+        ...
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """A family whose examples depend on how far apart the looks are."""
+
+    def at(self, interval_frames: int, task: Task) -> Family:
+        """The family for a study's interval and for the task that its measure is of."""
         ...
 
 

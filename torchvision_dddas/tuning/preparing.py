@@ -13,7 +13,7 @@ from torchvision_dddas.studies.goals import Goal, goal_of
 from torchvision_dddas.studies.record import Spec
 from torchvision_dddas.studies.running import plan
 from torchvision_dddas.studies.tried import parted
-from torchvision_dddas.tuning.family import Example, Family, Tick, family_of
+from torchvision_dddas.tuning.family import Example, Family, Tick, Timed, family_of
 
 
 @dataclass
@@ -53,6 +53,8 @@ def prepare(
     family = _family(names)
     knobs = Knobs(settings, names)
     goal = goal_of(measure or family.measure)
+    if isinstance(family, Timed):
+        family = family.at(spec.interval, goal.task)
     spec = replace(spec, tasks=(goal.task,))
     tuned, held = parted(spec, base, clips, holdout)
     seen = tuple(job.clip for job in plan(spec, base, [glob.escape(name) for name in tuned]).jobs)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-ROUNDS = 200
+ROUNDS = 50
 """Rounds of messages at most."""
-_CLOSE = 1e-10  # change of any message's logarithm that ends the rounds
+_CLOSE = 1e-6  # change of any share that ends the rounds
 
 
 def shares(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS) -> Float[Tensor, "*B N M"]:
@@ -29,11 +29,10 @@ def shares(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS
 
 
 def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS) -> Float[Tensor, "*B"]:
-    """softness · log Σ exp(sum of scores / softness), over all assignments, as Bethe has it.
+    """Bethe's softness · log Σ exp(sum of scores / softness), over all assignments.
 
     score: -inf forbids a pair. The gradient in the scores is `shares`: at the fixed point messages have no slope, so
-    that they need none. Exact where no target of both frames has a choice, and never more than half a factor of two a
-    target off (Gurvits).
+    that they need none. Never above the exact sum (Gurvits), and equal to it where one frame has a single target.
     """
     scaled = score / softness
     with torch.no_grad():
@@ -49,13 +48,14 @@ def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int =
 
 def _from_columns(scaled: Float[Tensor, "*B N M"], rounds: int) -> Float[Tensor, "*B N M"]:
     """Logarithms of the messages from columns to their pairs: how free a column is, would the pair not be."""
-    message = torch.zeros_like(scaled)
+    message, share = torch.zeros_like(scaled), torch.zeros_like(scaled)
+    if not scaled.numel():
+        return message
     for _ in range(rounds):
         from_row = scaled - _log_sum_of_others(scaled + message, -1)
-        new = -_log_sum_of_others(from_row, -2)
-        far = (new - message).abs().amax() if new.numel() else new.new_zeros(())
-        message = new
-        if far < _CLOSE:
+        message = -_log_sum_of_others(from_row, -2)
+        before, share = share, torch.sigmoid(from_row + message)
+        if (share - before).abs().amax() < _CLOSE:
             break
     return message
 

@@ -1,0 +1,219 @@
+"""Identities: how unlikely the true links are by the scores that the tracker gives them.
+
+Examples are stretches of a clip, some tens of looks each, prepared as `dddas track` would see them: the pace, the rate
+of births and the likenesses are those of the looks so far, the camera's motion is registered. True boxes are taken as
+the task `association` takes them.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.modules.links import Looks, unlikeliness
+from torchvision_dddas.settings import Settings, TrackKnobs
+from torchvision_dddas.studies.record import Task
+from torchvision_dddas.targets.kalman import carried_boxes
+from torchvision_dddas.targets.likeness import blended, likeness, visible_share
+from torchvision_dddas.targets.links import births_of, near_border
+from torchvision_dddas.targets.pace import Pace
+from torchvision_dddas.tuning.family import Example, Tick
+
+LOOKS = 25
+"""Looks of a stretch: with the memory of 125 frames all that counts at an interval of 5."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One of `modules.links.Looks`, without its first axis, and the settings that hold for what is not tuned."""
+
+    looks: Mapping[str, np.ndarray]
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Identities:
+    """The family `tracking`. interval: frames between looks."""
+
+    interval: int = 1
+    name: str = "tracking"
+    task: Task = "association"
+    measure: str = "association.tracks.idf1"
+    softness: tuple[float, float] = (2.0, 0.5)
+
+    def at(self, interval_frames: int, task: Task) -> "Identities":
+        """The same for a study's interval; see `family.Timed`."""
+        return replace(self, interval=interval_frames)
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """Stretches of the clips' true tracks. See `family.Family`."""
+        found = []
+        for clip in clips:
+            if clip.truth is None or clip.truth.tracks is None or not len(clip.truth.tracks.frame):
+                raise InputError(f"{clip.name} has no true identities, which tuning the tracker needs; leave it out")
+            for stretch in _stretches(clip, clip.truth.tracks.every(self.interval), settings, self.interval):
+                found.append(Example(clip.name, int(stretch.looks["frame"][0]), stretch))
+                tick()
+        return found
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,) nats a link, at softness 1. See `family.Family`."""
+        settings: Settings = batch[0].content.settings
+        tuned = {name.removeprefix("track."): value for name, value in knobs.items() if name.startswith("track.")}
+        track = TrackKnobs.model_construct(**(dict(settings.track) | tuned))
+        device = next(iter(knobs.values())).device
+        return unlikeliness(track, together([example.content for example in batch], device), softness)
+
+
+def family() -> Identities:
+    """What `family.family_of` calls."""
+    return Identities()
+
+
+def together(stretches: Sequence[Stretch], device: torch.device | str = "cpu") -> Looks:
+    """Stretches as one batch: those with fewer looks or targets are filled up with looks at which nobody is."""
+    shapes = [stretch.looks["there"].shape for stretch in stretches]
+    most = {"T": max(shape[0] for shape in shapes), "N": max(shape[1] for shape in shapes)}
+    parts: dict[str, Any] = {}
+    for field in fields(Looks):
+        axes = cast(Any, field.type).dim_str.split()[1:]
+        rows = []
+        for stretch in stretches:
+            value = stretch.looks[field.name]
+            rows.append(_filled(value, [most.get(axis, size) for axis, size in zip(axes, value.shape, strict=True)]))
+        parts[field.name] = torch.as_tensor(np.stack(rows), device=device)
+    return Looks(**parts)
+
+
+def _filled(value: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Repeated at its ends up to a shape; what is not there is so on, as only numbers are repeated."""
+    wider = [(0, size - had) for size, had in zip(shape, value.shape, strict=True)]
+    if not value.ndim:
+        return value
+    if value.dtype == bool or not value.size:
+        return np.pad(value, wider, constant_values=False if value.dtype == bool else 1.0)
+    return np.pad(value, wider, mode="edge")
+
+
+def _stretches(clip: Clip, table: TrackTable, settings: Settings, interval: int) -> Iterator[Stretch]:
+    """The clip in pieces of LOOKS looks, the last one maybe shorter; none of a single look."""
+    looks = list(_looks(clip, table, settings, interval))
+    for start in range(0, len(looks), LOOKS):
+        piece = looks[start : start + LOOKS]
+        if len(piece) > 1:
+            yield Stretch(_stacked(piece), settings)
+
+
+@dataclass
+class _Look:
+    """One look at the true boxes, and what the tracker knows by then."""
+
+    frame: int
+    identity: np.ndarray
+    box_px: np.ndarray
+    score: np.ndarray
+    step: np.ndarray | None
+    signature: np.ndarray | None
+    fixed: dict[str, Any]
+
+
+def _looks(clip: Clip, table: TrackTable, settings: Settings, interval: int) -> Iterator[_Look]:
+    pace, before = Pace(settings.track.speed), None
+    size = _size(clip, table)
+    seen, births, known = 0, 0, set[int]()
+    for number, identity, box_px, step, signature in _shown(clip, table, settings, interval):
+        if before is not None:
+            pace.add(before if step is None else carried_boxes(before, step), box_px, interval)
+        seen += len(box_px)
+        fixed = {
+            "interval": float(interval),
+            "size": np.array(size, float),
+            "usual": pace.usual,
+            "known": float(pace.known),
+            "births": births_of(births, seen, 0.0, interval),
+            "doubt": 0.0,
+            "own": False,
+        }
+        yield _Look(number, identity, box_px, np.ones(len(box_px)), step, signature, fixed)
+        inside = ~near_border(box_px, size)
+        births += sum(one not in known for one in identity[inside].tolist()) if before is not None else 0
+        known |= set(identity.tolist())
+        before = box_px
+
+
+def _size(clip: Clip, table: TrackTable) -> tuple[float, float]:
+    from torchvision_dddas.sources.detections import DetectionTable
+    from torchvision_dddas.studies.stages import opened
+
+    if clip.pictures:
+        width, height = opened(clip).size
+        return float(width), float(height)
+    ones = np.ones(len(table.frame))
+    found = DetectionTable(clip.name, table.frame, np.asarray(table.box_px, float), ones, np.arange(len(ones))).extent
+    return found if found is not None else (1e6, 1e6)
+
+
+def _shown(
+    clip: Clip, table: TrackTable, settings: Settings, interval: int
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]]:
+    """Number, identities, boxes, camera's motion and histograms of each look from the first to the last with boxes."""
+    from torchvision_dddas.studies.stages import opened
+    from torchvision_dddas.vision import load
+    from torchvision_dddas.vision.appearance import strips
+    from torchvision_dddas.vision.camera import Camera
+
+    def at(number: int) -> tuple[np.ndarray, np.ndarray]:
+        rows = table.frame == number
+        return table.identity[rows], np.asarray(table.box_px[rows], float)
+
+    last = int(table.frame.max())
+    if not clip.pictures:
+        for number in range(int(table.frame.min()), last + 1, interval):
+            yield number, *at(number), None, None
+        return
+    camera, looks_matter = Camera(load("onboard", settings)), settings.track.appearance != "never"
+    for frame in opened(clip).every(interval):
+        if frame.number > last:
+            return
+        identity, box_px = at(frame.number)
+        step, _ = camera.step(frame.image)
+        yield frame.number, identity, box_px, step, strips(frame.image, box_px) if looks_matter else None
+
+
+def _stacked(looks: Sequence[_Look]) -> dict[str, np.ndarray]:
+    """The fields of `Looks`, box n always target n."""
+    names = np.unique(np.concatenate([look.identity for look in looks]))
+    shape = (len(looks), len(names))
+    box_px, there, visible = np.ones((*shape, 4)), np.zeros(shape, bool), np.ones(shape)
+    alike = np.full((*shape, len(names)), np.nan)
+    signature, hits = None, np.zeros(len(names), np.int64)
+    for t, look in enumerate(looks):
+        here = np.searchsorted(names, look.identity)
+        box_px[t, here], there[t, here] = look.box_px, True
+        visible[t, here] = visible_share(look.box_px)
+        if look.signature is not None and len(here):
+            if signature is None:
+                signature = np.zeros((len(names), look.signature.shape[1]))
+            alike[t][:, here] = likeness(signature, look.signature)
+            hits[here] += 1
+            signature[here] = blended(signature[here], look.signature, visible[t, here], hits[here])
+    fixed = {key: np.stack([np.asarray(look.fixed[key]) for look in looks]) for key in looks[0].fixed}
+    once = {key: fixed.pop(key)[0] for key in ("interval", "size", "own")}
+    return {
+        **fixed,
+        **once,
+        "frame": np.array([look.frame for look in looks], float),
+        "box_px": box_px,
+        "there": there,
+        "certain": there,
+        "begins": there,
+        "step": np.stack([np.eye(3) if look.step is None else look.step for look in looks]),
+        "likeness": alike,
+        "visible": visible,
+    }
