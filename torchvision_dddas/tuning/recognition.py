@@ -1,0 +1,162 @@
+"""People by their shape: probabilities that are the shares that are right, boxes that fit, a threshold that pays.
+
+The windows of a picture are scored once by the hard recognizer, down to `BELOW` under the threshold. What is right is
+told by the boxes of the settings that the examples were prepared with. Three losses are added, each with knobs of its
+own: the doubt about scores (probability_slope, probability_even), 1 - IoU of the boxes that are right (height_share,
+width_share, feet_share) and 1 - F1 of the picture (threshold).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics import uncounted
+from torchvision_dddas.metrics.detection import iou
+from torchvision_dddas.metrics.ranking import SAME, judged
+from torchvision_dddas.metrics.truth import Truth
+from torchvision_dddas.modules.people import bodies, doubt, overlap, soft_f
+from torchvision_dddas.settings import PeopleKnobs, Settings
+from torchvision_dddas.studies.record import Task
+from torchvision_dddas.targets import scan
+from torchvision_dddas.targets.persons import people_of
+from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.vision import Recognizer
+
+MOST = 80
+"""Pictures of a clip that are learned from, evenly over it: to score one takes about a second, and all clips' windows
+together tell six numbers."""
+
+BELOW = 1.0
+"""How far below the threshold of the settings windows are kept, in units of the score."""
+
+KNOBS = ("height_share", "width_share", "feet_share", "probability_slope", "probability_even", "threshold")
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The detections of a picture, best first. margin, right: (N,); right: 1.0 or 0.0. people: true ones.
+
+    sure: how many score above the threshold of the settings: these alone have a probability. window_px, true_px: (R, 4)
+    of those of them that are right, and the bodies' true boxes.
+    """
+
+    margin: Tensor
+    right: Tensor
+    sure: int
+    window_px: Tensor
+    true_px: Tensor
+    people: int
+    settings: PeopleKnobs
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """The family `people`."""
+
+    name: str = "people"
+    task: Task = "people"
+    measure: str = "people.boxes.f1"
+    softness: tuple[float, float] = (0.3, 0.05)
+    """In units of the score."""
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """The pictures whose people are labelled, each scored once. See `family.Family`."""
+        from torchvision_dddas.recognizing import recognizer_of
+
+        knobs = settings.people
+        if knobs.suppression != "nms":
+            raise InputError(f"people.suppression = {knobs.suppression} cannot be tuned by gradient; set it to nms")
+        recognizer, found = recognizer_of(knobs), list[Example]()
+        for clip in clips:
+            for example in _pictures(clip, knobs, recognizer):
+                found.append(example)
+                tick()
+        return found
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,). See `family.Family`."""
+        return torch.stack([_lost(example.content, knobs, softness) for example in batch])
+
+
+def family() -> Recognition:
+    """See `family.family_of`."""
+    return Recognition()
+
+
+def scored(
+    image: np.ndarray,
+    truth_px: np.ndarray,
+    knobs: PeopleKnobs,
+    recognizer: Recognizer,
+    counted: Callable[[np.ndarray], np.ndarray] = lambda box_px: np.ones(len(box_px), bool),
+) -> Scored:
+    """The detections of one picture, 8 bits grey or BGR, and which are right.
+
+    truth_px: (M, 4). counted: which of boxes (N, 4) are right or wrong; the others are left out.
+    """
+    size = (image.shape[1], image.shape[0])
+    parts = scan.everywhere(size, knobs)
+    (maps,) = recognizer.scores([image], [parts])
+    low = knobs.model_copy(update={"threshold": knobs.threshold - BELOW})
+    window_px, margin = scan.windows(parts, maps, size, low)
+    every = people_of(window_px, margin, size, low)
+    above = margin >= knobs.threshold
+    # Boxes are means of windows, weighed by how far they are above the threshold: those of the settings' own.
+    shown = people_of(window_px[above], margin[above], size, knobs)
+    box_px = np.concatenate([shown.box_px, every.box_px[len(shown) :]])
+    kept = counted(box_px)
+    sure = int(kept[: len(shown)].sum())
+    box_px, margin = box_px[kept], every.margin[kept]
+    right = judged(box_px, margin, truth_px)
+    whose = _whose(box_px[:sure], right[:sure], truth_px)
+    window_px = shown.window_px[kept[: len(shown)]][whose >= 0]
+    columns = margin, right, window_px, truth_px[whose[whose >= 0]].reshape(-1, 4)
+    margin_, right_, windows_, true_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
+    return Scored(margin_, right_, sure, windows_, true_, len(truth_px), knobs)
+
+
+def _pictures(clip: Clip, knobs: PeopleKnobs, recognizer: Recognizer) -> Iterator[Example]:
+    from torchvision_dddas.recognizing import checked
+    from torchvision_dddas.studies.stages import opened
+
+    truth = clip.truth
+    if truth is None or truth.kind != "boxes" or not truth.boxes:
+        raise InputError(f"{clip.name} has no boxes of people; wanted pictures with labelled people")
+    numbers = sorted(truth.boxes)
+    some = {numbers[i * len(numbers) // MOST] for i in range(MOST)} if len(numbers) > MOST else set(numbers)
+    for frame in opened(clip):
+        if frame.number in some:
+            image = checked(frame.image, f"{clip.name}, frame {frame.number}")
+            true_px = np.asarray(truth.boxes[frame.number], float).reshape(-1, 4)
+            told = partial(_counted, truth, frame.number)
+            yield Example(clip.name, frame.number, scored(image, true_px, knobs, recognizer, told))
+
+
+def _counted(truth: Truth, number: int, box_px: np.ndarray) -> np.ndarray:
+    return uncounted.counted(truth, np.full(len(box_px), number), box_px)
+
+
+def _whose(box_px: np.ndarray, right: np.ndarray, truth_px: np.ndarray) -> np.ndarray:
+    """(N,) the true box of each that is right, best first, each once; -1 for the others."""
+    whose, free = np.full(len(box_px), -1), iou(box_px, truth_px)
+    for row in np.flatnonzero(right > 0).tolist():
+        best = int(free[row].argmax())
+        if free[row, best] >= SAME:
+            whose[row], free[:, best] = best, -1
+    return whose
+
+
+def _lost(content: Scored, knobs: Mapping[str, Tensor], softness: float) -> Tensor:
+    values = {f"people.{name}": torch.tensor(float(getattr(content.settings, name))) for name in KNOBS} | dict(knobs)
+    total = 1 - soft_f(content.margin, content.right, content.people, values["people.threshold"], softness)
+    if content.sure:
+        total = total + doubt(content.margin[: content.sure], content.right[: content.sure], values).mean()
+    if len(content.true_px):
+        total = total + (1 - overlap(bodies(content.window_px, values), content.true_px)).mean()
+    return total
