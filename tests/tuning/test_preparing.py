@@ -1,0 +1,55 @@
+"""From a study to what is tuned: the family of the knobs, clips apart, and what cannot be."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.studies.world import filmed, followed, study
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.studies.spec import read_spec
+from torchvision_dddas.tuning.family import FAMILIES, family_of
+from torchvision_dddas.tuning.preparing import prepare
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory) -> Path:
+    """A study of two clips with masks, and one without."""
+    place = tmp_path_factory.mktemp("preparing") / "clips"
+    filmed(place, "one", 0, frames=7)
+    filmed(place, "held", 1, frames=7)
+    followed(place, "boxes", 2, frames=7)
+    return study(place, 'config = "fast"')
+
+
+def test_examples_are_of_the_clips_that_are_not_held_out(clips) -> None:
+    ready = prepare(read_spec(clips), clips.parent, ["difference.*"], ["held"], ["one", "held"])
+    assert ready.tuned == ("one",) and ready.held == ("held",)
+    assert {example.clip for example in ready.examples} == {"one"} and ready.examples
+    frames = [example.frame for example in ready.examples]
+    assert frames == sorted(frames)
+    assert ready.spec.tasks == ("motion",) and ready.goal.name == "motion.pixels.f"
+    assert set(ready.knobs.names) >= {"difference.threshold", "difference.noise_levels"}
+
+
+def test_a_clip_without_the_truth_that_is_needed_is_named(clips) -> None:
+    with pytest.raises(InputError, match="boxes"):
+        prepare(read_spec(clips), clips.parent, ["difference.threshold"], (), ["boxes"])
+
+
+def test_knobs_of_several_families_are_told_apart(clips) -> None:
+    with pytest.raises(InputError, match=r"motion: difference\.threshold; tracking: track\.speed"):
+        prepare(read_spec(clips), clips.parent, ["difference.threshold", "track.speed"])
+
+
+def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
+    with pytest.raises(InputError, match="wanted one of motion"):
+        family_of("weather")
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_every_family_is_there_and_says_what_it_is(name: str) -> None:
+    family = family_of(name)
+    assert family.name == name
+    assert family.measure.split(".")[0] == family.task
+    first, last = family.softness
+    assert first >= last >= 0
