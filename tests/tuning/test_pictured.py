@@ -48,7 +48,7 @@ def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:
 
 
 def looks(clip: Clip, settings: Settings | None = None) -> list[Look]:
-    return [example.content[0] for example in family().examples([clip], settings or Settings())]
+    return [example.content.look for example in family().examples([clip], settings or Settings())]
 
 
 @pytest.mark.parametrize("geographic", [False, True])
@@ -56,7 +56,7 @@ def test_looks_of_an_exact_flight_have_no_errors(tmp_path, geographic):
     clip = flown(tmp_path, Overflight(frames=3, geographic=geographic))
     examples = family().examples([clip], Settings())
     assert [example.frame for example in examples] == [1, 2, 3]
-    assert [len(example.content[0].true_m) for example in examples] == [4, 4, 4]
+    assert [len(example.content.look.true_m) for example in examples] == [4, 4, 4]
     wide = family().loss({"aerial.target_sigma_px": torch.tensor(1.0)}, examples, 1.0)
     fine = family().loss({"aerial.target_sigma_px": torch.tensor(0.05)}, examples, 1.0)
     assert (fine < wide - 1).all()  # no errors: the smaller the ellipses the better

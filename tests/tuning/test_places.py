@@ -11,7 +11,7 @@ from torchvision_dddas.targets.plane import ground_points
 from torchvision_dddas.targets.registrar import Registrar
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.looks import SPREADS, look_at, of_settings, only_noise
+from torchvision_dddas.tuning.looks import SPREADS, Seen, kept, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.places import UNPLACED, family
 from torchvision_dddas.vision import load_solver
 
@@ -31,7 +31,7 @@ def looks(count: int, settings: Settings, **how) -> list[Example]:
         flight = replace(look.flight, hfov_rad=HFOV)
         own = np.ones(n, bool)
         one = look_at(airborne.CAMERA, flight, marks, look.targets_px, look.targets, settings, own)
-        found.append(Example("looks", seed, (one, settings)))
+        found.append(Example("looks", seed, Seen(one, settings)))
     return found
 
 
@@ -82,20 +82,29 @@ def test_pictures_of_several_shapes_share_a_batch():
 def test_a_picture_that_no_pose_explains_costs_and_has_no_slope():
     settings = Settings()
     (example,) = looks(1, settings)
-    look, _ = example.content
+    look = example.content.look
     upward = replace(look, targets_px=np.full_like(look.targets_px, 1e7))
     knob = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-    found = family().loss({"aerial.tilt_sigma_deg": knob}, [Example("looks", 0, (upward, settings))], 1.0)
+    found = family().loss({"aerial.tilt_sigma_deg": knob}, [Example("looks", 0, Seen(upward, settings))], 1.0)
     found.sum().backward()
     assert float(found.detach()) == UNPLACED
     assert knob.grad is not None
     assert float(knob.grad) == 0
 
 
+def test_a_fit_that_is_kept_is_right_about_its_settings():
+    settings = Settings()
+    batch = looks(4, settings, tilt_deg=30.0)
+    quick = [replace(one, content=kept(one.content)) for one in batch]
+    for knobs in ({}, {"aerial.tilt_sigma_deg": torch.tensor(1.5)}, {"landmarks.sigma_m": torch.tensor(1.0)}):
+        hard, near = (family().loss(knobs, some, 1.0) for some in (batch, quick))
+        assert near.tolist() == pytest.approx(hard.tolist(), abs=0.02 if knobs else 1e-4)
+
+
 def test_swapped_landmarks_are_no_matter_of_noise():
     settings = Settings()
     (example,) = looks(1, settings, sigma_m=0.02)
-    look, _ = example.content
+    look = example.content.look
     probability = settings.aerial.gate_probability
     assert only_noise(look, values(settings), probability)
     pixels = look.marks.image_px[[1, 0, 2, 3]]

@@ -20,7 +20,7 @@ from torchvision_dddas.targets import geodesy
 from torchvision_dddas.targets.courses import Courses
 from torchvision_dddas.targets.elevation import surface
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.looks import look_at, of_settings, only_noise
+from torchvision_dddas.tuning.looks import Seen, look_at, of_settings, only_noise
 from torchvision_dddas.types import Grounded
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _look(
     )
     if not only_noise(look, of_settings(settings), settings.aerial.gate_probability):
         return None
-    return Example(clip.name, grounded.frame, (look, settings))
+    return Example(clip.name, grounded.frame, Seen(look, settings))
 
 
 def _probe(locator: Locator) -> tuple[Courses, float]:

@@ -19,10 +19,10 @@ from torchvision_dddas.settings import Settings
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.targets.pose import EXACT_M
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.looks import Laid, Look, joined, of_settings
+from torchvision_dddas.tuning.looks import Laid, Look, Seen, joined, of_settings
 from torchvision_dddas.tuning.looks import laid as hard_laid
 from torchvision_dddas.tuning.pictured import looks_of
-from torchvision_dddas.tuning.ranged import Sighted, person_lost, sightings_of
+from torchvision_dddas.tuning.ranged import person_lost, sightings_of
 
 UNPLACED = 25.0
 """Nats that a picture costs which no pose of the camera explains, or whose rays miss the ground: no slope, no NaN."""
@@ -59,12 +59,13 @@ class Places:
         found: list[Tensor] = [torch.zeros(0)] * len(batch)
         groups: dict[tuple[int, int], list[tuple[int, Look, dict[str, Tensor], Laid]]] = defaultdict(list)
         for row, example in enumerate(batch):
-            look, settings = example.content
-            if isinstance(look, Sighted):
-                found[row] = person_lost(look, settings, knobs, UNPLACED)
+            if not isinstance(example.content, Seen):
+                seen, settings = example.content
+                found[row] = person_lost(seen, settings, knobs, UNPLACED)
                 continue
-            values = {**of_settings(settings), **knobs}
-            here = hard_laid(look, values)
+            look = example.content.look
+            values = {**of_settings(example.content.settings), **knobs}
+            here = example.content.fit or hard_laid(look, values)
             if here is None:
                 found[row] = torch.full((), UNPLACED, dtype=torch.float64) + 0 * sum(knobs.values())
             else:
