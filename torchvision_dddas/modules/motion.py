@@ -92,7 +92,8 @@ class SoftMotion(nn.Module):
         margin = sizes.between(
             self._knob("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
         )
-        return Core(step(margin, softness * float(threshold)), margin, evidence)
+        unit = float(threshold.detach() if isinstance(threshold, Tensor) else threshold)
+        return Core(step(margin, softness * unit), margin, evidence)
 
     def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
         """The largest difference over the near pairs, in noise units or grey levels."""

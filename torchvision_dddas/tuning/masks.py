@@ -84,7 +84,8 @@ def masks_of(frames: Labelled, values: Values, softness: float) -> Float[Tensor,
     """The soft masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
     motion = SoftMotion(frames.settings)
     core = motion(frames.differences, values, softness)
-    threshold = float(values.get("difference.threshold", frames.settings.difference.threshold))
+    tuned = values.get("difference.threshold")
+    threshold = frames.settings.difference.threshold if tuned is None else float(tuned.detach())
     found = regions_of(core, frames.settings.morphology.hull, _REACH * softness * threshold)
     mask = motion.outlined(core, found, values, softness)
     return torch.where(frames.added, 1.0, torch.where(frames.away, 0.0, mask))

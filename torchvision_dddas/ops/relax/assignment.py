@@ -64,12 +64,12 @@ def _log_sum_of_others(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "
     """log(1 + Σ of exp over the others of the axis), for each: the largest is left out exactly, not subtracted."""
     if not x.numel():
         return x
-    largest = torch.nn.functional.one_hot(x.argmax(axis), x.shape[axis]).bool()
-    if axis == -2:
-        largest = largest.transpose(-1, -2)
-    zero = torch.zeros_like(x.sum(axis, keepdim=True))
-    without = torch.logaddexp(torch.logsumexp(x.masked_fill(largest, -torch.inf), axis, keepdim=True), zero)
-    whole = torch.logaddexp(torch.logsumexp(x, axis, keepdim=True), zero)
-    # An element that is not the largest is at most half of the sum: what is left loses no more than a bit.
-    less = whole + torch.log1p(-torch.exp((x - whole).clamp(max=-0.6931471805599453)))
-    return torch.where(largest, without, less)
+    most, at = x.max(axis, keepdim=True)
+    # Relative to the largest, or to the dummy's 0 where that is more.
+    top = most.clamp(min=0)
+    terms, alone = torch.exp(x - top), torch.exp(-top)
+    whole = terms.sum(axis, keepdim=True) + alone
+    others = (whole - terms).log() + top
+    # The largest is summed around, not subtracted: what is left may be smaller than what is lost in the difference.
+    rest = x.scatter(axis, at, -torch.inf)
+    return others.scatter(axis, at, torch.logaddexp(rest.logsumexp(axis, keepdim=True), torch.zeros_like(most)))

@@ -2,7 +2,8 @@
 
 The log-sum-exp of N numbers is above their largest by softness x ln N at most. Thresholds and extrema commute, so a
 mask's morphology is that of the margin by which its threshold is passed: soften the threshold last, and the outline is
-where the hard one is. At softness 0.0 the gradient goes to the pixel that decides.
+where the hard one is. At softness 0.0 the gradient goes to the pixel that decides; where a gradient is wanted, values
+within a 500,000th of the picture's span are alike.
 """
 
 import torch
@@ -16,6 +17,9 @@ from ..morphology import erode as hard_erode
 
 # Outside the picture nothing is set. Not infinite: the gradient of a log-sum-exp of nothing but infinities is none.
 _NOTHING = -1e4
+# Places are told within tiles of this side; with them, 32 bits leave so many steps for the value.
+_TILE = 64
+_STEPS = (1 << 19) - 2
 
 
 def dilate(
@@ -23,7 +27,7 @@ def dilate(
 ) -> Float[Tensor, "B C H W"]:
     """Maximum under the element; with softness above 0, in the units of x, softness x log-sum-exp(x / softness)."""
     if softness == 0.0:
-        return _decided(x, hard_dilate(_ordered(x), size_px, shape)) if _routed(x) else hard_dilate(x, size_px, shape)
+        return _hard(x, size_px, shape, highest=True)
     width, height = (size_px, size_px) if isinstance(size_px, int) else size_px
     rows = element_rows(width, height, shape)
     left, above = width // 2, height // 2
@@ -44,7 +48,7 @@ def erode(
 ) -> Float[Tensor, "B C H W"]:
     """Minimum under the element; with softness above 0, -softness x log-sum-exp(-x / softness)."""
     if softness == 0.0:
-        return _decided(x, hard_erode(_ordered(x), size_px, shape)) if _routed(x) else hard_erode(x, size_px, shape)
+        return _hard(x, size_px, shape, highest=False)
     return -dilate(-x, size_px, shape, softness)
 
 
@@ -81,20 +85,28 @@ def _run(x: Tensor, length: int) -> Tensor:
         span *= 2
 
 
-def _routed(x: Tensor) -> bool:
-    """Whether the pixel that decides is worth noting: a chain of maxima would keep every step of itself."""
-    return x.requires_grad and torch.is_grad_enabled() and x.dtype == torch.float32 and x.numel() < 1 << 31
+def _hard(x: Tensor, size_px: Size, shape: Shape, highest: bool) -> Tensor:
+    """The hard extremum; where a gradient is wanted, by finding the pixel that decides.
+
+    A chain of maxima would keep every step of itself for the gradient: hundreds of pictures for a large ellipse. Here
+    one whole number of 32 bits a pixel goes through the chain, the value above, the place below.
+    """
+    largest = size_px if isinstance(size_px, int) else max(size_px)
+    if not (x.requires_grad and torch.is_grad_enabled() and x.dtype == torch.float32) or largest >= _TILE:
+        return hard_dilate(x, size_px, shape) if highest else hard_erode(x, size_px, shape)
+    sign = 1.0 if highest else -1.0
+    rows = torch.arange(x.shape[-2], device=x.device, dtype=torch.int32)[:, None]
+    columns = torch.arange(x.shape[-1], device=x.device, dtype=torch.int32)
+    decided = hard_dilate(_in_steps(sign * x.detach()) | (rows % _TILE * _TILE + columns % _TILE), size_px, shape)
+    # The element is smaller than a tile, so that a place within one tells the pixel.
+    row = rows + (decided // _TILE - rows + _TILE // 2) % _TILE - _TILE // 2
+    column = columns + (decided - columns + _TILE // 2) % _TILE - _TILE // 2
+    place = row * x.shape[-1] + column
+    return x.flatten(-2).gather(-1, place.long().flatten(-2)).reshape(x.shape)
 
 
-def _ordered(x: Tensor) -> Tensor:
-    """One whole number of 64 bits a pixel, in the order of the values, whose lower half tells where it came from."""
-    bits = x.detach().contiguous().view(torch.int32)
-    # Floats order as whole numbers do, but for negative ones, which run backwards. (-0.0 and 0.0 differ by one.)
-    order = torch.where(bits < 0, bits ^ 0x7FFFFFFF, bits).long()
-    place = torch.arange(x.numel(), device=x.device).reshape(x.shape)
-    return order.bitwise_left_shift(32) | place
-
-
-def _decided(x: Tensor, ordered: Tensor) -> Tensor:
-    """The values at the pixels that decided, which take the gradient. Outside the picture nothing ever decides."""
-    return x.reshape(-1)[(ordered & 0xFFFFFFFF).reshape(-1)].reshape(ordered.shape)
+def _in_steps(x: Tensor) -> Tensor:
+    """Values as whole numbers whose lowest bits are free for a place within a tile."""
+    low, high = x.aminmax()
+    step = (high - low).clamp(min=1e-30) / _STEPS
+    return ((x - low) / step).round_().int() * _TILE**2

@@ -13,7 +13,7 @@ def between(size: float | Tensor, operation: Callable[[int], Tensor], lowest: in
     size: one number, or a tensor without axes, to which the gradient goes. lowest, pitch: sizes are lowest, lowest +
     pitch, ...: 1 and 2 for odd ones.
     """
-    steps = (float(size) - lowest) / pitch
+    steps = (float(size.detach() if isinstance(size, Tensor) else size) - lowest) / pitch
     below = max(math.floor(steps), 0)
     first = operation(lowest + pitch * below)
     if not isinstance(size, Tensor):
