@@ -6,7 +6,8 @@ Scenes as in geo_scene.py: at 50 and 200 m, straight down and 45° off, four and
 with the noise that its head says. For each seed every noise knob begins off by a factor of up to 3, drawn evenly in the
 logarithm. The knobs are tuned on one half of the scenes by the negative log-likelihood of the places
 (tuning/places.py), in two turns of fits that are kept, and judged on the other half by the hard registrar with all its
-tests. `true noise`: the knobs as the scenes were drawn. An interval is that of 95 % over whole scenes. No data are needed.
+tests. `true noise`: the knobs as the scenes were drawn. An interval is that of 95 % over whole scenes. No data are
+needed.
 """
 
 import argparse

@@ -1,0 +1,82 @@
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.tuning.colours import fit_colours
+from torchvision_dddas.vision.onboard_colours import OnboardColours
+
+NAMES = ("red", "green")
+PAINT = {1: (178, 190, 190), 2: (62, 150, 150)}
+
+
+def scene(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A ground of olive and rust, which is near both paints, with a patch of each paint in light and shade."""
+    rng = np.random.default_rng(seed)
+    hsv = np.empty((60, 80, 3))
+    left = np.arange(80)[None] < 40
+    hsv[...] = np.where(left[..., None], (42, 90, 110), (10, 130, 120))
+    labels = np.zeros((60, 80), np.int64)
+    for k, paint in PAINT.items():
+        u, v = rng.integers(5, 60), rng.integers(5, 20) + 30 * (k - 1)
+        hsv[v : v + 8, u : u + 14], labels[v : v + 8, u : u + 14] = paint, k
+    hsv += rng.normal(0, (4, 18, 25), hsv.shape)
+    hsv[..., 0] %= 180
+    hsv[..., 1:] = hsv[..., 1:].clip(0, 255)
+    return cv2.cvtColor(np.round(hsv).clip(0, 255).astype(np.uint8), cv2.COLOR_HSV2BGR), labels
+
+
+def f(colours, seeds) -> float:
+    """Mean F of the colours' pixels, by the onboard finder."""
+    found = []
+    for k in range(len(NAMES)):
+        hit = told = true = 0
+        for seed in seeds:
+            picture, labels = scene(seed)
+            mask = OnboardColours().masks(picture, colours.low, colours.high)[k] > 0
+            hit, told, true = hit + (mask & (labels == k + 1)).sum(), told + mask.sum(), true + (labels == k + 1).sum()
+        found.append(2 * hit / (told + true))
+    return float(np.mean(found))
+
+
+def test_tuned_ranges_find_colours_in_pictures_not_tuned_on():
+    pictures, labels = zip(*(scene(seed) for seed in range(4)), strict=True)
+    before = fit_colours(pictures, labels, NAMES, steps=0)
+    after = fit_colours(pictures, labels, NAMES, steps=80)
+    held_out = range(100, 104)
+    assert f(after, held_out) > max(f(before, held_out) + 0.05, 0.9)
+    assert after.low[0, 0] > after.high[0, 0]  # red goes over 0
+    assert after.names == NAMES
+
+
+def test_ranges_may_begin_where_others_ended():
+    pictures, labels = zip(*(scene(seed) for seed in range(2)), strict=True)
+    once = fit_colours(pictures, labels, NAMES, steps=20)
+    again = fit_colours(pictures, labels, NAMES, steps=0, start=once)
+    assert again.low.tolist() == once.low.tolist()
+    with pytest.raises(InputError, match="wanted green, red"):
+        fit_colours(pictures, labels, ("green", "red"), start=once)
+
+
+def test_colours_that_pictures_do_not_tell_apart_are_refused():
+    picture, labels = scene(0)
+    v, u = np.nonzero(labels == 1)
+    labels[v[: len(v) // 2], u[: len(v) // 2]] = 2
+    labels[labels == 2] = np.where(cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)[labels == 2][:, 0] > 100, 2, 0)
+    with pytest.raises(InputError, match="come out overlapping"):
+        fit_colours([picture], [labels], NAMES, steps=5)
+
+
+@pytest.mark.parametrize(
+    ("picture", "labels", "words"),
+    [
+        (np.zeros((4, 5), np.uint8), np.zeros((4, 5), int), "wanted height x width x 3"),
+        (np.zeros((4, 5, 3), np.uint8), np.zeros((5, 4), int), "labels of that size"),
+        (np.zeros((4, 5, 3), np.uint8), np.full((4, 5), 3), "labels go from 3 to 3; wanted 0 to 2"),
+        (np.zeros((4, 5, 3), np.uint8), np.full((4, 5), 1), "no pixel is labelled with colour 2"),
+    ],
+)
+def test_bad_labels_are_refused_in_one_line(picture, labels, words):
+    with pytest.raises(InputError, match=words) as caught:
+        fit_colours([picture], [labels], NAMES)
+    assert "\n" not in str(caught.value)
