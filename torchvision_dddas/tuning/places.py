@@ -55,7 +55,12 @@ class Places:
         return found
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """(B,) nats a target. See `family.Family`."""
+        """(B,) nats a target. See `family.Family`.
+
+        Computed on the CPU, where the fits are, whatever the knobs' device.
+        """
+        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
+        knobs = {name: value.cpu() for name, value in knobs.items()}
         found: list[Tensor] = [torch.zeros(0)] * len(batch)
         groups: dict[tuple[int, int], list[tuple[int, Look, dict[str, Tensor], Laid]]] = defaultdict(list)
         for row, example in enumerate(batch):
@@ -74,7 +79,7 @@ class Places:
             lost = _lost([look for _, look, _, _ in members], members[0][2], [here for *_, here in members])
             for (row, *_), value in zip(members, lost, strict=True):
                 found[row] = value
-        return torch.stack(found)
+        return torch.stack(found).to(device)
 
 
 def family() -> Places:

@@ -80,8 +80,10 @@ class Recognition:
         return found
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """(B,). See `family.Family`."""
-        return torch.stack([_lost(example.content, knobs, softness) for example in batch])
+        """(B,). See `family.Family`. A picture has too few numbers for another device than the CPU."""
+        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
+        here = {name: value.cpu() for name, value in knobs.items()}
+        return torch.stack([_lost(example.content, here, softness) for example in batch]).to(device)
 
 
 def family() -> Recognition:
