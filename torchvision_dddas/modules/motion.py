@@ -81,7 +81,7 @@ class SoftMotion(nn.Module):
         self.whole = whole
 
     def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
-        """The core mask. values: by name, those that are tuned. softness: of the threshold, as a share of it."""
+        """The core mask. values: by name, those that are tuned. softness: of the threshold, as a share of the settings'."""
         threshold = self._knob("difference.threshold", values)
         evidence = self.evidence(differences, values)
         margin = evidence - threshold
@@ -92,8 +92,7 @@ class SoftMotion(nn.Module):
         margin = sizes.between(
             self._knob("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
         )
-        unit = float(threshold.detach() if isinstance(threshold, Tensor) else threshold)
-        return Core(step(margin, softness * unit), margin, evidence)
+        return Core(step(margin, softness * self.knobs.difference.threshold), margin, evidence)
 
     def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
         """The largest difference over the near pairs, in noise units or grey levels."""

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import cast
 
 import numpy as np
@@ -15,17 +16,19 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.truth import labels_of
 from torchvision_dddas.modules.motion import Differences, SoftMotion, Values
 from torchvision_dddas.ops.relax.passing import through
-from torchvision_dddas.settings import Settings
+from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.labelling import regions_of
 from torchvision_dddas.tuning.overlap import f_loss
-from torchvision_dddas.tuning.recorded import differences_of, recorded
+from torchvision_dddas.tuning.recorded import Recorded, differences_of, recorded
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 # A soft mask reaches this many softnesses below the threshold: there it is 0.05.
 _REACH = 3.0
+# Of the threshold: where it is tried what the hard steps after the hulls do with more than is drawn at the settings'.
+_FREER = 0.6
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class Labelled:
     """A batch of labelled frames of one size. truth, known: where something moves, and where it is known.
 
     away, added: what the hard steps after the hulls took from the mask, and gave to it, at the settings that the frames
-    were prepared with: persistence, outlines by motion and colour, shadows, small and weak targets.
+    were prepared with: persistence, outlines by motion and colour, shadows, small and weak targets. away holds as well
+    what they take from what only a lower threshold draws.
     """
 
     differences: Differences
@@ -52,14 +56,14 @@ class Masks:
     measure = "motion.pixels.f"
     softness = (0.5, 0.1)
 
-    def __init__(self, wrong: Loss = f_loss, passing: bool = False) -> None:
-        self.wrong, self.passing = wrong, passing
+    def __init__(self, wrong: Loss = f_loss, passing: bool = False, after: bool = True) -> None:
+        self.wrong, self.passing, self.after = wrong, passing, after
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The frames with masks. Raises InputError for a clip without any."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
-        return [example for clip in clips for example in _examples(clip, settings, tick)]
+        return [example for clip in clips for example in _examples(clip, settings, self.after, tick)]
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) 1 - F of each frame."""
@@ -84,9 +88,8 @@ def masks_of(frames: Labelled, values: Values, softness: float) -> Float[Tensor,
     """The soft masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
     motion = SoftMotion(frames.settings)
     core = motion(frames.differences, values, softness)
-    tuned = values.get("difference.threshold")
-    threshold = frames.settings.difference.threshold if tuned is None else float(tuned.detach())
-    found = regions_of(core, frames.settings.morphology.hull, _REACH * softness * threshold)
+    reach = _REACH * softness * frames.settings.difference.threshold
+    found = regions_of(core, frames.settings.morphology.hull, reach)
     mask = motion.outlined(core, found, values, softness)
     return torch.where(frames.added, 1.0, torch.where(frames.away, 0.0, mask))
 
@@ -116,33 +119,45 @@ def together(frames: Sequence[Labelled], device: torch.device) -> Labelled:
     )
 
 
-def _examples(clip: Clip, settings: Settings, tick: Tick) -> list[Example]:
+def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[Example]:
     truth = clip.truth
     if truth is None or not truth.masks:
         raise InputError(f"{clip.name} has no masks of what moves, which tuning the knobs of motion needs")
     found = []
-    for one in recorded(clip, settings, set(truth.masks)):
+    # What would become of more than is drawn now: without it, whatever a lower threshold adds would seem to stay.
+    freer = with_knobs(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
+    probes: Iterable[Recorded | None] = recorded(clip, freer, set(truth.masks)) if after else repeat(None)
+    for one, probe in zip(recorded(clip, settings, set(truth.masks)), probes, strict=False):
         labels = labels_of(truth, one.frame)
         if labels.shape != one.mask.shape:
             raise InputError(f"{truth.masks[one.frame]} is {_size(labels)}, the frame itself {_size(one.mask)}")
         # A frame without a window shows nothing, whatever the knobs.
         if one.window is not None and (labels >= 0).any():
             differences = differences_of(one.window, settings)
-            found.append(Example(clip.name, one.frame, _labelled(differences, labels, one.mask, settings)))
+            frame = _labelled(differences, labels, settings)
+            if probe is not None:
+                frame = _as_drawn(frame, one.mask, probe.mask, freer)
+            found.append(Example(clip.name, one.frame, frame))
         tick()
     if not found:
         raise InputError(f"no labelled frame of {clip.name} hangs together with its neighbours: nothing to tune on")
     return found
 
 
-def _labelled(differences: Differences, labels: np.ndarray, mask: np.ndarray, settings: Settings) -> Labelled:
-    """A frame with its truth; what comes after the hulls is what the soft steps, made hard, lack of the mask."""
-    truth, known, final = (torch.from_numpy(map_)[None, None] for map_ in (labels > 0, labels >= 0, mask))
-    none = torch.zeros_like(final)
-    frame = Labelled(differences, truth, known, none, none, settings)
+def _labelled(differences: Differences, labels: np.ndarray, settings: Settings) -> Labelled:
+    truth, known = (torch.from_numpy(picture)[None, None] for picture in (labels > 0, labels >= 0))
+    none = torch.zeros_like(truth)
+    return Labelled(differences, truth, known, none, none, settings)
+
+
+def _as_drawn(frame: Labelled, mask: np.ndarray, freer_mask: np.ndarray, freer: Settings) -> Labelled:
+    """A frame with what comes after the hulls: what the soft steps, made hard, lack of the mask that was drawn."""
+    final, freer_final = (torch.from_numpy(drawn)[None, None] for drawn in (mask, freer_mask))
+    batch = together([frame], torch.device("cpu"))
     with torch.no_grad():
-        drawn = masks_of(together([frame], torch.device("cpu")), {}, 0.0) > 0.5
-    return replace(frame, away=drawn & ~final, added=final & ~drawn)
+        hull = masks_of(batch, {}, 0.0) > 0.5
+        freer_hull = masks_of(replace(batch, settings=freer), {}, 0.0) > 0.5
+    return replace(frame, away=(hull & ~final) | (freer_hull & ~hull & ~freer_final), added=final & ~hull)
 
 
 def _size(picture: np.ndarray) -> str:

@@ -1,0 +1,101 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchvision_dddas.datasets import folder
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.demo import film_into
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics.truth import labels_of
+from torchvision_dddas.modules.tunable import TUNABLE, Knobs
+from torchvision_dddas.run import run
+from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.studies.stages import opened
+from torchvision_dddas.tuning.family import Example, family_of
+from torchvision_dddas.tuning.masks import Masks, masks_of, together
+from torchvision_dddas.vision import load
+
+SETTINGS = with_knobs(
+    Settings(), {"gates.min_area_px": 30, "morphology.close_px": 7, "registration.keypoints": 200, "small.on": False}
+)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
+    place = tmp_path_factory.mktemp("films")
+    film_into(place / "film", 3, 9, (240, 180))
+    (found,) = folder.read(place, {}, lambda name: True).clips
+    return found
+
+
+@pytest.fixture(scope="module")
+def examples(clip: Clip) -> list[Example]:
+    return Masks().examples([clip], SETTINGS)
+
+
+def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example]) -> None:
+    """At the settings that the examples were prepared with: what comes after the hulls is then as it was."""
+    final = {s.frame.number: s.mask > 0 for s in run(opened(clip), load("onboard", SETTINGS), SETTINGS)}
+    assert [example.frame for example in examples] == list(range(1, 10))
+    for example in examples:
+        mask = masks_of(together([example.content], CPU), {}, 0.0)[0, 0] > 0.5
+        assert torch.equal(mask, torch.from_numpy(final[example.frame])), example.frame
+
+
+def test_the_loss_tends_to_that_of_hard_masks(examples: list[Example]) -> None:
+    knobs = {"difference.threshold": torch.tensor(4.0)}
+    family = Masks()
+    hard = family.loss(knobs, examples, 0.0)
+    misses = [float((family.loss(knobs, examples, softness) - hard).abs().mean()) for softness in (0.5, 0.1, 0.01)]
+    assert misses[0] > misses[1] > misses[2] and misses[2] < 0.02
+
+
+def test_the_loss_of_an_example_does_not_depend_on_its_batch(examples: list[Example]) -> None:
+    knobs, family = {"difference.threshold": torch.tensor(3.5)}, Masks()
+    whole = family.loss(knobs, examples, 0.2)
+    single = torch.stack([family.loss(knobs, [example], 0.2)[0] for example in examples])
+    torch.testing.assert_close(whole, single)
+
+
+def test_straight_through_gives_the_loss_of_hard_masks_and_a_gradient(examples: list[Example]) -> None:
+    knobs = Knobs(SETTINGS, ["difference.threshold"])
+    passing = Masks(passing=True).loss(knobs.values(), examples[3:5], 0.1)
+    assert torch.equal(passing.detach(), Masks().loss(knobs.values(), examples[3:5], 0.0).detach())
+    passing.sum().backward()
+    assert knobs.free[0].grad is not None and float(knobs.free[0].grad) != 0
+
+
+def test_every_knob_of_motion_has_a_finite_gradient(examples: list[Example]) -> None:
+    knobs = Knobs(SETTINGS, [name for name, knob in TUNABLE.items() if knob.family == "motion"])
+    Masks().loss(knobs.values(), examples[3:6], 0.2).sum().backward()
+    for name, free in zip(knobs.names, knobs.free, strict=True):
+        assert free.grad is not None and bool(free.grad.isfinite()) and float(free.grad) != 0, name
+
+
+def test_a_step_down_the_slope_of_a_threshold_that_is_too_high_lowers_it(clip: Clip) -> None:
+    family, settings = Masks(after=False), with_knobs(SETTINGS, {"difference.threshold": 10.0})
+    examples = family.examples([clip], settings)[3:6]
+    knobs = Knobs(settings, ["difference.threshold"])
+    family.loss(knobs.values(), examples, 0.3).sum().backward()
+    assert float(knobs.free[0].grad) > 0
+
+
+def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
+    for truth in (None, replace(clip.truth, masks={})) if clip.truth else ():
+        with pytest.raises(InputError, match="film has no masks of what moves"):
+            Masks().examples([replace(clip, truth=truth)], SETTINGS)
+    with pytest.raises(InputError, match=r"difference\.halved"):
+        Masks().examples([clip], with_knobs(SETTINGS, {"difference.halved": True}))
+
+
+def test_unlabelled_pixels_are_known_to_be_so(clip: Clip, examples: list[Example]) -> None:
+    assert clip.truth is not None
+    labels = labels_of(clip.truth, examples[0].frame)
+    assert torch.equal(examples[0].content.truth[0, 0], torch.from_numpy(labels > 0))
+    assert bool(examples[0].content.known.all())
+
+
+def test_the_family_is_found_by_its_name() -> None:
+    assert family_of("motion").measure == "motion.pixels.f"
