@@ -177,6 +177,15 @@ def test_it_ends_when_its_time_is_over() -> None:
     assert found.ended == "0 s are over" and len(found.history) == 1 and found.best == 0
 
 
+def test_when_its_time_is_over_the_last_state_has_its_say(monkeypatch) -> None:
+    clock = iter(range(1000))
+    monkeypatch.setattr("torchvision_dddas.tuning.descent.time.perf_counter", lambda: float(next(clock)))
+    found = descend(Bowl(), knobs(), pieces(spread=0.0), Plan(steps=99, rate=0.1, look_every=50, most_s=4.0))
+    assert "are over" in found.ended and found.best == found.history[-1].step == 3
+    first, last = found.history[0].watched, found.history[-1].watched
+    assert first is not None and last is not None and last < first
+
+
 class Dear:
     """A threshold that costs time."""
 

@@ -47,7 +47,7 @@ def _by_slope(family: Family, batch: Sequence[Example], values: Mapping[str, Ten
         for (name, value), slope in zip(leaves.items(), slopes, strict=True):
             if slope is not None and not bool(torch.isfinite(slope).all()):
                 where = f"{example.clip}, frame {example.frame}"
-                return f"the slope of the loss in {name} = {float(value):.6g} is no number for {where}"
+                return f"the slope of the loss in {name} = {float(value.detach()):.6g} is no number for {where}"
     return ""
 
 

@@ -131,6 +131,7 @@ def descend(
     while not (run.ended or run.failed):
         if time.perf_counter() - began >= plan.most_s:
             run.ended = f"{plan.most_s:g} s are over"
+            run.look()
             break
         step = run.step()
         if step is not None:
@@ -193,6 +194,15 @@ class _Run:
         if last and not self.ended:
             self.ended = f"all {number} steps were taken"
         return None if self.failed else told
+
+    def look(self) -> None:
+        """Look at the state after the last step, where that was not done."""
+        last = self.history[-1]
+        if last.watched is None:
+            self.history.pop()
+            ended, self.ended = self.ended, ""
+            self._told(last.step, last.softness, last.loss, look=True)
+            self.ended = self.ended or ended
 
     def load(self, place: Path) -> None:
         """Take up what a checkpoint holds. Raises InputError for one of another descent."""
