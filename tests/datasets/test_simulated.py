@@ -2,13 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.datasets.layouts import clip, complaint, mask, pictures, read, text
+from tests.studies.scored_clips import found_of
 from torchvision_dddas.metrics.truth import labels_of
 from torchvision_dddas.sinks.truth import COLUMNS
+from torchvision_dddas.studies.scoring import score
 
 PLACES = (
     ",".join(COLUMNS) + "\n"
@@ -46,6 +49,14 @@ def test_masks_tell_pixels_and_gt_tells_identities(tmp_path: Path) -> None:
     assert truth.tracks.identity.tolist() == [1, 1]
     assert truth.ignored is not None
     assert truth.ignored.identity.tolist() == [4]
+
+
+def test_a_track_on_a_ground_vehicle_is_neither_right_nor_false(tmp_path: Path) -> None:
+    run(tmp_path)
+    target, vehicle, part, nothing = (2, 2, 8, 8), (20, 10, 10, 8), (21, 10, 4, 8), (14, 2, 4, 4)
+    rows = [(1, 1, *target, 1), (1, 2, *vehicle, 1), (2, 1, *target, 1), (2, 2, *part, 1), (2, 3, *nothing, 1)]
+    tracks: Any = score(clip("simulated", tmp_path), "tracking", found_of(np.array(rows, float), 2)).counts["tracks"]
+    assert (tracks.clear.tp, tracks.clear.fp, tracks.clear.fn) == (2, 1, 0)
 
 
 def test_places_are_those_of_targets_that_show_and_are_no_landmarks(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@
     RUN/run.json              frames a second, and whether the run was finished
 
 Pixels and boxes are scored by the masks, identities by gt.txt, places by positions.csv; of the latter the targets that
-show, and not the ground vehicles, which are the landmarks. Where masks were not saved, gt.txt has the boxes. The
+show, and not the ground vehicles, which are the landmarks. A track on one of them, as the masks show it, is neither
+right nor false. Where masks were not saved, gt.txt has the boxes. The
 pictures of the ground vehicles, ground/, are not read. Options: none. Terms of use: none but this project's licence.
 """
 

@@ -39,12 +39,14 @@ def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scor
     if clip.truth is None:
         raise InputError(f"{clip.name} has no truth; nothing can be scored")
     followed = task in ("tracking", "association")
-    truth = clip.truth
+    truth = judged = clip.truth
     if followed and truth.kind == "masks":
-        # A simulated clip has both: masks tell pixels, boxes tell identities.
+        # A simulated clip has both: masks tell pixels, boxes tell identities, but of the ground vehicles.
+        vehicles = _fleet(truth)
         truth = replace(truth, kind="boxes")
+        judged = replace(truth, ignored=vehicles, regions=vehicles, ignoring="removed")
     box_px = as_written(found.box_px)
-    counts = uncounted.counted(clip.truth, found.frame, box_px) & ~_unlabelled(clip.truth, found.frame, box_px)
+    counts = uncounted.counted(judged, found.frame, box_px) & ~_unlabelled(clip.truth, found.frame, box_px)
     rows = counts & (found.identity != -1) if followed else counts
     table = TrackTable(found.frame[rows], found.identity[rows], box_px[rows])
     last = int(found.looked.max(initial=0))
@@ -105,6 +107,17 @@ def _still(found: "Found") -> Scored:
     each = {"frames": np.ones(len(frames)), "alarmed": (blobs > 0).astype(float), "blobs": blobs}
     counts: Counts = {"still": Still(len(frames), int((blobs > 0).sum()), int(blobs.sum()))}
     return Scored(frames, counts, {"still": each})
+
+
+def _fleet(truth: Truth) -> TrackTable:
+    """The boxes of the ground vehicles, which masks show by their numbers."""
+    rows: list[tuple[float, ...]] = []
+    fleet = np.zeros(0) if truth.fleet is None else truth.fleet.identity
+    for frame in truth.frames if len(fleet) else ():
+        labels = truths.labels_of(truth, frame)
+        rows += [(frame, n, *cv2.boundingRect((labels == n).astype(np.uint8))) for n in np.intersect1d(labels, fleet)]
+    table = np.array(rows, float).reshape(-1, 6)
+    return TrackTable(table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2:])
 
 
 def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
