@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import time
 
 import numpy as np
 import pytest
@@ -35,6 +36,15 @@ def test_a_file_that_was_not_touched_is_read_once(tmp_path) -> None:
     old(tmp_path / "a", "three")
     with pytest.raises(digests.UnreadError):
         digests.Files(tmp_path / "memory", read=False).digest([tmp_path / "a"])
+
+
+def test_a_file_of_the_same_size_and_with_its_old_time_is_read_again(tmp_path) -> None:
+    old(tmp_path / "a", "one")
+    memory = tmp_path / "memory"
+    first = digests.Files(memory).digest([tmp_path / "a"])
+    time.sleep(0.05)
+    old(tmp_path / "a", "two")
+    assert digests.Files(memory).digest([tmp_path / "a"]) != first
 
 
 def test_a_file_written_just_now_is_not_remembered(tmp_path) -> None:

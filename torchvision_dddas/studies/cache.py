@@ -75,7 +75,8 @@ class Cache:
             place.parent.mkdir(exist_ok=True)
             write_whole(place, content)
         except OSError as error:
-            raise cannot_write(place, error) from None
+            said = str(cannot_write(place, error)).replace("another --out", "another --cache")
+            raise InputError(said) from None
 
 
 class Carried:

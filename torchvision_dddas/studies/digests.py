@@ -93,7 +93,7 @@ class UnreadError(Exception):
 
 
 class Files:
-    """Digests of files' content. A list of files that is as it was by size and time is not read again.
+    """Digests of files' content. A list of files that is as it was by size and times is not read again.
 
     memory: a folder where they are kept; None keeps nothing. read: whether files may be read, else UnreadError.
     """
@@ -122,12 +122,12 @@ class Files:
         return digest
 
 
-def _mark(path: Path) -> tuple[str, int, int]:
+def _mark(path: Path) -> tuple[str, int, int, int]:
     try:
         found = path.stat()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    return str(path.absolute()), found.st_size, found.st_mtime_ns
+    return str(path.absolute()), found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
 def _contents(paths: Iterable[Path]) -> Iterable[str]:
