@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -65,6 +66,14 @@ def test_clips_held_out_have_no_say_and_are_told_apart(swept) -> None:
     assert told["clips"] == ["one", "two"] and told["held_out"] == ["held"]
     assert set(told["on_held_out"]) == {"before", "best"}
     assert "Held out (held)" in swept[1]
+
+
+def test_how_far_the_next_points_are_is_told_meanwhile(capsys, monkeypatch) -> None:
+    sweep = import_module("torchvision_dddas.cli.sweep")
+    monkeypatch.setattr(sweep, "EVERY_S", 0.0)
+    sweep._pace(False)(3, 24)
+    sweep._pace(True)(4, 24)
+    assert capsys.readouterr().err == "3 of 24 clips of the next points\n"
 
 
 def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(study, swept, monkeypatch) -> None:

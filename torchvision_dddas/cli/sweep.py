@@ -1,6 +1,8 @@
 """`dddas sweep`: a study with other knobs, again and again, and which of them measure best."""
 
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +11,7 @@ import typer
 
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,7 +90,7 @@ def sweep(
     if optuna is not None:
         sweeping.need_optuna()
     tuned, held = parted(spec, dataset.parent, patterns(clips, "--clips"), patterns(holdout, "--holdout"))
-    tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache)
+    tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache, _pace(quiet))
     search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
     swept = Swept(out, settings, goal, search, tuned, held)
     on_tuned = lambda knobs: tried.measured(knobs, tuned)  # noqa: E731
@@ -107,6 +110,19 @@ def sweep(
     swept.choose(found, (tried.measured({}, held), tried.measured(found.knobs, held)) if held else None)
     if not quiet:
         show(swept)
+
+
+def _pace(quiet: bool) -> Callable[[int, int], None]:
+    """Tells every few seconds, on stderr, how many clips of the points under way are done."""
+    told = time.monotonic()
+
+    def tell(done: int, of: int) -> None:
+        nonlocal told
+        if not quiet and time.monotonic() - told >= EVERY_S:
+            told = time.monotonic()
+            print(f"{done} of {of} clips of the next points", file=sys.stderr, flush=True)
+
+    return tell
 
 
 def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] | None) -> None:

@@ -1,7 +1,7 @@
 """The studies of a sweep: one data set and one goal, other knobs each time."""
 
 import glob
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -11,7 +11,7 @@ from torchvision_dddas.settings import with_knobs
 from torchvision_dddas.studies import digests
 from torchvision_dddas.studies.cache import Cache
 from torchvision_dddas.studies.goals import Goal, value_of
-from torchvision_dddas.studies.jobs import cores, share
+from torchvision_dddas.studies.jobs import Event, cores, share
 from torchvision_dddas.studies.record import Spec
 from torchvision_dddas.studies.running import cache_folder, order, plan, run_study
 from torchvision_dddas.studies.sweep import Measured, written
@@ -20,7 +20,7 @@ from torchvision_dddas.studies.working import kept
 
 @dataclass
 class Tried:
-    """jobs, scheduler, cache: as of `running.run_study`."""
+    """jobs, scheduler, cache: as of `running.run_study`. tell: is given how many clips of how many are done."""
 
     spec: Spec
     base: Path
@@ -28,13 +28,21 @@ class Tried:
     jobs: int | None
     scheduler: str | None
     cache: Path | None
+    tell: Callable[[int, int], object] = lambda done, of: None
 
     def measured(self, knobs: Mapping[str, object], clips: Sequence[str]) -> Measured:
         """The goal's value over clips of these names, and if it has none why."""
         changed = tuple(f"{name}={written(value)}" for name, value in knobs.items())
         spec = replace(self.spec, overrides=(*self.spec.overrides, *changed))
         names = [glob.escape(name) for name in clips]
-        return value_of(self.goal, run_study(spec, self.base, self.jobs, self.scheduler, self.cache, names).cases)
+        done = 0
+
+        def tell(event: Event) -> None:
+            nonlocal done
+            done += event.done is not None
+            self.tell(done, len(clips))
+
+        return value_of(self.goal, run_study(spec, self.base, self.jobs, self.scheduler, self.cache, names, tell).cases)
 
     def ahead(self, points: Sequence[Mapping[str, object]], clips: Sequence[str]) -> None:
         """Compute what the studies of several points will need, by one set of workers that none leaves idle."""
@@ -45,8 +53,10 @@ class Tried:
         files = digests.Files(store.folder / "files", read=False)
         each = [replace(job, settings=with_knobs(job.settings, knobs)) for knobs in points for job in planned.jobs]
         jobs = order([replace(job, number=number) for number, job in enumerate(each)])
-        for _ in share([job for job in jobs if kept(job, store, files) is None], self.jobs or cores(), store.folder):
-            pass
+        waiting, done = [job for job in jobs if kept(job, store, files) is None], 0
+        for event in share(waiting, self.jobs or cores(), store.folder):
+            done += event.done is not None
+            self.tell(done, len(waiting))
 
 
 def parted(
