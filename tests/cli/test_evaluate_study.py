@@ -41,6 +41,12 @@ def test_a_line_is_not_broken_however_long(dddas, study, tmp_path) -> None:
     assert any(x.startswith("left out: a_clip") and x.endswith("can be scored") for x in done.stdout.splitlines())
 
 
+def test_names_are_shown_as_they_are(dddas, tmp_path) -> None:
+    world.followed(tmp_path / "clips", "car[red]s", 3, pictures=False)
+    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    assert "car[red]s │" in dddas("evaluate", "--dataset", world.study(tmp_path / "clips"), *words).stdout
+
+
 def test_what_lacks_of_clips_that_are_scored_is_a_note_and_not_left_out(dddas, tmp_path) -> None:
     world.followed(tmp_path / "clips", "bare", 3, pictures=False)
     film = world.filmed(tmp_path / "own", "film", 4)

@@ -202,6 +202,7 @@ def show(report: dict[str, Any]) -> None:
 
 
 def _table(report: dict[str, Any], group: str) -> "Table":
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=TITLES[group])
@@ -210,7 +211,7 @@ def _table(report: dict[str, Any], group: str) -> "Table":
         table.add_column(SHORT.get(column, column), justify="right", no_wrap=True)
     rows = {name: (str(clip["frames"]), clip[group]) for name, clip in report["clips"].items() if group in clip}
     for name, (frames, clip) in rows.items():
-        table.add_row(name, frames, *(_cell(clip[c]) for c in COLUMNS[group]))
+        table.add_row(escape(name), frames, *(_cell(clip[c]) for c in COLUMNS[group]))
     if len(rows) > 1:
         table.add_section()
         for name in ("pooled", "mean"):

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -73,16 +73,17 @@ def study_into(
         try:
             with shown(quiet) as (begun, tell):
                 results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin, together)
+            measures = _measures(results)
+            _write(folder, "metrics.json", measures)
+            _write_tables(folder, measures, results)
+            if find_spec("torchvision_dddas.sinks.study_report.page") is not None:
+                write_whole(folder / "report.html", _report(finite(measures), results).encode())
+            _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
         except BaseException:
             if running:  # else nothing of an earlier study in this folder has been touched
-                _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
+                with suppress(OSError):
+                    _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
             raise
-        measures = _measures(results)
-        _write(folder, "metrics.json", measures)
-        _write_tables(folder, measures, results)
-        if find_spec("torchvision_dddas.sinks.study_report.page") is not None:
-            write_whole(folder / "report.html", _report(finite(measures), results).encode())
-        _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
     except OSError as error:
         raise cannot_write(folder / "run.json", error) from error
     return results, measures
@@ -164,7 +165,7 @@ def shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Even
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("clips, {task.fields[frames]} frames"),
@@ -204,7 +205,7 @@ def _in_lines() -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
     def begun(planned: "Plan") -> None:
         nonlocal total
         total = len(planned.jobs)
-        say(f"{total} clips, {planned.frames} frames to look at over all tasks")
+        say(f"{total} clip{'s' * (total != 1)}, {planned.frames} frames to look at over all tasks")
 
     def tell(event: "Event") -> None:
         nonlocal done, frames

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from torchvision_dddas.cli.evaluate import COLUMNS, SHORT, TITLES
+from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,6 +54,7 @@ def tables(measures: Mapping[str, Any]) -> "Iterator[Table]":
 
 
 def _table(task: str, group: str, told: Mapping[str, Any]) -> "Table":
+    from rich.markup import escape
     from rich.table import Table
 
     columns = OF_STUDIES[group]
@@ -66,7 +68,8 @@ def _table(task: str, group: str, told: Mapping[str, Any]) -> "Table":
     for column in ("frames", *columns):
         table.add_column(WORDS.get(column, column), justify="right", no_wrap=True)
     for name in shown:
-        table.add_row(name, str(having[name]["frames"]), *(cell(having[name][group][c]) for c in columns))
+        cells = (cell(having[name][group][c]) for c in columns)
+        table.add_row(escape(str(InputError(name))), str(having[name]["frames"]), *cells)
     if len(having) > 1:
         table.add_section()
         table.add_row("pooled", "", *(cell(told["pooled"][group][c]) for c in columns))

@@ -135,7 +135,7 @@ def _gathered(
             scored = cache.get(done.scored) if done.scored else None
             cause = done.cause
             if found is not None:
-                notes += [f"{job.clip.name}, {done.task}: {note}" for note in found.notes]
+                notes += [str(InputError(f"{job.clip.name}, {done.task}: {note}")) for note in found.notes]
             if not cause and (found is None or scored is None):
                 cause = "what was kept of it is gone or damaged; run the study again"
             cases.append(Case(job.clip, done.task, found, scored, cause))
