@@ -82,7 +82,7 @@ def unlikeliness(knobs: TrackKnobs, looks: Looks, softness: float) -> Float[Tens
     visible: Any = looks.visible
     compares = not bool(looks.likeness.isnan().all())
     tracks: _Tracks | None = None
-    lost, boxes = looks.frame.new_zeros(len(looks.frame)), looks.frame.new_zeros(len(looks.frame))
+    scores, told, boxes = [], looks.frame.new_zeros(len(looks.frame)), looks.frame.new_zeros(len(looks.frame))
     for look in range(looks.frame.shape[1]):
         frame: Any = looks.frame[:, look, None]
         box: Any = looks.box_px[:, look]
@@ -105,12 +105,21 @@ def unlikeliness(knobs: TrackKnobs, looks: Looks, softness: float) -> Float[Tens
             if compares:
                 score = score + scores_of(likeness[:, look], visible[:, look], knobs)
             true = tracks.alive & there
-            free = score.masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf)
-            told = torch.where(true, score.diagonal(dim1=1, dim2=2), 0.0).sum(1)
-            lost = lost + log_partition(free, softness, _ROUNDS) - told
+            scores.append(score.masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf))
+            told = told + torch.where(true, score.diagonal(dim1=1, dim2=2), 0.0).sum(1)
             boxes = boxes + torch.where(tracks.alive.any(1), there.sum(1), 0)
         tracks = _after(tracks, begun, looks, look, sight, mine)
-    return lost / boxes.clamp(min=1)
+    if not scores:
+        return told
+    free = _dense(_dense(torch.stack(scores, 1)).transpose(-1, -2))
+    return (log_partition(free, softness, _ROUNDS).sum(1) - told) / boxes.clamp(min=1)
+
+
+def _dense(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"]:
+    """Without rows in which no pair is possible, as far as every look has some: most targets are not there."""
+    possible = score.detach().isfinite().any(-1)
+    first = possible.to(torch.int8).argsort(-1, descending=True)[..., : max(int(possible.sum(-1).max()), 1)]
+    return torch.take_along_dim(score, first[..., None], -2)
 
 
 def _after(tracks: _Tracks, begun: Any, looks: Looks, look: int, sight: Sight, knobs: TrackKnobs) -> _Tracks:
@@ -136,8 +145,9 @@ def _for_each(knobs: TrackKnobs, own: Bool[Tensor, "B"]) -> TrackKnobs:
     """With the scatter and births of own targets where the boxes are such: (B, 1), and (B, 1, 1) of births."""
 
     def picked(name: str) -> Tensor:
-        other, usual = (torch.as_tensor(getattr(knobs, key)).to(own.device) for key in (f"own_{name}", name))
-        return torch.where(own[:, None], other.double(), usual.double())
+        pair = (getattr(knobs, key) for key in (f"own_{name}", name))
+        other, usual = (torch.as_tensor(value, dtype=torch.float64, device=own.device) for value in pair)
+        return torch.where(own[:, None], other, usual)
 
     each = {"scatter": picked("scatter"), "size_scatter": picked("size_scatter"), "births": picked("births")[..., None]}
     return TrackKnobs.model_construct(**(dict(knobs) | each))

@@ -97,7 +97,8 @@ def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray, k
     """(N, M) logarithm of the density of centres around places, and the prior. variance: (N,) in squared heights."""
     functions = namespace(place)
     # Standing people move less up and down in the picture than across it.
-    upright = functions.where(place[..., HEIGHT] > place[..., WIDTH], knobs.upright, 1.0)
+    level = functions.ones_like(variance)
+    upright = functions.where(place[..., HEIGHT] > place[..., WIDTH], knobs.upright * level, level)
     unit = (place[..., HEIGHT] ** 2 * variance)[..., None]
     across = centre_px[..., None, :, 0] - place[..., X : X + 1]
     along = (centre_px[..., None, :, 1] - place[..., Y : Y + 1]) / upright[..., None]

@@ -45,7 +45,8 @@ class Identities:
     name: str = "tracking"
     task: Task = "association"
     measure: str = "association.tracks.idf1"
-    softness: tuple[float, float] = (2.0, 0.5)
+    softness: tuple[float, float] = (1.0, 1.0)
+    """A likelihood is one at softness 1 alone: colder, it asks for the best assignment whatever the others are."""
 
     def at(self, interval_frames: int, task: Task) -> "Identities":
         """The same for a study's interval; see `family.Timed`."""

@@ -25,7 +25,7 @@ def shares(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS
     """
     scaled = score / softness
     from_column = _from_columns(scaled.detach(), rounds)
-    return torch.softmax(torch.cat([scaled + from_column, torch.zeros_like(scaled[..., :1])], -1), -1)[..., :-1]
+    return torch.exp(scaled + from_column - _log_one_more(scaled + from_column, -1)[..., None])
 
 
 def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int = ROUNDS) -> Float[Tensor, "*B"]:
@@ -39,10 +39,9 @@ def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int =
         from_column = _from_columns(scaled, rounds)
         from_row = scaled - _log_sum_of_others(scaled + from_column, -1)
         # Of the columns and the pairs; the rows have the slope.
-        columns = torch.logaddexp(torch.logsumexp(from_row, -2), torch.zeros_like(from_row[..., 0, :])).sum(-1)
+        columns = _log_one_more(from_row, -2).sum(-1)
         pairs = torch.nn.functional.softplus(from_row + from_column).sum((-1, -2))
-    alone = torch.zeros_like(scaled[..., :1])
-    rows = torch.logsumexp(torch.cat([scaled + from_column, alone], -1), -1).sum(-1)
+    rows = _log_one_more(scaled + from_column, -1).sum(-1)
     return softness * (rows + columns - pairs)
 
 
@@ -58,6 +57,12 @@ def _from_columns(scaled: Float[Tensor, "*B N M"], rounds: int) -> Float[Tensor,
         if (share - before).abs().amax() < _CLOSE:
             break
     return message
+
+
+def _log_one_more(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "*B K"]:
+    """log(1 + Σ exp) over an axis, 1 being for who stays alone."""
+    alone = torch.zeros_like(x.sum(axis, keepdim=True))
+    return torch.logsumexp(torch.cat([x, alone], axis), axis)
 
 
 def _log_sum_of_others(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "*B N M"]:
