@@ -1,0 +1,30 @@
+"""The tutorial runs, on scenes too small to learn much from, and its text names what is there."""
+
+import re
+import runpy
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from torchvision_dddas import demo
+from torchvision_dddas.tuning import descent
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, capsys) -> None:
+    film, plan = demo.film_into, descent.Plan
+    monkeypatch.setattr(demo, "film_into", lambda folder, seed, **_: film(folder, seed, frames=6, size=(160, 120)))
+    monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2, look_every=1))
+    runpy.run_path(str(DOCS / "tuning.py"))["main"](tmp_path)
+    told = capsys.readouterr().out
+    assert "step 2: " in told and "difference.threshold: 12 -> " in told
+    assert "F on the clips tuned on: " in told and "F on the clips held out: " in told
+
+
+@pytest.mark.parametrize("line", re.findall(r"^from torchvision_dddas.*$", (DOCS / "tuning.md").read_text(), re.M))
+def test_what_the_text_imports_is_there(line: str) -> None:
+    module, names = re.fullmatch(r"from (\S+) import (.+)", line).groups()  # type: ignore[union-attr]
+    for name in names.split(", "):
+        assert hasattr(import_module(module), name)
