@@ -54,7 +54,7 @@ class Masks:
     name = "motion"
     task: Task = "motion"
     measure = "motion.pixels.f"
-    softness = (0.5, 0.1)
+    softness = (0.3, 0.02)
 
     def __init__(self, wrong: Loss = f_loss, passing: bool = False, after: bool = True) -> None:
         self.wrong, self.passing, self.after = wrong, passing, after
