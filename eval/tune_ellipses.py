@@ -1,6 +1,6 @@
 """Do ellipses hold 95 % of the true places, once noise levels were tuned on other scenes? Simulated.
 
-    python eval/tune_ellipses.py [--seeds 10] [--scenes 6000] [--steps 120] [--write eval/README.md] [--json FILE]
+    python eval/tune_ellipses.py [--seeds 10] [--scenes 6000] [--steps 120] [--json FILE]
 
 Scenes as in geo_scene.py: at 50 and 200 m, straight down and 45° off, four and six landmarks, on a ring and anywhere,
 with the noise that its head says. For each seed every noise knob begins off by a factor of up to 3, drawn evenly in the

@@ -7,11 +7,10 @@ one person each, 96 px high, whose width nobody labelled: it is taken for 0.41 o
 
 F1 at an IoU of 0.5 over all detections at or above people.threshold; IoU: the mean of boxes that are right. Of the
 detections at or above the default threshold, before and after, doubt: mean negative log-likelihood of their being right
-by their probability, in nats; off: the mean distance of probabilities
-from the share that is right, in tenths of the probability, weighed by how many detections each holds (expected
-calibration error). An interval of a difference is that of 95 % over pictures drawn anew. The default values were
-calibrated by hand on PETS09-S2L1 and TUD-Stadtmitte themselves (people_miss_rate.py --calibrate), which
-flatters `before` there.
+by their probability, in nats; off: the mean distance of probabilities from the share that is right, in tenths of the
+probability, weighed by how many detections each holds (expected calibration error). An interval of a difference is that
+of 95 % over pictures drawn anew. The default values were calibrated on PETS09-S2L1 and TUD-Stadtmitte themselves
+(people_miss_rate.py --calibrate), which flatters `before` there.
 """
 
 import argparse
