@@ -81,7 +81,7 @@ class SoftMotion(nn.Module):
         self.whole = whole
 
     def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
-        """The core mask. values: by name, those that are tuned. softness: of the threshold, as a share of the settings'."""
+        """The core mask. values: by name, those that are tuned. softness: a share of the settings' threshold."""
         threshold = self._knob("difference.threshold", values)
         evidence = self.evidence(differences, values)
         margin = evidence - threshold

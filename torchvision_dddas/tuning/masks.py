@@ -49,7 +49,12 @@ class Labelled:
 
 
 class Masks:
-    """Implements `Family` for the knobs of motion. passing: masks are hard, their gradient soft."""
+    """Implements `Family` for the knobs of motion.
+
+    wrong: the loss, one of `overlap`. passing: masks are hard, their gradient that of soft ones. after: what the hard
+    steps after the hulls do near the settings that examples are prepared with is kept (see `Labelled`); without it
+    tuning does better where it begins far from what is right.
+    """
 
     name = "motion"
     task: Task = "motion"
