@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,8 +55,10 @@ def study_into(
 ) -> tuple["Results", dict[str, Any]]:
     """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
     from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.sinks.study_report import report
     from torchvision_dddas.sinks.whole import cannot_write, write_whole
     from torchvision_dddas.studies.running import cache_folder, run_study
+    from torchvision_dddas.studies.summary import summary
 
     began, place = time.perf_counter(), cache or cache_folder()
     try:
@@ -73,11 +74,10 @@ def study_into(
         try:
             with shown(quiet) as (begun, tell):
                 results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin, together)
-            measures = _measures(results)
+            measures = summary(results)
             _write(folder, "metrics.json", measures)
             _write_tables(folder, measures, results)
-            if find_spec("torchvision_dddas.sinks.study_report.page") is not None:
-                write_whole(folder / "report.html", _report(finite(measures), results).encode())
+            write_whole(folder / "report.html", report(finite(measures), results).encode())
             _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
         except BaseException:
             if running:  # else nothing of an earlier study in this folder has been touched
@@ -107,31 +107,10 @@ def _write_tables(folder: Path, measures: dict[str, Any], results: "Results") ->
     write_scores(folder, results.spec.name, kept)
 
 
-def _report(measures: dict[str, Any], results: "Results") -> str:
-    from torchvision_dddas.sinks.study_report import report
-
-    return report(measures, results)
-
-
-def _measures(results: "Results") -> dict[str, Any]:
-    if find_spec("torchvision_dddas.studies.summary") is None:
-        return {"cases": [[case.clip.name, case.task, case.cause] for case in results.cases]}
-    from torchvision_dddas.studies.summary import summary
-
-    return summary(results)
-
-
-def _costs(results: "Results") -> Any:
-    if find_spec("torchvision_dddas.studies.costs") is None:
-        return None
-    from torchvision_dddas.studies.costs import costs
-
-    return costs(results)
-
-
 def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
     """What run.json says of a study."""
     from torchvision_dddas.sinks.journal import versions
+    from torchvision_dddas.studies.costs import costs
 
     spec = results.spec
     return {
@@ -150,7 +129,7 @@ def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
         "cache": cache,
         "settings": results.settings.model_dump(),
         "seconds": {"wall": round(wall_s, 3)},
-        "costs": _costs(results),
+        "costs": costs(results),
     }
 
 
