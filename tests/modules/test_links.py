@@ -1,6 +1,7 @@
 """The loss on true links: the tracker's own scores, whose knobs it can find again."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,13 +74,11 @@ def test_tensors_are_scored_as_arrays_are():
     state[::2, kalman.SEEN] = 1
     left, sight = np.arange(6) % 3 == 0, Sight(11, 5, 0.07, 0.02, 0.1, (500.0, 500.0))
     wanted = link_scores(state, left, box[2], sight, knobs)
-    found = link_scores(
-        torch.as_tensor(state),
-        torch.as_tensor(left),
-        looks.box_px[0, 2],
-        replace(sight, births=torch.tensor(0.02, dtype=torch.float64)),
-        knobs,
-    )
+    there: Any = torch.as_tensor(state)
+    at_border: Any = torch.as_tensor(left)
+    last: Any = looks.box_px[0, 2]
+    births: Any = torch.tensor(0.02, dtype=torch.float64)
+    found: Any = link_scores(there, at_border, last, replace(sight, births=births), knobs)
     np.testing.assert_allclose(found.numpy(), wanted, rtol=0, atol=1e-9)
 
 

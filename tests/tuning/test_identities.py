@@ -1,0 +1,106 @@
+"""Examples of true links from clips, and the family that tunes on them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.metrics.truth import Truth
+from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.settings import Settings
+from torchvision_dddas.targets.tracks import Tracker
+from torchvision_dddas.tuning import identities
+from torchvision_dddas.tuning.descent import Plan, descend
+from torchvision_dddas.tuning.family import Timed, family_of
+from torchvision_dddas.tuning.identities import Identities, together
+from torchvision_dddas.types import Detections
+
+PERSON = np.array([20.0, 50.0])
+
+
+def walk(name: str = "walk", people: int = 4, frames: int = 150, seed: int = 0, true: bool = True) -> Clip:
+    """People who walk about for a while."""
+    draw = np.random.default_rng(seed)
+    place = draw.uniform(100, 400, (people, 2)) + np.cumsum(draw.normal(0, 0.5, (frames, people, 2)), axis=0).cumsum(0)
+    frame = np.repeat(np.arange(1, frames + 1), people)
+    identity = np.tile(np.arange(1, people + 1), frames)
+    box_px = np.concatenate([place.reshape(-1, 2) - PERSON / 2, np.tile(PERSON, (len(frame), 1))], axis=1)
+    table = TrackTable(frame, identity, box_px)
+    truth = Truth("boxes", Path(name), {}, {int(f): box_px[frame == f] for f in np.unique(frame)}, table)
+    return Clip(name, Path(name), truth=truth if true else None)
+
+
+def test_a_clip_becomes_stretches_of_its_looks_in_order_each_with_a_loss():
+    family, settings, told = Identities(interval=5), Settings(), []
+    examples = family.examples([walk()], settings, lambda: told.append(1))
+    assert [example.frame for example in examples] == [1, 1 + 5 * identities.LOOKS]
+    assert [example.clip for example in examples] == ["walk", "walk"]
+    assert len(told) == 2
+    values = Knobs(settings, ["track.scatter", "track.prior"]).values()
+    losses = family.loss(values, examples, 1.0)
+    assert losses.shape == (2,)
+    assert (losses > 0).all()
+    alone = torch.cat([family.loss(values, [example], 1.0) for example in examples])
+    torch.testing.assert_close(losses, alone, rtol=0, atol=1e-4)
+
+
+def test_what_the_tracker_knows_of_a_look_is_what_the_tracker_itself_knows(monkeypatch: pytest.MonkeyPatch):
+    """Pace and births, where it links as is true."""
+    clip, settings, seen = walk(people=6, frames=100), Settings(), []
+    plain = Tracker._sight
+
+    def sight(self, look):
+        seen.append((look.frame, self.pace.speed, plain(self, look).births))
+        return plain(self, look)
+
+    monkeypatch.setattr(Tracker, "_sight", sight)
+    assert clip.truth is not None
+    assert clip.truth.tracks is not None
+    (example,) = Identities(interval=5).examples([clip], settings)
+    width, height = example.content.looks["size"].tolist()
+    tracker = Tracker(settings, 5, (width, height))
+    for number in range(1, 101, 5):
+        box = clip.truth.boxes[number]
+        one = np.ones(len(box))
+        tracker.feed(number, Detections(box, one, one, one * np.nan, one * np.nan))
+    tracker.end()
+    looks = example.content.looks
+    speeds = {frame: speed for frame, speed, _ in seen}
+    births = {frame: rate for frame, _, rate in seen}
+    from torchvision_dddas.targets.pace import speed_of
+
+    found = [speed_of(settings.track.speed, *pair) for pair in zip(looks["usual"], looks["known"], strict=True)]
+    assert found == pytest.approx([speeds[int(frame)] for frame in looks["frame"]])
+    assert looks["births"].tolist() == pytest.approx([births[int(frame)] for frame in looks["frame"]])
+
+
+def test_stretches_of_several_sizes_are_filled_up_with_nobody():
+    family = Identities(interval=5)
+    examples = family.examples([walk("a", 3, 60), walk("b", 5, 40, seed=1)], Settings())
+    looks = together([example.content for example in examples])
+    assert looks.there.shape == (2, 12, 5)
+    assert looks.there.sum((1, 2)).tolist() == [36, 40]
+
+
+def test_a_clip_without_identities_is_refused_by_name():
+    with pytest.raises(InputError, match="nobody has no true identities"):
+        Identities().examples([walk("nobody", true=False)], Settings())
+
+
+def test_the_family_is_found_by_its_name_and_takes_the_interval_of_a_study():
+    family = family_of("tracking")
+    assert isinstance(family, Timed)
+    assert family.at(5, "association").examples([walk()], Settings())[0].content.looks["interval"] == 5
+
+
+def test_a_wrong_knob_gets_better_by_descending():
+    settings = Settings().model_copy(update={"track": Settings().track.model_copy(update={"scatter": 0.5})})
+    family = Identities(interval=5)
+    knobs = Knobs(settings, ["track.scatter"])
+    done = descend(family, knobs, family.examples([walk()], settings), Plan(6, 2, 0.3, look_every=3))
+    assert done.settings.track.scatter < 0.3
+    assert not done.failed
