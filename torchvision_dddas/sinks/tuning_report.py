@@ -116,7 +116,12 @@ def _plots(told: Mapping[str, Any]) -> list[str]:
         dots = [Dots("kept", steps[mark], values[mark], 2, sign="ring")]
         start = Line("as it was", steps, np.full(len(steps), values[0] if len(values) else math.nan), 6, dashed=True)
         unit = told["knobs"][name]["unit"]
+        # A knob that hardly moves is not to look as if it did.
+        middle = float(values.mean()) if len(values) else 0.0
+        reach = max(float(np.ptp(values)) * 0.55 if len(values) else 0.0, 0.02 * abs(middle), 1e-6)
         axis = Axis(unit if unit not in ("", "-") else "value")
+        if len(values) and np.ptp(values) < 0.04 * abs(middle):
+            axis = Axis(axis.name, middle - reach, middle + reach)
         charts.append(chart(name, across, axis, [start, Line("value", steps, values, 1)], dots))
     if len({step["softness"] for step in history}) > 1:
         charts.append(chart("Softness", across, Axis("softness"), [Line("", steps, _column(history, "softness"), 3)]))

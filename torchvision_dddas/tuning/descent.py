@@ -25,6 +25,9 @@ from torchvision_dddas.tuning.split import batch_of, parted
 FADED = 0.1
 """Of the rate, at the last step."""
 
+GAIN = 1e-5
+"""A loss that is less by no more than this is rounding, and no reason to move a knob."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -255,7 +258,7 @@ class _Run:
         return step
 
     def _judge(self, number: int, watched: float) -> None:
-        if watched < self._least:
+        if not self._best or watched < self._least - GAIN:
             self._least, self._best_step, self._since = watched, number, 0
             self._best = {name: value.clone() for name, value in self._knobs.state_dict().items()}
             return
