@@ -1,6 +1,6 @@
 """Does tuning the tracker by the likelihood of true links on some sequences help on others? Leave-one-sequence-out.
 
-    python eval/tune_identities.py DATA [--interval 5] [--steps 40] [--json FILE] [--only NAME,...]
+    python eval/tune_identities.py DATA [--interval 5] [--steps 40] [--json FILE] [--looks 25] [--only NAME,...]
 
 DATA: a folder of sequences, as the kinds `motchallenge`, `cvml` and `sdd` of a study have them. Each sequence is
 followed by the tracker as it runs (hard decisions, K = 3) on its true boxes without identities, with the shipped knobs
@@ -25,6 +25,7 @@ from torchvision_dddas.studies.record import Source
 from torchvision_dddas.studies.scoring import score
 from torchvision_dddas.studies.stages import find
 from torchvision_dddas.studies.summary import measures
+from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.identities import Identities
 
@@ -57,9 +58,11 @@ def main() -> None:
     ask.add_argument("--seed", type=int, default=0)
     ask.add_argument("--knobs", default=",".join(KNOBS))
     ask.add_argument("--only", default="", help="names of the sequences to hold out, all by default")
+    ask.add_argument("--looks", type=int, default=identities.LOOKS, help="of a stretch that is learned from")
     ask.add_argument("--json", type=Path)
     given = ask.parse_args()
     torch.set_num_threads(1)
+    identities.LOOKS = given.looks
     clips = {clip.name: clip for clip in _clips(given.data)}
     shipped = {name: _idf1(clip, Settings(), given.interval) for name, clip in clips.items()}
     family = Identities(interval=given.interval)

@@ -95,7 +95,7 @@ def test_slopes_are_those_of_small_changes():
     def lost(*values: Tensor) -> Tensor:
         return unlikeliness(track(dict(zip(NAMES, values, strict=True))), looks, 1.0)
 
-    start = [torch.tensor(float(value), dtype=torch.float64) for value in Knobs(Settings(), NAMES).values().values()]
+    start = [value.detach() for value in Knobs(Settings(), NAMES).values().values()]
     for place in range(len(NAMES)):
         ends = []
         for sign in (1, -1):
