@@ -81,11 +81,14 @@ def test_every_file_that_the_readme_names_is_there():
     assert [name for name in named if not ((package / name).exists() or (ROOT / name).exists())] == []
 
 
-def test_the_camera_and_the_configuration_of_the_readme_are_taken(tmp_path):
+def test_the_camera_the_study_and_the_configuration_of_the_readme_are_taken(tmp_path):
     from torchvision_dddas.settings import load
     from torchvision_dddas.sources.cameras import left_open, read_camera
+    from torchvision_dddas.studies.spec import read_spec
 
-    camera, own = blocks("toml")
+    camera, study, own = blocks("toml")
+    (tmp_path / "study.toml").write_text(study)
+    assert read_spec(tmp_path / "study.toml").tasks == ("motion", "tracking")
     (tmp_path / "ugv.toml").write_text(camera)
     assert read_camera(tmp_path / "ugv.toml").geographic
     assert left_open(tmp_path / "ugv.toml") == ""
