@@ -17,7 +17,7 @@ from torchvision_dddas.settings import load
 from torchvision_dddas.tuning import costing, preparing
 
 THRESHOLD = "difference.threshold"
-ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "0")
+ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
     [
         (("--knobs", "difference.absent"), "difference.threshold (0.1 to"),
         (("--knobs", "registration.keypoints"), "is no knob that can be tuned"),
-        (("--knobs", ""), "no knob to tune"),
+        (("--knobs", ""), "names no knob"),
         (("--knobs", f"{THRESHOLD},track.speed"), "several families"),
         (("--knobs", THRESHOLD, "--steps", "0"), "steps is 0"),
         (("--knobs", THRESHOLD, "--holdout", "none*"), "fits no clip"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet, check_jobs
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
@@ -126,14 +126,11 @@ def evaluate(
         _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
         from torchvision_dddas.cli import study as whole
 
-        if jobs is not None and jobs < 1:
-            raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
+        check_jobs(jobs, scheduler)
         if together is not None and (together < 1 or scheduler is not None):
             raise InputError(f"--together is {together}; wanted 1 or more clips, and no --scheduler")
         if interval is not None and not 1 <= interval <= 1000:
             raise InputError(f"--interval is {interval}; wanted a whole number of frames, 1 to 1000")
-        if jobs is not None and scheduler is not None:
-            raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
         folder = out or Path("dddas-study")
         spec = whole.asked(dataset, config, set_ or [], backend and backend.value, interval)
         if together is not None and together > 1 and spec.backend != "torch":

@@ -34,11 +34,12 @@ def asked(
     return replace(spec, backend=backend or spec.backend, interval=spec.interval if interval is None else interval)
 
 
-def patterns(text: str | None, option: str) -> list[str]:
+def patterns(text: str | None, option: str, what: str = "clip") -> list[str]:
     """The patterns of names that an option gives between commas. Raises InputError where it was given without any."""
     words = [word.strip() for word in (text or "").split(",") if word.strip()]
     if text is not None and not words:
-        raise InputError(f"{option} '{text}' names no clip; wanted patterns of names, such as 'bms_*'")
+        example = "'bms_*'" if what == "clip" else "'difference.*'"
+        raise InputError(f"{option} '{text}' names no {what}; wanted patterns of names, such as {example}")
     return words
 
 

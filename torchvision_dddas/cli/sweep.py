@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.cli.options import Backend, CacheFolder, Clips, Config, Jobs, Overrides, Quiet, check_jobs
 from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
@@ -47,18 +47,12 @@ def sweep(
         typer.Option(metavar="PATTERN,...", help="Clips without a say; before and best are measured on them too."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of what Optuna draws.")] = 0,
-    clips: Annotated[
-        str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one a core]")
-    ] = None,
+    clips: Clips = None,
+    jobs: Jobs = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler in place of --jobs.")
     ] = None,
-    cache: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
-    ] = None,
+    cache: CacheFolder = None,
     config: Config = None,
     set_: Overrides = None,
     backend: Annotated[Backend | None, typer.Option(help="The engine. [default: as FILE says]")] = None,
@@ -77,10 +71,7 @@ def sweep(
     from torchvision_dddas.studies.swept import Swept
     from torchvision_dddas.studies.tried import Tried, parted
 
-    if jobs is not None and jobs < 1:
-        raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
-    if jobs is not None and scheduler is not None:
-        raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
+    check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
     goal, spec = goal_of(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
     spec = replace(spec, tasks=(goal.task,))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet
+from torchvision_dddas.cli.options import Backend, CacheFolder, Clips, Config, Jobs, Overrides, Quiet, check_jobs
 from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
@@ -52,15 +52,9 @@ def tune(
         str | None,
         typer.Option(metavar="TASK.GROUP.MEASURE", help="Told before and after. [default: that of the knobs' family]"),
     ] = None,
-    clips: Annotated[
-        str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(metavar="N", help="Processes that measure before and after. [default: one a core]")
-    ] = None,
-    cache: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
-    ] = None,
+    clips: Clips = None,
+    jobs: Jobs = None,
+    cache: CacheFolder = None,
     config: Config = None,
     set_: Overrides = None,
     backend: Annotated[
@@ -74,11 +68,10 @@ def tune(
     Writes tuned.toml, which every command takes as --config, report.html and run.json.
     """
     _need_torch()
-    from torchvision_dddas.cli.study import asked
+    from torchvision_dddas.cli.study import asked, patterns
     from torchvision_dddas.tuning.descent import Plan
 
-    if jobs is not None and jobs < 0:
-        raise InputError(f"--jobs is {jobs}; wanted 0 or more processes")
+    check_jobs(jobs)
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes is {minutes:g}; wanted more than 0")
     if cost is not None and not 0 <= cost < float("inf"):
@@ -91,9 +84,9 @@ def tune(
             _prepared,
             spec,
             study.parent,
-            _words(knobs),
-            _words(holdout),
-            _words(clips),
+            patterns(knobs, "--knobs", "knob"),
+            patterns(holdout, "--holdout"),
+            patterns(clips, "--clips"),
             measure,
             _device(device),
             quiet,
@@ -335,10 +328,6 @@ def _device(name: str) -> Any:
 def _need_torch() -> None:
     if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
         raise InputError(f"dddas tune needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]'")
-
-
-def _words(text: str | None) -> list[str]:
-    return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 def _clips(count: int) -> str:
