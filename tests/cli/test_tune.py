@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -114,6 +115,63 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
     assert "What time costs" in (tmp_path / "report.html").read_text()
 
 
+def test_another_weight_of_the_cost_is_not_taken_for_the_one_before(clips, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
+    assert asked(clips, *words, "--cost", "0.5").exit_code == 0
+    result = asked(clips, *words, "--cost", "2", "--resume", "--quiet")
+    assert "with other cost" in bad(result)
+
+
+def test_what_is_refused_leaves_the_record_of_the_run_before(clips, tmp_path) -> None:
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
+    assert asked(clips, *words).exit_code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    result = asked(clips, *words, "--patience", "3", "--resume", "--quiet")
+    assert "with other patience" in bad(result)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_settings_that_tuning_would_overwrite_are_refused(clips, tmp_path) -> None:
+    """The figures before are of those settings, read again once the new ones are written."""
+    (tmp_path / "tuned.toml").write_text("[difference]\nthreshold = 12.0\n")
+    config = str(tmp_path / "tuned.toml")
+    result = asked(clips, *ASKED, "--config", config, "--out", str(tmp_path))
+    assert "tuned.toml is a file that this run writes" in bad(result)
+    assert load(config).difference.threshold == 12
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed(clips, tmp_path) -> None:
+    (tmp_path / "file").touch()
+    bowl = Bowl()
+    bowl.examples = lambda *_: pytest.fail("examples were prepared")  # type: ignore[method-assign]
+    assert "cannot write" in bad(asked(clips, *ASKED, "--out", str(tmp_path / "file"), bowl=bowl))
+
+
+def test_a_run_that_is_stopped_says_so_and_can_be_taken_up(clips, tmp_path) -> None:
+    class Stopped(Bowl):
+        def loss(self, knobs, batch, softness):
+            if len(self.calls) > 9:
+                raise KeyboardInterrupt
+            return super().loss(knobs, batch, softness)
+
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
+    assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
+    assert json.loads((tmp_path / "run.json").read_text())["state"] == "interrupted"
+    assert asked(clips, *words, "--resume").exit_code == 0
+    whole = asked(clips, *words[:-1], str(tmp_path / "whole"))
+    assert whole.exit_code == 0
+    histories = [json.loads((place / "run.json").read_text())["history"] for place in (tmp_path, tmp_path / "whole")]
+    assert histories[0] == histories[1]
+
+
+def test_without_torch_one_line_says_what_to_install(clips, monkeypatch) -> None:
+    for name in ("torch", "kornia"):
+        monkeypatch.setitem(sys.modules, name, None)
+    result = CliRunner().invoke(app, ["tune", str(clips), *ASKED])
+    assert "needs torch and kornia; pip install" in bad(result)
+
+
 def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_settings(clips, tmp_path) -> None:
     bowl = Bowl(place=math.log(60), wrong=("one", 2), wrong_above=12)
     result = asked(clips, *ASKED, "--clips", "one", "--set", f"{THRESHOLD}=10", "--out", str(tmp_path), bowl=bowl)
@@ -137,6 +195,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         (("--knobs", THRESHOLD, "--holdout", "*"), "leaves no clip"),
         (("--knobs", THRESHOLD, "--cost", "-1"), "--cost is -1"),
         (("--knobs", THRESHOLD, "--device", "nowhere"), "--device nowhere"),
+        (("--knobs", THRESHOLD, "--device", "meta"), "--device meta"),
         (("--knobs", THRESHOLD, "--minutes", "0"), "--minutes is 0"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels"), "is no measure"),
     ],

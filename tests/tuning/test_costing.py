@@ -71,7 +71,18 @@ def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     assert read(tmp_path / "cost.json") == cost
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"weight": 1}', '{"weight": 1, "seconds": 1, "curves": [1]}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        '{"weight": 1}',
+        '{"weight": 1, "seconds": 1, "curves": [1]}',
+        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.threshold", "values": ["a"], "times": [1]}]}',
+        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.threshold", "values": [1, 2], "times": [1]}]}',
+        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.absent", "values": [1], "times": [1]}]}',
+    ],
+)
 def test_a_damaged_file_is_told_in_a_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "cost.json").write_text(content)
     with pytest.raises(InputError, match="does not tell the cost"):

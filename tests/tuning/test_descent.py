@@ -95,7 +95,7 @@ def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict
         descend(Bowl(), place=place, resume=True, **asked)
 
 
-@pytest.mark.parametrize("content", [b"", b"no checkpoint at all", b"PK\x03\x04 and then nothing"])
+@pytest.mark.parametrize("content", [b"", b"junk", b"no checkpoint at all", b"PK\x03\x04 and then nothing"])
 def test_a_damaged_checkpoint_is_told_in_a_line(tmp_path: Path, content: bytes) -> None:
     place = tmp_path / "checkpoint.pt"
     place.write_bytes(content)

@@ -2,9 +2,11 @@
 
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.tuning.verdict import Side, Verdict
 
 CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
+FILES = (CHECKPOINT, COST, TUNED, REPORT, RUN)
 
 
 @explained
@@ -69,6 +72,7 @@ def tune(
     """
     _need_torch()
     from torchvision_dddas.cli.study import asked, patterns
+    from torchvision_dddas.sinks.whole import refuse_own_input
     from torchvision_dddas.tuning.descent import Plan
 
     check_jobs(jobs)
@@ -79,6 +83,9 @@ def tune(
     longest_s = float("inf") if minutes is None else 60 * minutes
     plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s)
     spec = asked(study, config, set_ or [], backend and backend.value, None)
+    # The settings are read again for the figures before: tuned.toml may not have taken their place by then.
+    read = [study, *([Path(spec.config)] if spec.config else [])]
+    refuse_own_input(read, [out / name for name in FILES], "folder with --out")
     _Tuning(out, plan, quiet, jobs, cache).run(
         partial(
             _prepared,
@@ -104,9 +111,22 @@ class _Tuning:
         self._folder, self._plan, self._quiet, self._jobs, self._cache = folder, plan, quiet, jobs, cache
         self._seconds: dict[str, float] = {}
         self._said, self._least = 0.0, (float("inf"), 0)
+        self._state: dict[str, str] = {}
 
     def run(self, prepared: Any, weight: float | None, resume: bool, backend: str) -> None:
         """All of it. Raises InputError, at the end too where a loss was no number."""
+        self._write(None)
+        try:
+            found = self._run(prepared, weight, resume, backend)
+        except BaseException:
+            if self._state:  # else the record of an earlier run in this folder is still there
+                with suppress(InputError):
+                    self._write(RUN, _json({**self._state, "state": "interrupted"}))
+            raise
+        if found.failed:
+            raise InputError(f"{found.failed}; {self._folder / TUNED} holds the last good state, of step {found.best}")
+
+    def _run(self, prepared: Any, weight: float | None, resume: bool, backend: str) -> "Descended":
         from torchvision_dddas.tuning.descent import descend
 
         began = time.perf_counter()
@@ -117,7 +137,7 @@ class _Tuning:
         before = _values(ready)
         began = time.perf_counter()
         place = self._folder / CHECKPOINT
-        tell = (lambda step: None) if self._quiet else self._tell
+        tell = partial(self._tell, {"state": "running", "study": ready.spec.name})
         found = descend(ready.family, ready.knobs, ready.examples, self._plan, cost, tell, place, resume)
         self._clock("descent", began)
         self._toml(ready, found, None)
@@ -128,15 +148,13 @@ class _Tuning:
         self._write(RUN, _json(record))
         if not self._quiet:
             show(verdict, self._folder, before, _values(ready))
-        if found.failed:
-            raise InputError(f"{found.failed}; {self._folder / TUNED} holds the last good state, of step {found.best}")
+        return found
 
     def _begin(self, ready: "Prepared") -> None:
         if not self._quiet:
             told = f"{ready.family.name}: {len(ready.examples)} examples of {_clips(len(ready.tuned))}"
             held = f", {_clips(len(ready.held))} held out" if ready.held else ""
             print(told + held, file=sys.stderr, flush=True)
-        self._write(RUN, _json({"state": "running", "study": ready.spec.name}))
 
     def _cost(self, ready: "Prepared", weight: float, backend: str, resume: bool) -> "TimeCost":
         """What the knobs cost, measured on the shortest clip; of a descent that is taken up, as it was measured."""
@@ -144,8 +162,9 @@ class _Tuning:
         from torchvision_dddas.tuning import costing
 
         place = self._folder / COST
-        if resume and place.is_file():
-            return costing.read(place)
+        if resume and place.is_file() and (self._folder / CHECKPOINT).is_file():
+            # Another weight is another descent, which the checkpoint refuses.
+            return replace(costing.read(place), weight=weight)
         began = time.perf_counter()
         clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
         names, settings = ready.knobs.names, ready.knobs.base
@@ -156,8 +175,13 @@ class _Tuning:
         self._clock("cost", began)
         return cost
 
-    def _tell(self, step: "Step") -> None:
-        """A line for each look, and every few seconds."""
+    def _tell(self, state: dict[str, str], step: "Step") -> None:
+        """A line for each look, and every few seconds; with the first step the run has begun."""
+        if not self._state:
+            self._write(RUN, _json(state))
+            self._state = state
+        if self._quiet:
+            return
         now = time.monotonic()
         if step.watched is None and now - self._said < EVERY_S:
             return
@@ -244,14 +268,18 @@ class _Tuning:
     def _clock(self, what: str, began: float) -> None:
         self._seconds[what] = time.perf_counter() - began
 
-    def _write(self, name: str, text: str) -> None:
+    def _write(self, name: str | None, text: str = "") -> None:
+        """Write a file; without a name, only see that some can be written. Raises InputError."""
         from torchvision_dddas.sinks.whole import cannot_write, write_whole
 
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_whole(self._folder / name, text.encode())
+            if name is None:
+                tempfile.TemporaryFile(dir=self._folder).close()
+            else:
+                write_whole(self._folder / name, text.encode())
         except OSError as error:
-            raise cannot_write(self._folder / name, error) from error
+            raise cannot_write(self._folder / (name or RUN), error) from error
 
 
 def show(verdict: "Verdict", folder: Path, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
@@ -319,8 +347,8 @@ def _device(name: str) -> Any:
 
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
+        torch.zeros(1, dtype=torch.float64, device=device).item()
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
         raise InputError(f"--device {name} will not do: {str(error).splitlines()[0]}; wanted cpu or cuda") from None
     return device
 

@@ -128,7 +128,12 @@ def read(place: Path) -> TimeCost:
     """Read it back. Raises InputError where it is damaged."""
     try:
         told = json.loads(place.read_text(encoding="utf-8"))
-        curves = [Curve(str(c["knob"]), tuple(c["values"]), tuple(c["times"])) for c in told["curves"]]
+        curves = [
+            Curve(TUNABLE[c["knob"]].name, tuple(map(float, c["values"])), tuple(map(float, c["times"])))
+            for c in told["curves"]
+        ]
+        if any(len(curve.values) != len(curve.times) for curve in curves):
+            raise ValueError
         return TimeCost(float(told["weight"]), float(told["seconds"]), tuple(curves))
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         raise InputError(f"{place} does not tell the cost of the knobs; begin again without --resume") from None
