@@ -83,9 +83,11 @@ def test_a_step_down_the_slope_of_a_threshold_that_is_too_high_lowers_it(clip: C
 
 
 def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
-    for truth in (None, replace(clip.truth, masks={})) if clip.truth else ():
-        with pytest.raises(InputError, match="film has no masks of what moves"):
-            Masks().examples([replace(clip, truth=truth)], SETTINGS)
+    assert clip.truth is not None
+    for truth in (None, replace(clip.truth, masks={})):
+        bare = replace(clip, name="bare", truth=truth)
+        with pytest.raises(InputError, match="bare has no masks of what moves; choose with --clips"):
+            Masks().examples([clip, bare], SETTINGS, lambda: pytest.fail("a clip was computed before"))
     with pytest.raises(InputError, match=r"difference\.halved"):
         Masks().examples([clip], with_knobs(SETTINGS, {"difference.halved": True}))
 

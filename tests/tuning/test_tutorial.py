@@ -23,6 +23,21 @@ def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, c
     assert "F on the clips tuned on: " in told and "F on the clips held out: " in told
 
 
+def test_the_ten_lines_of_the_text_run_as_they_are(tmp_path, monkeypatch, capsys) -> None:
+    (code,) = re.findall(r"^```python\n(.+?)^```", (DOCS / "tuning.md").read_text(), re.M | re.S)
+    assert len([line for line in code.splitlines() if line]) <= 10
+    for seed, name in enumerate(("one", "held")):
+        demo.film_into(tmp_path / "clips" / name, seed, frames=6, size=(160, 120))
+    (tmp_path / "study.toml").write_text('[[dataset]]\nkind = "folder"\nfolder = "clips"\n')
+    plan = descent.Plan
+    monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ten.py").write_text(code)
+    runpy.run_path("ten.py")
+    assert re.fullmatch(r"\(\S+, \S+\)\n", capsys.readouterr().out)
+
+
 @pytest.mark.parametrize("line", re.findall(r"^from torchvision_dddas.*$", (DOCS / "tuning.md").read_text(), re.M))
 def test_what_the_text_imports_is_there(line: str) -> None:
     module, names = re.fullmatch(r"from (\S+) import (.+)", line).groups()  # type: ignore[union-attr]

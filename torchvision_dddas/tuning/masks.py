@@ -68,6 +68,11 @@ class Masks:
         """The frames with masks. Raises InputError for a clip without any."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
+        bare = [clip.name for clip in clips if clip.truth is None or not clip.truth.masks]
+        if bare:  # told before any clip is computed
+            names = ", ".join(bare)
+            has = "have" if len(bare) > 1 else "has"
+            raise InputError(f"{names} {has} no masks of what moves; choose with --clips such as have")
         return [example for clip in clips for example in _examples(clip, settings, self.after, tick)]
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
@@ -126,8 +131,7 @@ def together(frames: Sequence[Labelled], device: torch.device) -> Labelled:
 
 def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[Example]:
     truth = clip.truth
-    if truth is None or not truth.masks:
-        raise InputError(f"{clip.name} has no masks of what moves, which tuning the knobs of motion needs")
+    assert truth is not None, "asked for clips with masks alone"
     found = []
     # What would become of more than is drawn now: without it, whatever a lower threshold adds would seem to stay.
     freer = with_knobs(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
