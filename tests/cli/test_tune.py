@@ -94,6 +94,7 @@ def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tune
     result = asked(clips, *ASKED, "--holdout", "h*", "--out", str(out), "--resume", bowl=bowl)
     after = json.loads((out / "run.json").read_text())
     assert result.exit_code == 0 and bowl.calls == []
+    assert (before["taken"], after["taken"]) == (10, 0) and "s a step" not in (out / "report.html").read_text()
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 

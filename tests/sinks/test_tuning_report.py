@@ -55,6 +55,7 @@ def record(**changed):
         "examples": 20,
         "knobs": knobs,
         "best": 4,
+        "taken": 4,
         "ended": "all 4 steps were taken",
         "failed": "",
         "history": history,
@@ -80,6 +81,7 @@ def test_it_says_first_what_tuning_was_worth_on_clips_tuned_on_and_held_out():
     assert "Clips held out 0.500 F, pixels, all together; before 0.550 −0.050" in start
     assert "mean of 2 clips: 0.500 → 0.600" in start and "20.0 → 15.0 ms a frame" in start
     assert "within noise" in start and "2.00 s a step, 20 examples" in start
+    assert "4.00 s a step" in said(tuning_report(record(taken=2)))
 
 
 def test_each_knob_has_its_plot_and_its_row_and_one_without_a_slope_is_told():

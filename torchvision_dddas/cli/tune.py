@@ -251,6 +251,7 @@ class _Tuning:
                 for name in ready.knobs.names
             },
             "best": found.best,
+            "taken": found.taken,
             "ended": found.ended,
             "failed": found.failed,
             "history": [asdict(step) for step in found.history],

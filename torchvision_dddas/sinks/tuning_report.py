@@ -48,11 +48,12 @@ def _cards(told: Mapping[str, Any], verdict: Mapping[str, Any] | None) -> list[s
             inner = _gain(verdict["measure"], found)
         cards.append(f'<section class="card"><h3><a href="#{side}">{heading}</a></h3>{inner}</section>')
     steps = told["history"][-1]["step"] if told["history"] else 0
-    pace = told["seconds"]["descent"] / steps if steps else math.nan
+    # Of a run that was taken up, the steps that it took itself.
+    pace = f"{number(told['seconds']['descent'] / told['taken'], 2)} s a step, " if told["taken"] else ""
     cards.append(
         '<section class="card"><h3>Descent</h3>'
         f'<div class="big">{steps} <span>steps, the best state after step {told["best"]}</span></div>'
-        f"<p>{escape(told['ended'])}</p><p>{number(pace, 2)} s a step, {told['examples']} examples</p></section>"
+        f"<p>{escape(told['ended'])}</p><p>{pace}{told['examples']} examples</p></section>"
     )
     return cards
 

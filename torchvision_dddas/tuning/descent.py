@@ -86,7 +86,8 @@ class Step:
 class Descended:
     """What became of it. knobs: in their best state, which is that after step `best`. ended: why, in words.
 
-    failed: in a line, which clip, frame and knob gave no number; empty where all went well.
+    failed: in a line, which clip, frame and knob gave no number; empty where all went well. taken: steps in `seconds`,
+    without those that a checkpoint held.
     """
 
     knobs: Knobs
@@ -96,6 +97,7 @@ class Descended:
     failed: str = ""
     seconds: float = 0.0
     idle: tuple[str, ...] = ()
+    taken: int = 0
 
     @property
     def settings(self) -> Settings:
@@ -126,6 +128,7 @@ def descend(
     began = time.perf_counter()
     if resume and place is not None and place.is_file():
         run.load(place)
+    held = run.history[-1].step if run.history else 0
     for known in run.history:
         tell(known)
     if not run.history:
@@ -141,7 +144,7 @@ def descend(
             tell(step)
         if step is None or step.watched is not None:
             run.save(place)
-    return run.result(time.perf_counter() - began)
+    return run.result(time.perf_counter() - began, held)
 
 
 class _Run:
@@ -235,12 +238,13 @@ class _Run:
         }
         checkpoint.write(place, self._facts(), state)
 
-    def result(self, seconds: float) -> Descended:
+    def result(self, seconds: float, held: int) -> Descended:
         """The knobs in their best state, and how they came there."""
         self._knobs.load_state_dict(self._best)
         ended = self.ended or "a loss was no number"
         idle = tuple(name for name in self._knobs.names if name not in self._moved) if len(self.history) > 1 else ()
-        return Descended(self._knobs, self._best_step, self.history, ended, self.failed, seconds, idle)
+        taken = self.history[-1].step - held
+        return Descended(self._knobs, self._best_step, self.history, ended, self.failed, seconds, idle, taken)
 
     def _told(self, number: int, softness: float, loss: float, look: bool) -> Step:
         """Take note of the knobs as they are now, and where they are looked at of how good they are."""
