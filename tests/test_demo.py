@@ -34,7 +34,7 @@ def test_the_demo_finds_most_movers_and_leaves_the_parked_car_alone(tmp_path, mo
 
 
 def test_the_python_of_the_readme_runs_and_finds_targets(tmp_path, monkeypatch, capsys):
-    code, _ = blocks("python")
+    code, _, _ = blocks("python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
     film_into(tmp_path / "demo-out/clip", frames=8, size=(480, 360))
     monkeypatch.chdir(tmp_path)
@@ -43,7 +43,7 @@ def test_the_python_of_the_readme_runs_and_finds_targets(tmp_path, monkeypatch, 
 
 
 def test_the_python_of_the_readme_gives_what_opencv_gives(tmp_path, monkeypatch, capsys):
-    _, code = blocks("python")
+    _, code, _ = blocks("python")
     photo = np.full((240, 320, 3), 200, np.uint8)
     cv2.ellipse(photo, (160, 110), (16, 40), 0, 0, 360, (40, 40, 40), -1)  # body, head, legs
     cv2.circle(photo, (160, 62), 10, (40, 40, 40), -1)
@@ -79,6 +79,11 @@ def test_every_file_that_the_readme_names_is_there():
     named += re.findall(r"\]\(([^)]+)\)", README)
     assert len(named) >= 20
     assert [name for name in named if not ((package / name).exists() or (ROOT / name).exists())] == []
+
+
+def test_the_tuning_of_the_readme_is_that_of_its_own_page_which_is_run():
+    _, _, code = blocks("python")
+    assert f"```python\n{code}```" in (ROOT / "docs/tuning.md").read_text(encoding="utf-8")
 
 
 def test_the_camera_the_study_and_the_configuration_of_the_readme_are_taken(tmp_path):
