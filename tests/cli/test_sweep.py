@@ -127,7 +127,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(study, tmp_path, words, told) 
         ("sight.pixels.f", "no task"),
         ("motion.voxels.f", "no group"),
         ("motion.pixels.n_tp", "neither more nor less"),
-        ("motion.pixels.beauty", "there are pixels."),
+        ("motion.tracks.idf1", "no group of measures of motion; wanted pixels"),
+        ("motion.pixels.beauty", "no measure of motion.pixels; wanted accuracy, "),
         ("tracking.tracks.idf1", "no clip is left"),
     ],
 )

@@ -199,6 +199,8 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         (("--knobs", THRESHOLD, "--device", "meta"), "--device meta"),
         (("--knobs", THRESHOLD, "--minutes", "0"), "--minutes is 0"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels"), "is no measure"),
+        (("--knobs", THRESHOLD, "--measure", "motion.pixels.iou"), "no measure of motion.pixels; wanted accuracy, "),
+        (("--knobs", THRESHOLD, "--measure", "motion.target.hit"), "no clip has truth for motion.target.hit"),
     ],
 )
 def test_bad_input_is_one_line(clips, tmp_path, words: tuple[str, ...], said: str) -> None:

@@ -5,11 +5,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
+from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.studies.record import Case, Task
-from torchvision_dddas.studies.summary import BETTER_LOW, GROUPS, measures
+from torchvision_dddas.studies.summary import BETTER_LOW, measures, names
 
 BY = ("pooled", "mean", "worst")
+
+OF_TASK: Mapping[Task, tuple[str, ...]] = {
+    "motion": ("pixels", "boxes", "ranking", "target", "still"),
+    "tracking": ("tracks", "target_track"),
+    "association": ("tracks",),
+    "people": ("boxes", "ranking"),
+    "location": ("metres", "location"),
+}
+"""The groups of measures that a task can have; which of them a clip has depends on its truth."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +48,40 @@ def goal_of(text: str, by: str = "pooled") -> Goal:
     if len(parts) != 3 or not all(parts):
         raise InputError(f"'{text}' is no measure; wanted task.group.measure, such as motion.pixels.f")
     task, group, measure = parts
-    for what, word, known in (("task", task, get_args(Task)), ("group of measures", group, GROUPS), ("way", by, BY)):
+    for what, word, known in (("task", task, get_args(Task)), ("way", by, BY)):
         if word not in known:
-            raise InputError(f"'{word}' is no {what} that a sweep knows; wanted {', '.join(known)}")
+            raise InputError(f"'{word}' is no {what} that a study knows; wanted {', '.join(known)}")
+    found: Task = next(known for known in get_args(Task) if known == task)
+    if group not in OF_TASK[found]:
+        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(OF_TASK[found])}")
     if measure.startswith("n_") and measure not in BETTER_LOW:
         raise InputError(f"{measure} is a count, of which neither more nor less is better; wanted a measure")
-    found: Task = next(known for known in get_args(Task) if known == task)
+    if measure not in names(group):
+        raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(names(group))}")
     return Goal(found, group, measure, by)
+
+
+def groups_of(clip: Clip, task: Task) -> tuple[str, ...]:
+    """The groups of measures that a clip's truth allows, of a task that the clip allows."""
+    truth = clip.truth
+    if task == "motion" and clip.still:
+        return ("still",)
+    if truth is None or task in ("association", "people", "location"):
+        return OF_TASK[task]
+    alone = truth.kind == "one target"
+    if task == "tracking":
+        return ("target_track",) if alone else ("tracks",)
+    if truth.kind == "masks":
+        return ("pixels", "boxes", "ranking") if truth.labels.separate else ("pixels",)
+    return ("target",) if alone else ("boxes", "ranking")
+
+
+def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
+    """Raises InputError where no clip's truth has the goal's group of measures: told before anything is computed."""
+    having = dict.fromkeys(group for clip in clips for group in groups_of(clip, goal.task))
+    if goal.group not in having:
+        told = ", ".join(f"{goal.task}.{group}" for group in having)
+        raise InputError(f"no clip has truth for {goal.name}; there is truth for {told or 'nothing'}")
 
 
 def value_of(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:

@@ -5,11 +5,19 @@ It tells nothing of the machine, the time or the folders: the same data, code an
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from torchvision_dddas.metrics import bootstrap, metres
+from torchvision_dddas.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.metrics.figures import figures, mean, pooled
+from torchvision_dddas.metrics.metres import Located
+from torchvision_dddas.metrics.ranking import ranking
+from torchvision_dddas.metrics.segmentation import Pixels
+from torchvision_dddas.metrics.still import Still
+from torchvision_dddas.metrics.tracking import TargetTrack, TrackCounts
 from torchvision_dddas.studies import estimates
 from torchvision_dddas.studies.estimates import METRES, RANKED, Estimate
 from torchvision_dddas.studies.record import TASKS, Case, Results, Task
@@ -28,6 +36,17 @@ BETTER_LOW = frozenset(
     }
 )
 """Measures of which less is better; of all others more is."""
+
+_EMPTY: Mapping[str, Any] = {
+    "pixels": Pixels(),
+    "boxes": Boxes(),
+    "target": OneTarget(),
+    "tracks": TrackCounts(),
+    "target_track": TargetTrack(),
+    "still": Still(),
+    "location": Located(),
+}
+"""Groups whose measures come of counts, and no counts at all."""
 
 
 def summary(results: Results) -> dict[str, Any]:
@@ -96,6 +115,17 @@ def measures(cases: Sequence[Scored]) -> dict[str, dict[str, float]]:
         samples = estimates.samples_of(having)
         found[METRES] = {**metres.measures(samples), "n_places": len(samples["error_m"])}
     return {group: found[group] for group in GROUPS if group in found}
+
+
+def names(group: str) -> tuple[str, ...]:
+    """The measures that a group of GROUPS can have, and those of its counts of which less is better."""
+    if group == RANKED:
+        return tuple(ranking(*np.zeros((5, 0))).measures())
+    if group == METRES:
+        none = dict.fromkeys(("error_m", "inside", "relative_error_m", "relative_inside"), np.zeros(0))
+        return tuple(metres.measures(none))
+    found = figures({group: _EMPTY[group]})[group]
+    return tuple(name for name in found if not name.startswith("n_") or name in BETTER_LOW)
 
 
 def _intervals(group: str, estimate: Estimate) -> dict[str, list[float] | None]:

@@ -9,7 +9,7 @@ from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.modules.tunable import TUNABLE, Knobs, chosen
 from torchvision_dddas.settings import load
-from torchvision_dddas.studies.goals import Goal, goal_of
+from torchvision_dddas.studies.goals import Goal, check_possible, goal_of
 from torchvision_dddas.studies.record import Spec
 from torchvision_dddas.studies.running import plan
 from torchvision_dddas.studies.tried import parted
@@ -58,6 +58,7 @@ def prepare(
     spec = replace(spec, tasks=(goal.task,))
     tuned, held = parted(spec, base, clips, holdout)
     seen = tuple(job.clip for job in plan(spec, base, [glob.escape(name) for name in tuned]).jobs)
+    check_possible(goal, seen)
     examples = family.examples(seen, settings, tick)
     return Prepared(spec, base, family, knobs, seen, tuned, held, goal, examples)
 
