@@ -166,6 +166,40 @@ def test_a_run_that_is_stopped_says_so_and_can_be_taken_up(clips, tmp_path) -> N
     assert histories[0] == histories[1]
 
 
+def test_without_a_checkpoint_to_go_on_from_it_is_said_that_it_begins_anew(clips, tmp_path) -> None:
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path), "--resume")
+    first = asked(clips, *words)
+    assert first.exit_code == 0
+    assert f"there is no checkpoint at {tmp_path / 'checkpoint.pt'}: it begins anew" in first.output.splitlines()
+    assert "begins anew" not in asked(clips, *words).output
+
+
+def test_an_unfinished_descent_is_kept_beside_the_new_one(clips, tmp_path) -> None:
+    def stopped(after: int):
+        class Stopped(Bowl):
+            def loss(self, knobs, batch, softness):
+                if len(self.calls) > after:
+                    raise KeyboardInterrupt
+                return super().loss(knobs, batch, softness)
+
+        return Stopped(place=math.log(6))
+
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
+    old, now = tmp_path / "checkpoint.old.pt", tmp_path / "checkpoint.pt"
+    assert asked(clips, *words, bowl=stopped(8)).exit_code == 130
+    begun = now.read_bytes()
+    again = asked(clips, *words, "--rate", "0.1", bowl=stopped(2))  # not as far as the first step's look
+    assert again.exit_code == 130 and "unfinished descent, of 5 steps; kept as checkpoint.old.pt" in again.output
+    assert old.read_bytes() == begun != now.read_bytes()
+    assert asked(clips, *words).exit_code == 0
+    assert old.read_bytes() == begun, "one of fewer steps took the place of the one of more"
+    assert asked(clips, *words).exit_code == 0
+    assert old.read_bytes() == begun, "a descent that came to its end was kept as unfinished"
+    old.replace(now)
+    assert asked(clips, *words, "--resume").exit_code == 0
+    assert json.loads((tmp_path / "run.json").read_text())["taken"] == 5
+
+
 def test_without_torch_one_line_says_what_to_install(clips, monkeypatch) -> None:
     for name in ("torch", "kornia"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.tuning.verdict import Side, Verdict
 
 CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
-FILES = (CHECKPOINT, COST, TUNED, REPORT, RUN)
+OLD = "checkpoint.old.pt"
+FILES = (CHECKPOINT, OLD, COST, TUNED, REPORT, RUN)
 
 
 @explained
@@ -45,7 +46,14 @@ def tune(
         float | None,
         typer.Option(metavar="WEIGHT", help="The loss that a frame of twice the time is worth. [default: none]"),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help=f"Go on from the checkpoint in --out; begin where there is none. Without it an unfinished one is kept "
+            f"as {OLD}.",
+        ),
+    ] = False,
     batch: Annotated[int, typer.Option(metavar="N", help="Examples of a step.")] = 8,
     rate: Annotated[float, typer.Option(help="Of a step: 0.05 is about 5 % of a knob.")] = 0.05,
     patience: Annotated[int, typer.Option(metavar="N", help="Looks, one every 5 steps, without a gain.")] = 10,
@@ -137,7 +145,9 @@ class _Tuning:
         before = _values(ready)
         began = time.perf_counter()
         place = self._folder / CHECKPOINT
-        tell = partial(self._tell, {"state": "running", "study": ready.spec.name})
+        if resume and not place.is_file():
+            self._say(f"there is no checkpoint at {place}: it begins anew")
+        tell = partial(self._tell, {"state": "running", "study": ready.spec.name}, resume)
         found = descend(ready.family, ready.knobs, ready.examples, self._plan, cost, tell, place, resume)
         self._clock("descent", began)
         self._toml(ready, found, None)
@@ -151,10 +161,13 @@ class _Tuning:
         return found
 
     def _begin(self, ready: "Prepared") -> None:
+        told = f"{ready.family.name}: {len(ready.examples)} examples of {_clips(len(ready.tuned))}"
+        held = f", {_clips(len(ready.held))} held out" if ready.held else ""
+        self._say(told + held)
+
+    def _say(self, line: str) -> None:
         if not self._quiet:
-            told = f"{ready.family.name}: {len(ready.examples)} examples of {_clips(len(ready.tuned))}"
-            held = f", {_clips(len(ready.held))} held out" if ready.held else ""
-            print(told + held, file=sys.stderr, flush=True)
+            print(line, file=sys.stderr, flush=True)
 
     def _cost(self, ready: "Prepared", weight: float, backend: str, resume: bool) -> "TimeCost":
         """What the knobs cost, measured on the shortest clip; of a descent that is taken up, as it was measured."""
@@ -175,9 +188,11 @@ class _Tuning:
         self._clock("cost", began)
         return cost
 
-    def _tell(self, state: dict[str, str], step: "Step") -> None:
+    def _tell(self, state: dict[str, str], resume: bool, step: "Step") -> None:
         """A line for each look, and every few seconds; with the first step the run has begun."""
         if not self._state:
+            if not resume:
+                self._set_aside()
             self._write(RUN, _json(state))
             self._state = state
         if self._quiet:
@@ -192,7 +207,15 @@ class _Tuning:
             self._least = min(self._least, (step.watched, step.step))
             told += f"{',' if step.step else ':'} watched {step.watched:.4f}"
             told += f" (least {self._least[0]:.4f} at step {self._least[1]})"
-        print(told, file=sys.stderr, flush=True)
+        self._say(told)
+
+    def _set_aside(self) -> None:
+        """A checkpoint that could be gone on with is not written over."""
+        from torchvision_dddas.tuning.checkpoint import set_aside
+
+        place, aside = self._folder / CHECKPOINT, self._folder / OLD
+        if steps := set_aside(place, aside):
+            self._say(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
 
     def _judged(self, ready: "Prepared") -> "Verdict":
         from torchvision_dddas.cli.study import shown

@@ -62,6 +62,31 @@ def read(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
     return state
 
 
+def set_aside(place: Path, aside: Path) -> int:
+    """Keep a checkpoint that a new descent would overwrite, and the steps that it took; 0 where nothing is kept.
+
+    Kept is what could still be gone on with: a descent that did not come to its end, of more steps than one that lies
+    there already. Raises InputError where the disk refuses.
+    """
+    steps = _unfinished(place)
+    if steps == 0 or steps < _unfinished(aside):
+        return 0
+    try:
+        place.replace(aside)
+    except OSError as error:
+        raise cannot_write(aside, error) from error
+    return steps
+
+
+def _unfinished(place: Path) -> int:
+    """Steps of a descent that did not come to its end; 0 where there is none that can be read."""
+    try:
+        state = torch.load(place, weights_only=True, map_location="cpu")["state"]
+        return 0 if state["ended"] or state["failed"] else int(state["history"][-1]["step"])
+    except Exception:  # as above: what cannot be read cannot be gone on with
+        return 0
+
+
 def _short(value: object) -> str:
     text = str(value)
     return text if len(text) <= 80 else f"{text[:79]}…"
