@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -133,6 +134,29 @@ def test_what_is_refused_leaves_the_record_of_the_run_before(clips, tmp_path) ->
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@dataclass
+class Choosy(Bowl):
+    """A bowl of two losses."""
+
+    losses: tuple[str, ...] = ("round", "square")
+    loss_name: str = "round"
+
+    def by(self, loss_name: str) -> "Choosy":
+        return replace(self, loss_name=loss_name)
+
+
+def test_the_loss_that_was_chosen_is_recorded_and_no_checkpoint_of_another_is_taken(clips, tmp_path) -> None:
+    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
+    bowl = Choosy(place=math.log(6))
+    assert asked(clips, *words, "--loss", "square", bowl=bowl).exit_code == 0
+    assert json.loads((tmp_path / "run.json").read_text())["loss"] == "square"
+    assert "motion, loss square, on" in (tmp_path / "report.html").read_text()
+    result = asked(clips, *words, "--resume", "--quiet", bowl=bowl)
+    assert "with other loss, square and not round" in bad(result)
+    unknown = asked(clips, *words, "--loss", "oval", bowl=bowl)
+    assert "'oval' is no loss of the family motion; wanted one of round, square" in bad(unknown)
+
+
 def test_settings_that_tuning_would_overwrite_are_refused(clips, tmp_path) -> None:
     """The figures before are of those settings, read again once the new ones are written."""
     (tmp_path / "tuned.toml").write_text("[difference]\nthreshold = 12.0\n")
@@ -232,6 +256,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         (("--knobs", THRESHOLD, "--device", "nowhere"), "--device nowhere"),
         (("--knobs", THRESHOLD, "--device", "meta"), "--device meta"),
         (("--knobs", THRESHOLD, "--minutes", "0"), "--minutes is 0"),
+        (("--knobs", THRESHOLD, "--loss", "f"), "is no loss of the family motion; it has one of its own"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels"), "is no measure"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels.iou"), "no measure of motion.pixels; wanted accuracy, "),
         (("--knobs", THRESHOLD, "--measure", "motion.target.hit"), "no clip has truth for motion.target.hit"),

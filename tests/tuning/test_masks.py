@@ -12,7 +12,7 @@ from torchvision_dddas.modules.tunable import TUNABLE, Knobs
 from torchvision_dddas.run import run
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.studies.stages import opened
-from torchvision_dddas.tuning.family import Example, family_of
+from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
 from torchvision_dddas.tuning.masks import Masks, masks_of, together
 from torchvision_dddas.vision import load
 
@@ -97,6 +97,26 @@ def test_unlabelled_pixels_are_known_to_be_so(clip: Clip, examples: list[Example
     labels = labels_of(clip.truth, examples[0].frame)
     assert torch.equal(examples[0].content.truth[0, 0], torch.from_numpy(labels > 0))
     assert bool(examples[0].content.known.all())
+
+
+def test_a_loss_of_another_name_is_another_loss_of_the_same_masks(examples: list[Example]) -> None:
+    knobs = {"difference.threshold": torch.tensor(4.0)}
+    found = {}
+    for name in Masks().losses:
+        family = with_loss(Masks(passing=True), name)
+        assert isinstance(family, Masks) and family.passing and loss_of(family) == name
+        found[name] = family.loss(knobs, examples, 0.1)
+    assert loss_of(Masks()) == "f" and torch.equal(found["f"], Masks(passing=True).loss(knobs, examples, 0.1))
+    assert not torch.allclose(found["f"], found["focal"])
+    # Squares of hard masks are the masks.
+    torch.testing.assert_close(found["f"], found["dice"])
+
+
+def test_a_loss_that_a_family_has_not_is_refused_with_those_it_has() -> None:
+    with pytest.raises(InputError, match="'iou' is no loss of the family motion; wanted one of f, dice, focal"):
+        with_loss(Masks(), "iou")
+    with pytest.raises(InputError, match="'f' is no loss of the family people; it has one of its own"):
+        with_loss(family_of("people"), "f")
 
 
 def test_the_family_is_found_by_its_name() -> None:

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from torchvision_dddas.metrics.segmentation import Pixels, measures
+from torchvision_dddas.tuning.overlap import LOSSES as BY_NAME
 from torchvision_dddas.tuning.overlap import dice_loss, f_loss, focal_loss
 
 TRUTH = torch.zeros(2, 1, 40, 50, dtype=torch.bool)
@@ -42,3 +43,7 @@ def test_losses_have_the_right_gradient(loss) -> None:
     found = 0.05 + 0.9 * torch.rand(2, 1, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     truth, known = TRUTH[..., 3:7, 8:13], KNOWN[..., 3:7, 8:13]
     assert torch.autograd.gradcheck(lambda mask: loss(mask, truth, known), (found.requires_grad_(),))
+
+
+def test_every_loss_has_a_name_that_can_be_asked_for() -> None:
+    assert list(BY_NAME.values()) == LOSSES and next(iter(BY_NAME)) == "f"

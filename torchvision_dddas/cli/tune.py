@@ -63,6 +63,10 @@ def tune(
         str | None,
         typer.Option(metavar="TASK.GROUP.MEASURE", help="Told before and after. [default: that of the knobs' family]"),
     ] = None,
+    loss: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Of the family's losses: f, dice or focal of motion. [default: the first]"),
+    ] = None,
     clips: Clips = None,
     jobs: Jobs = None,
     cache: CacheFolder = None,
@@ -103,6 +107,7 @@ def tune(
             patterns(holdout, "--holdout"),
             patterns(clips, "--clips"),
             measure,
+            loss,
             _device(device),
             quiet,
         ),
@@ -248,6 +253,7 @@ class _Tuning:
         from torchvision_dddas.modules.tunable import TUNABLE
         from torchvision_dddas.settings import all_knobs
         from torchvision_dddas.sinks.journal import versions
+        from torchvision_dddas.tuning.family import loss_of
 
         spec, after = ready.spec, _values(ready)
         meaning = {knob.name: knob.meaning for knob in all_knobs()}
@@ -260,6 +266,7 @@ class _Tuning:
             "versions": versions(),
             "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
             "family": ready.family.name,
+            "loss": loss_of(ready.family) or None,
             "plan": asdict(self._plan),
             "examples": len(ready.examples),
             "knobs": {
@@ -348,6 +355,7 @@ def _prepared(
     holdout: list[str],
     clips: list[str],
     measure: str | None,
+    loss: str | None,
     device: Any,
     quiet: bool,
 ) -> "Prepared":
@@ -355,7 +363,7 @@ def _prepared(
     from torchvision_dddas.tuning.preparing import prepare
 
     with progress("examples", None, quiet) as tick:
-        ready = prepare(spec, base, names, holdout, clips, measure, tick)
+        ready = prepare(spec, base, names, holdout, clips, measure, loss, tick)
     ready.knobs.to(device)
     return ready
 

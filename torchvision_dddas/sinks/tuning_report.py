@@ -20,7 +20,8 @@ def tuning_report(told: Mapping[str, Any]) -> str:
     """The HTML. told: the content of run.json of `dddas tune`, NaN as None."""
     knobs = told["knobs"]
     title = f"Tuning of {len(knobs)} knob{'s' * (len(knobs) != 1)} by gradient"
-    about = f"{told['family']} on {told['study']['name']}; seed {told['plan']['seed']}"
+    loss = f", loss {told['loss']}," if told.get("loss") else ""
+    about = f"{told['family']}{loss} on {told['study']['name']}; seed {told['plan']['seed']}"
     parts = [f"<h1>{escape(title)} <span>{escape(about)}</span></h1>"]
     if told["failed"]:
         parts.append(f'<p class="bad">Stopped: {escape(told["failed"])}. The knobs are the last good ones.</p>')

@@ -13,14 +13,16 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.modules.tunable import Knobs
 from torchvision_dddas.settings import changes
 from torchvision_dddas.sinks.whole import cannot_write, write_whole
+from torchvision_dddas.tuning.family import Family, loss_of
 
-FORMAT = 1
+FORMAT = 2
 
 
-def facts(family: str, knobs: Knobs, plan: Mapping[str, Any], seen: Sequence[str], cost: object) -> dict[str, Any]:
+def facts(family: Family, knobs: Knobs, plan: Mapping[str, Any], seen: Sequence[str], cost: object) -> dict[str, Any]:
     """What a descent depends on, in words and numbers. seen: its examples, in order."""
     return {
-        "family": family,
+        "family": family.name,
+        "loss": loss_of(family),
         "knobs": ", ".join(knobs.names),
         "settings": json.dumps(changes(knobs.base), default=str),
         **plan,

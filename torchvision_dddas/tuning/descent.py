@@ -301,4 +301,4 @@ class _Run:
         """What a descent depends on: of a checkpoint it has to be the same."""
         plan = {name: value for name, value in asdict(self._plan).items() if name != "most_s"}
         seen = [f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched)]
-        return checkpoint.facts(self._family.name, self._knobs, plan, seen, self._cost)
+        return checkpoint.facts(self._family, self._knobs, plan, seen, self._cost)

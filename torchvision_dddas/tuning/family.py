@@ -85,6 +85,39 @@ class Timed(Protocol):
         ...
 
 
+@runtime_checkable
+class Choosing(Protocol):
+    """A family that offers several losses."""
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Their names, the first the one that is taken unless said."""
+        ...
+
+    @property
+    def loss_name(self) -> str:
+        """The one that is taken."""
+        ...
+
+    def by(self, loss_name: str) -> Family:
+        """The family with one of its losses."""
+        ...
+
+
+def with_loss(family: Family, name: str) -> Family:
+    """A family with one of its losses. Raises InputError, with what there is, where it has no such."""
+    offered = family.losses if isinstance(family, Choosing) else ()
+    if isinstance(family, Choosing) and name in offered:
+        return family.by(name)
+    there = f"wanted one of {', '.join(offered)}" if offered else "it has one of its own; leave --loss out"
+    raise InputError(f"'{name}' is no loss of the family {family.name}; {there}")
+
+
+def loss_of(family: Family) -> str:
+    """The name of a family's loss; empty where it has no choice."""
+    return family.loss_name if isinstance(family, Choosing) else ""
+
+
 def family_of(name: str) -> Family:
     """The family of a name. Raises InputError where there is none."""
     module = f"{__package__}.{FAMILIES[name]}" if name in FAMILIES else ""

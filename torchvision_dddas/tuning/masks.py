@@ -20,7 +20,7 @@ from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.labelling import regions_of
-from torchvision_dddas.tuning.overlap import f_loss
+from torchvision_dddas.tuning.overlap import LOSSES, f_loss
 from torchvision_dddas.tuning.recorded import Recorded, differences_of, recorded
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -63,6 +63,21 @@ class Masks:
 
     def __init__(self, wrong: Loss = f_loss, passing: bool = False, after: bool = True) -> None:
         self.wrong, self.passing, self.after = wrong, passing, after
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """See `family.Choosing`."""
+        return tuple(LOSSES)
+
+    @property
+    def loss_name(self) -> str:
+        """See `family.Choosing`; of a loss of one's own, what it is called."""
+        named = (name for name, loss in LOSSES.items() if loss is self.wrong)
+        return next(named, getattr(self.wrong, "__name__", "its own"))
+
+    def by(self, loss_name: str) -> "Masks":
+        """See `family.Choosing`."""
+        return Masks(LOSSES[loss_name], self.passing, self.after)
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The frames with masks. Raises InputError for a clip without any."""

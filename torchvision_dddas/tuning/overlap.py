@@ -1,5 +1,7 @@
 """How wrong a soft mask is, one number a mask: 0 is right, 1 is wrong. What nobody labelled does not count."""
 
+from collections.abc import Callable, Mapping
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -35,6 +37,14 @@ def focal_loss(
     right = torch.where(truth, mask, 1 - mask).clamp(min=1e-6)
     weight = torch.where(truth, movers, 1 - movers) * known
     return (-((1 - right) ** focus) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
+
+
+LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "f": f_loss,
+    "dice": dice_loss,
+    "focal": focal_loss,
+}
+"""By the names that `dddas tune --loss` takes; the first one unless said."""
 
 
 def _sums(mask: Tensor, truth: Tensor, known: Tensor, power: int = 1) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,7 +13,7 @@ from torchvision_dddas.studies.goals import Goal, check_possible, goal_of
 from torchvision_dddas.studies.record import Spec
 from torchvision_dddas.studies.running import plan
 from torchvision_dddas.studies.tried import parted
-from torchvision_dddas.tuning.family import Example, Family, Tick, Timed, family_of
+from torchvision_dddas.tuning.family import Example, Family, Tick, Timed, family_of, with_loss
 
 
 @dataclass
@@ -41,13 +41,15 @@ def prepare(
     holdout: Sequence[str] = (),
     clips: Sequence[str] = (),
     measure: str | None = None,
+    loss: str | None = None,
     tick: Tick = lambda: None,
 ) -> Prepared:
     """Read a study's clips, and prepare the examples of those that are not held out.
 
     names: of knobs, as `tunable.chosen` takes them. holdout, clips: patterns of clips' names. measure: in place of the
-    family's. tick: called once an example. Raises InputError for a knob that cannot be tuned, knobs of several
-    families, clips without the truth that is needed, and as `running.plan` does.
+    family's. loss: one of those that the family offers. tick: called once an example. Raises InputError for a knob that
+    cannot be tuned, knobs of several families, a loss that the family has not, clips without the truth that is needed,
+    and as `running.plan` does.
     """
     settings = load(spec.config, spec.overrides)
     family = _family(names)
@@ -55,6 +57,8 @@ def prepare(
     goal = goal_of(measure or family.measure)
     if isinstance(family, Timed):
         family = family.at(spec.interval, goal.task)
+    if loss is not None:
+        family = with_loss(family, loss)
     spec = replace(spec, tasks=(goal.task,))
     tuned, held = parted(spec, base, clips, holdout)
     seen = tuple(job.clip for job in plan(spec, base, [glob.escape(name) for name in tuned]).jobs)
