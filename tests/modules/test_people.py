@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.metrics.detection import iou
-from torchvision_dddas.modules.people import bodies, doubt, overlap, soft_f
+from torchvision_dddas.metrics.detection import areas, iou
+from torchvision_dddas.modules.people import bodies, doubt, soft_f
 from torchvision_dddas.settings import PeopleKnobs
 from torchvision_dddas.targets.persons import body, probability
 
@@ -61,11 +61,12 @@ def test_f_of_a_picture_without_people_falls_with_every_false_one():
     assert f == pytest.approx([1, 1 / 2, 1 / 3])
 
 
-def test_overlap_is_the_measure_s():
+def test_areas_of_tensors_are_those_of_the_measure():
     a, b = drawn(0), drawn(1)
-    np.testing.assert_allclose(overlap(torch.as_tensor(a), torch.as_tensor(b)).numpy(), np.diag(iou(a, b)))
+    common, union = areas(torch.as_tensor(a), torch.as_tensor(b))
+    np.testing.assert_array_equal((common / union).numpy(), np.diag(iou(a, b)))
     apart = torch.tensor([[0.0, 0, 10, 10]]), torch.tensor([[50.0, 50, 10, 10]])
-    assert float(overlap(*apart)) == 0
+    assert [float(area) for area in areas(*apart)] == [0, 200]
 
 
 def test_gradients_of_all_are_right():
@@ -75,8 +76,8 @@ def test_gradients_of_all_are_right():
 
     def lost(*values: torch.Tensor) -> torch.Tensor:
         knobs = dict(zip(KNOBS, values[:-1], strict=True))
-        boxes = overlap(bodies(window, knobs), true).sum()
-        return boxes + doubt(margin, right, knobs).sum() + soft_f(margin, right, 4, values[-1], 0.3)
+        common, union = areas(bodies(window, knobs), true)
+        return (common / union).sum() + doubt(margin, right, knobs).sum() + soft_f(margin, right, 4, values[-1], 0.3)
 
     start = [value.clone().requires_grad_() for value in (*KNOBS.values(), torch.tensor(0.4, dtype=torch.float64))]
     assert torch.autograd.gradcheck(lost, start)

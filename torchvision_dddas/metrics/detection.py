@@ -1,6 +1,6 @@
 """Boxes against true boxes: precision, recall and F1, and what can be said when only one target is labelled."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,13 +46,22 @@ def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
     return np.array(boxes, float).reshape(-1, 4)
 
 
+def areas(box_px: Any, other_px: Any) -> tuple[Any, Any]:
+    """(...) what two boxes (..., 4) share and what they cover together, px²; broadcast against each other.
+
+    Arrays, or tensors, whose gradients it keeps. The pipeline has a formula of its own, `targets.boxes`: measures share
+    no code with what they measure.
+    """
+    low = box_px[..., :2].clip(min=other_px[..., :2])
+    high = (box_px[..., :2] + box_px[..., 2:]).clip(max=other_px[..., :2] + other_px[..., 2:])
+    common = (high - low).clip(min=0).prod(-1)
+    return common, box_px[..., 2:].prod(-1) + other_px[..., 2:].prod(-1) - common
+
+
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N, M) intersection over union of boxes (N, 4) and (M, 4), x, y, width, height."""
-    a, b = boxes[:, None], others[None]
-    side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    overlap = np.prod(np.maximum(side, 0), axis=-1)
-    union = np.prod(a[..., 2:], axis=-1) + np.prod(b[..., 2:], axis=-1) - overlap
-    return np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
+    common, union = areas(boxes[:, None], others[None])
+    return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
 
 
 def match(found: np.ndarray, truth: np.ndarray, least: float = 0.5) -> Boxes:

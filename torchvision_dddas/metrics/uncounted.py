@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.metrics.detection import iou
+from torchvision_dddas.metrics.detection import areas, iou
 from torchvision_dddas.metrics.matching import EPSILON, LEAST, TrackTable
 from torchvision_dddas.metrics.truth import Truth
 
@@ -41,9 +41,7 @@ def within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
     """(N,) bool: whether more than half of the area of each box (N, 4) lies in one of the regions (M, 4)."""
     if not len(region_px) or not len(box_px):
         return np.zeros(len(box_px), bool)
-    a, b = box_px[:, None], region_px[None]
-    side = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    inside = np.prod(np.maximum(side, 0), axis=-1)
+    inside, _ = areas(box_px[:, None], region_px[None])
     share: np.ndarray = inside / np.maximum(np.prod(box_px[:, 2:], axis=1), EPSILON)[:, None]
     return np.asarray((share > WITHIN + EPSILON).any(axis=1))
 

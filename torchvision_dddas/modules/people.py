@@ -45,13 +45,5 @@ def soft_f(
     return (2 * (counts * right).sum() + nobody * _SPARE) / (found + people + nobody * _SPARE)
 
 
-def overlap(box_px: Float[Tensor, "N 4"], other_px: Float[Tensor, "N 4"]) -> Float[Tensor, " N"]:
-    """Intersection over union of boxes x, y, width, height, row by row."""
-    low = torch.maximum(box_px[:, :2], other_px[:, :2])
-    high = torch.minimum(box_px[:, :2] + box_px[:, 2:], other_px[:, :2] + other_px[:, 2:])
-    both = (high - low).clamp(min=0).prod(1)
-    return both / (box_px[:, 2:].prod(1) + other_px[:, 2:].prod(1) - both).clamp(min=1e-9)
-
-
 _SPARE = 1.0
 """Found in a picture without people: the more there are the worse, and none is right."""

@@ -57,6 +57,9 @@ def stepped(
 
     pixel_variance: px², of the landmarks' pixels. variance: of what telemetry and reports say, in the units of Fix.
     """
+    # The normal equations of `fit_pose`, which this cannot share: there they are of one problem at a time, in NumPy for
+    # the onboard install, with an information matrix that is full once frames are remembered; here of a batch, with a
+    # diagonal one that has a gradient. The tests of `tuning.places` hold loss and slope to those of the hard fit.
     information = problem.known / variance.clamp(min=1e-12)
     weighed = problem.slopes.mT / pixel_variance[:, None]
     pulled = problem.by_turn.mT * information[:, None]

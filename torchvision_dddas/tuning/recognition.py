@@ -17,10 +17,10 @@ from torch import Tensor
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics import uncounted
-from torchvision_dddas.metrics.detection import iou
+from torchvision_dddas.metrics.detection import areas, iou
 from torchvision_dddas.metrics.ranking import SAME, judged
 from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.modules.people import bodies, doubt, overlap, soft_f
+from torchvision_dddas.modules.people import bodies, doubt, soft_f
 from torchvision_dddas.settings import PeopleKnobs, Settings
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.targets import scan
@@ -160,5 +160,6 @@ def _lost(content: Scored, knobs: Mapping[str, Tensor], softness: float) -> Tens
     if content.sure:
         total = total + doubt(content.margin[: content.sure], content.right[: content.sure], values).mean()
     if len(content.true_px):
-        total = total + (1 - overlap(bodies(content.window_px, values), content.true_px)).mean()
+        common, union = areas(bodies(content.window_px, values), content.true_px)
+        total = total + (1 - common / union).mean()
     return total
