@@ -117,6 +117,20 @@ def test_true_links_are_likelier_than_exchanged_ones():
     assert (right < wrong - 0.5).all()
 
 
+def test_margins_cost_most_where_links_are_in_doubt():
+    """Sure links stay all but free, those that could be exchanged cost more; without margins nothing changes."""
+    sure, vague = walkers(2, 6, hide=False), walkers(12, 6, hide=False, scatter=0.4)
+    of = [[unlikeliness(Settings().track, looks, 1.0, m, m).mean() for m in (0.0, 1.0)] for looks in (sure, vague)]
+    assert of[0][1] > of[0][0]
+    assert of[1][1] - of[1][0] > 2 * (of[0][1] - of[0][0])
+    torch.testing.assert_close(unlikeliness(Settings().track, sure, 1.0, 0.0, 0.0).mean(), of[0][0])
+
+
+def test_cold_margins_are_a_hinge_that_is_zero_where_the_true_links_are_best_by_far():
+    looks = walkers(2, 6, hide=False, scatter=0.01)
+    assert unlikeliness(Settings().track, looks, 0.01, 1.0, 1.0).abs().max() < 0.02
+
+
 def test_neither_the_order_of_targets_nor_empty_places_matter():
     looks = walkers()
     wanted = unlikeliness(Settings().track, looks, 1.0)

@@ -202,12 +202,23 @@ def test_what_time_costs_moves_the_bottom() -> None:
     assert charged.settings.difference.threshold == pytest.approx(math.exp(2.5), rel=0.02)
 
 
+def test_a_pull_keeps_knobs_near_where_they_began_and_the_stronger_the_nearer() -> None:
+    plan = Plan(steps=80, rate=0.1)
+    ends = [
+        descend(Bowl(), knobs(), pieces(spread=0.0), replace(plan, pull=pull)).settings.difference.threshold
+        for pull in (0.0, 0.3, 3.0)
+    ]
+    assert 12.0 < ends[2] < ends[1] < ends[0] - 0.1
+
+
 def test_without_examples_there_is_one_line() -> None:
     with pytest.raises(InputError, match="nothing to tune motion on"):
         descend(Bowl(), knobs(), [], QUICK)
 
 
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch": 0}, {"rate": 0.0}, {"watched": 1.0}, {"patience": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"batch": 0}, {"rate": 0.0}, {"watched": 1.0}, {"patience": 0}, {"pull": -1.0}]
+)
 def test_a_plan_that_will_not_do_is_refused(wrong: dict) -> None:
     with pytest.raises(InputError, match="wanted"):
         replace(QUICK, **wrong)

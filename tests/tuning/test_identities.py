@@ -1,5 +1,6 @@
 """Examples of true links from clips, and the family that tunes on them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ import torch
 
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.following import follow_table
 from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.modules.tunable import Knobs
 from torchvision_dddas.settings import Settings
+from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.targets.tracks import Tracker
 from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
@@ -32,6 +35,21 @@ def walk(name: str = "walk", people: int = 4, frames: int = 150, seed: int = 0, 
     table = TrackTable(frame, identity, box_px)
     truth = Truth("boxes", Path(name), {}, {int(f): box_px[frame == f] for f in np.unique(frame)}, table)
     return Clip(name, Path(name), truth=truth if true else None)
+
+
+def seen(clip: Clip, place: Path, false: int = 1, miss: float = 0.1, seed: int = 1) -> Clip:
+    """The clip with public detections: some people missed, boxes that scatter, and false alarms in each frame."""
+    draw = np.random.default_rng(seed)
+    assert clip.truth is not None
+    lines = []
+    for frame, boxes in clip.truth.boxes.items():
+        for x, y, width, height in boxes[draw.uniform(size=len(boxes)) >= miss] + draw.normal(0, 0.5, (1, 4)):
+            lines.append(f"{frame},-1,{x:.2f},{y:.2f},{width:.2f},{height:.2f},{draw.choice([0.8, 0.99, 1.0])}")
+        for x, y in draw.uniform(-200, 700, (false, 2)):
+            lines.append(f"{frame},-1,{x:.2f},{y:.2f},20,50,{draw.choice([0.8, 0.99])}")
+    path = place / f"{clip.name}.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return replace(clip, given=path)
 
 
 def test_a_clip_becomes_stretches_of_its_looks_in_order_each_with_a_loss():
@@ -95,6 +113,69 @@ def test_the_family_is_found_by_its_name_and_takes_the_interval_of_a_study():
     family = family_of("tracking")
     assert isinstance(family, Timed)
     assert family.at(5, "association").examples([walk()], Settings())[0].content.looks["interval"] == 5
+
+
+def test_the_task_says_whether_true_boxes_or_detections_are_learned_from(tmp_path: Path):
+    clip, settings = seen(walk(), tmp_path), Settings()
+    family = Identities()
+    true = family.at(5, "association").examples([clip], settings)[0].content.looks
+    found = family.at(5, "tracking").examples([clip], settings)[0].content.looks
+    assert true["there"].all()
+    assert true["doubt"].max() == 0
+    assert family.at(5, "tracking").measure == "tracking.tracks.idf1"
+    assert found["doubt"].min() > 0
+    assert (found["certain"] <= found["there"]).all()
+    assert (found["begins"] <= found["there"]).all()
+    assert found["certain"].sum() < found["begins"].sum() < found["there"].sum()
+    # Four people who are missed now and then, and one false alarm a look.
+    assert sorted(found["there"].sum(0).tolist())[-5:][0] == 1
+    assert found["there"].sum(1).max() == 5
+
+
+def test_births_and_doubt_of_detections_are_those_of_the_tracker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Doubt is; births are where false alarms have no part in it."""
+    clip, settings, told = seen(walk(people=6, frames=100), tmp_path, false=0), Settings(), []
+    plain = Tracker._sight
+
+    def sight(self, look):
+        told.append((look.frame, plain(self, look)))
+        return plain(self, look)
+
+    monkeypatch.setattr(Tracker, "_sight", sight)
+    (example,) = Identities().at(5, "tracking").examples([clip], settings)
+    assert clip.given is not None
+    for _ in follow_table(read_detections(clip.given), settings, 5):
+        pass
+    # Of a look ahead less is counted: the last of each look is its own.
+    of = dict(told)
+    looks = example.content.looks
+    frames = looks["frame"].astype(int).tolist()
+    assert looks["doubt"].tolist() == pytest.approx([of[frame].doubt for frame in frames])
+    assert looks["births"].tolist() == pytest.approx([of[frame].births for frame in frames])
+
+
+def test_detections_are_wanted_by_name_where_there_are_none(tmp_path: Path):
+    with pytest.raises(InputError, match="walk has no public detections"):
+        Identities().at(5, "tracking").examples([walk()], Settings())
+    settings = Settings().model_copy(update={"track": Settings().track.model_copy(update={"min_score": 1.0})})
+    path = tmp_path / "faint.txt"
+    path.write_text("1,-1,10,10,20,50,0.5\n")
+    with pytest.raises(InputError, match="no box of score 1 or more"):
+        Identities().at(5, "tracking").examples([replace(walk(), given=path)], settings)
+
+
+def test_links_to_false_alarms_are_never_true(tmp_path: Path):
+    """A prior that lets everything be linked costs more where there are false alarms to link."""
+    family, lax = Identities().at(5, "tracking"), Settings()
+    lax = lax.model_copy(update={"track": lax.track.model_copy(update={"prior": 12.0})})
+    losses = []
+    for false in (0, 6):
+        clip = seen(walk(), tmp_path, false)
+        of = [
+            family.loss(Knobs(s, ["track.tail"]).values(), family.examples([clip], s), 1.0) for s in (lax, Settings())
+        ]
+        losses.append((of[0] - of[1]).mean().item())
+    assert losses[1] > losses[0] + 0.1
 
 
 def test_a_wrong_knob_gets_better_by_descending():

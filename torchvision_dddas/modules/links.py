@@ -69,10 +69,15 @@ class _Tracks:
     left: Any
 
 
-def unlikeliness(knobs: TrackKnobs, looks: Looks, softness: float) -> Float[Tensor, "B"]:
+def unlikeliness(
+    knobs: TrackKnobs, looks: Looks, softness: float, missed: float = 0.0, wrong: float = 0.0
+) -> Float[Tensor, "B"]:
     """What the true links lack in likelihood, per box that a link was possible to; at softness 1 in nats.
 
-    knobs: numbers or tensors. softness: temperature of the assignment, above 0.
+    knobs: numbers or tensors. softness: temperature of the assignment, above 0. missed, wrong: margins, in the unit of
+    scores: by so much for each true link that it lacks, and for each other link that it has, an assignment is to be
+    worse than the true one. What is that much better already costs next to nothing, so that what is in doubt counts.
+    Source of the margins: Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
     """
     mine = _for_each(knobs, looks.own)
     size: Any = (looks.size[:, :1], looks.size[:, 1:])
@@ -105,8 +110,10 @@ def unlikeliness(knobs: TrackKnobs, looks: Looks, softness: float) -> Float[Tens
             if compares:
                 score = score + scores_of(likeness[:, look], visible[:, look], knobs)
             true = tracks.alive & there
-            scores.append(score.masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf))
-            told = told + torch.where(true, score.diagonal(dim1=1, dim2=2), 0.0).sum(1)
+            margin = wrong - (wrong + missed) * torch.eye(score.shape[-1]).to(score)
+            rival = score + margin
+            scores.append(rival.masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf))
+            told = told + torch.where(true, score.diagonal(dim1=1, dim2=2) - missed, 0.0).sum(1)
             boxes = boxes + torch.where(tracks.alive.any(1), there.sum(1), 0)
         tracks = _after(tracks, begun, looks, look, sight, mine)
     if not scores:

@@ -148,6 +148,11 @@ class Knobs(nn.Module):
         """Each knob's value with its gradient: numbers without axes, float64."""
         return {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
 
+    def moved(self) -> Tensor:
+        """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient."""
+        ways = [(free - start) ** 2 for free, start in zip(self.free, self._starts, strict=True)]
+        return torch.stack(ways).sum()
+
     def settings(self) -> Settings:
         """The settings with these values, whole and odd ones rounded; knobs that have not moved stay as they were."""
         moved = {

@@ -35,7 +35,9 @@ class Plan:
 
     look_every: steps from one look at the watched examples to the next. patience: looks without a gain that end the
     descent. watched: share of each clip's examples, its last, that nothing is learned from. most_watched: of all clips
-    together. most_s: no step is begun after so many seconds.
+    together. most_s: no step is begun after so many seconds. pull: towards the knobs' values before the first step; a
+    loss is charged half of it times the square of how far each knob is from there, in the rate's units: what few
+    examples say weakly does not move a knob far.
     """
 
     steps: int = 100
@@ -47,6 +49,7 @@ class Plan:
     watched: float = 0.25
     most_watched: int = 32
     most_s: float = math.inf
+    pull: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises InputError for what will not do."""
@@ -57,6 +60,8 @@ class Plan:
             raise InputError(f"the rate is {self.rate:g}; wanted more than 0, at most 10")
         if not 0 <= self.watched <= 0.9:
             raise InputError(f"the share of examples to watch is {self.watched:g}; wanted 0 to 0.9")
+        if not 0 <= self.pull < math.inf:
+            raise InputError(f"the pull is {self.pull:g}; wanted 0 or more")
 
 
 class Cost(Protocol):
@@ -278,7 +283,9 @@ class _Run:
         return total / len(self._watched) + float(self._charge(values))
 
     def _charge(self, values: Mapping[str, Tensor]) -> Tensor:
-        return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
+        """For time, and for what the knobs are away from where they began."""
+        charge = torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
+        return charge + self._plan.pull / 2 * self._knobs.moved() if self._plan.pull else charge
 
     def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
         self.failed = f"{self._unfit(batch, values, softness) or 'the cost is no number'}, at step {number}"

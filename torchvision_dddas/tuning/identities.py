@@ -1,8 +1,9 @@
 """Identities: how unlikely the true links are by the scores that the tracker gives them.
 
 Examples are stretches of a clip, some tens of looks each, prepared as `dddas track` would see them: the pace, the rate
-of births and the likenesses are those of the looks so far, the camera's motion is registered. True boxes are taken as
-the task `association` takes them.
+of births and the likenesses are those of the looks so far, the camera's motion is registered. For the task
+`association` they are the true boxes; for `tracking` the clip's public detections: who is missed has none, who is seen
+has the box that was found, and a false alarm is a target of its own that is seen once, so that any link to it is wrong.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,14 +17,17 @@ from torch import Tensor
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.metrics.matching import TrackTable
+from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.modules.links import Looks, unlikeliness
 from torchvision_dddas.settings import Settings, TrackKnobs
+from torchvision_dddas.sources.detections import DetectionTable, read_detections
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.targets.kalman import carried_boxes
 from torchvision_dddas.targets.likeness import blended, likeness, visible_share
 from torchvision_dddas.targets.links import births_of, near_border
 from torchvision_dddas.targets.pace import Pace
 from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.tuning.owners import Owned, owned
 
 LOOKS = 25
 """Looks of a stretch: with the memory of 125 frames all that counts at an interval of 5."""
@@ -47,20 +51,44 @@ class Identities:
     measure: str = "association.tracks.idf1"
     softness: tuple[float, float] = (1.0, 1.0)
     """A likelihood is one at softness 1 alone: colder, it asks for the best assignment whatever the others are."""
+    missed: float = 0.0
+    """Margin for each true link that an assignment lacks, in the unit of scores."""
+    wrong: float = 0.0
+    """The same for each link that it has and the truth has not."""
 
     def at(self, interval_frames: int, task: Task) -> "Identities":
-        """The same for a study's interval; see `family.Timed`."""
-        return replace(self, interval=interval_frames)
+        """The same for a study's interval, and for the boxes that its task follows; see `family.Timed`."""
+        task = "tracking" if task == "tracking" else "association"
+        return replace(self, interval=interval_frames, task=task, measure=f"{task}.tracks.idf1")
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """Stretches of the clips' true tracks. See `family.Family`."""
+        """Stretches of the clips' true tracks, by true boxes or by detections. See `family.Family`."""
         found = []
         for clip in clips:
             if clip.truth is None or clip.truth.tracks is None or not len(clip.truth.tracks.frame):
                 raise InputError(f"{clip.name} has no true identities, which tuning the tracker needs; leave it out")
-            for stretch in _stretches(clip, clip.truth.tracks.every(self.interval), settings, self.interval):
+            for stretch in _stretches(clip, self._boxes(clip, clip.truth, settings), settings, self.interval):
                 found.append(Example(clip.name, int(stretch.looks["frame"][0]), stretch))
                 tick()
+        return found
+
+    def _boxes(self, clip: Clip, truth: Truth, settings: Settings) -> Owned:
+        """Whose boxes are followed. Raises InputError where detections are wanted and the clip has none."""
+        assert truth.tracks is not None, "asked for where there is truth"
+        if self.task == "association":
+            table = truth.tracks.every(self.interval)
+            return Owned(table, np.ones(len(table.frame)), _extent(table))
+        if clip.given is None:
+            raise InputError(
+                f"{clip.name} has no public detections, which tuning for the task 'tracking' needs; leave it out, or "
+                "tune for true boxes: --measure association.tracks.idf1"
+            )
+        found = owned(read_detections(clip.given), truth, self.interval, settings.track.min_score)
+        if not len(found.score):
+            raise InputError(
+                f"{clip.given} has no box of score {settings.track.min_score:g} or more on frames 1, "
+                f"{1 + self.interval}, {1 + 2 * self.interval}, ...; lower track.min_score, or leave {clip.name} out"
+            )
         return found
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
@@ -69,7 +97,9 @@ class Identities:
         tuned = {name.removeprefix("track."): value for name, value in knobs.items() if name.startswith("track.")}
         track = TrackKnobs.model_construct(**(dict(settings.track) | tuned))
         device = next(iter(knobs.values())).device
-        return unlikeliness(track, together([example.content for example in batch], device), softness)
+        return unlikeliness(
+            track, together([example.content for example in batch], device), softness, self.missed, self.wrong
+        )
 
 
 def family() -> Identities:
@@ -102,18 +132,18 @@ def _filled(value: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     return np.pad(value, wider, mode="edge")
 
 
-def _stretches(clip: Clip, table: TrackTable, settings: Settings, interval: int) -> Iterator[Stretch]:
+def _stretches(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Iterator[Stretch]:
     """The clip in pieces of LOOKS looks, the last one maybe shorter; none of a single look."""
-    looks = list(_looks(clip, table, settings, interval))
+    looks = list(_looks(clip, boxes, settings, interval))
     for start in range(0, len(looks), LOOKS):
         piece = looks[start : start + LOOKS]
         if len(piece) > 1:
-            yield Stretch(_stacked(piece), settings)
+            yield Stretch(_stacked(piece, settings.track.birth_score), settings)
 
 
 @dataclass
 class _Look:
-    """One look at the true boxes, and what the tracker knows by then."""
+    """One look at the boxes, and what the tracker knows by then."""
 
     frame: int
     identity: np.ndarray
@@ -124,40 +154,45 @@ class _Look:
     fixed: dict[str, Any]
 
 
-def _looks(clip: Clip, table: TrackTable, settings: Settings, interval: int) -> Iterator[_Look]:
+def _looks(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Iterator[_Look]:
     pace, before = Pace(settings.track.speed), None
-    size = _size(clip, table)
-    seen, births, known = 0, 0, set[int]()
-    for number, identity, box_px, step, signature in _shown(clip, table, settings, interval):
+    size = _size(clip, boxes)
+    seen, doubtful, births, known = 0, 0, 0, set[int]()
+    for number, identity, box_px, step, signature in _shown(clip, boxes.table, settings, interval):
+        score = boxes.score[boxes.table.frame == number]
         if before is not None:
             pace.add(before if step is None else carried_boxes(before, step), box_px, interval)
         seen += len(box_px)
+        doubtful += int((score < 1).sum())
+        doubt = doubtful / max(seen, 1)
         fixed = {
             "interval": float(interval),
             "size": np.array(size, float),
             "usual": pace.usual,
             "known": float(pace.known),
-            "births": births_of(births, seen, 0.0, interval),
-            "doubt": 0.0,
-            "own": False,
+            "births": births_of(births, seen, doubt, interval),
+            "doubt": doubt,
+            "own": boxes.own,
         }
-        yield _Look(number, identity, box_px, np.ones(len(box_px)), step, signature, fixed)
-        inside = ~near_border(box_px, size)
-        births += sum(one not in known for one in identity[inside].tolist()) if before is not None else 0
-        known |= set(identity.tolist())
+        yield _Look(number, identity, box_px, score, step, signature, fixed)
+        begun = (score >= settings.track.birth_score) & ~np.isin(identity, list(known))
+        births += int((begun & ~near_border(box_px, size)).sum()) if before is not None else 0
+        known |= set(identity[begun].tolist())
         before = box_px
 
 
-def _size(clip: Clip, table: TrackTable) -> tuple[float, float]:
-    from torchvision_dddas.sources.detections import DetectionTable
+def _size(clip: Clip, boxes: Owned) -> tuple[float, float]:
     from torchvision_dddas.studies.stages import opened
 
     if clip.pictures:
         width, height = opened(clip).size
         return float(width), float(height)
+    return boxes.size if boxes.size is not None else (1e6, 1e6)
+
+
+def _extent(table: TrackTable) -> tuple[float, float] | None:
     ones = np.ones(len(table.frame))
-    found = DetectionTable(clip.name, table.frame, np.asarray(table.box_px, float), ones, np.arange(len(ones))).extent
-    return found if found is not None else (1e6, 1e6)
+    return DetectionTable("", table.frame, np.asarray(table.box_px, float), ones, np.arange(len(ones))).extent
 
 
 def _shown(
@@ -187,16 +222,16 @@ def _shown(
         yield frame.number, identity, box_px, step, strips(frame.image, box_px) if looks_matter else None
 
 
-def _stacked(looks: Sequence[_Look]) -> dict[str, np.ndarray]:
-    """The fields of `Looks`, box n always target n."""
+def _stacked(looks: Sequence[_Look], birth_score: float) -> dict[str, np.ndarray]:
+    """The fields of `Looks`, box n always target n. birth_score: of a box that may begin a track."""
     names = np.unique(np.concatenate([look.identity for look in looks]))
     shape = (len(looks), len(names))
-    box_px, there, visible = np.ones((*shape, 4)), np.zeros(shape, bool), np.ones(shape)
+    box_px, visible, score = np.ones((*shape, 4)), np.ones(shape), np.full(shape, -1.0)
     alike = np.full((*shape, len(names)), np.nan)
     signature, hits = None, np.zeros(len(names), np.int64)
     for t, look in enumerate(looks):
         here = np.searchsorted(names, look.identity)
-        box_px[t, here], there[t, here] = look.box_px, True
+        box_px[t, here], score[t, here] = look.box_px, look.score
         visible[t, here] = visible_share(look.box_px)
         if look.signature is not None and len(here):
             if signature is None:
@@ -211,9 +246,9 @@ def _stacked(looks: Sequence[_Look]) -> dict[str, np.ndarray]:
         **once,
         "frame": np.array([look.frame for look in looks], float),
         "box_px": box_px,
-        "there": there,
-        "certain": there,
-        "begins": there,
+        "there": score >= 0,
+        "certain": score >= 1,
+        "begins": (score >= 0) & (score >= birth_score),
         "step": np.stack([np.eye(3) if look.step is None else look.step for look in looks]),
         "likeness": alike,
         "visible": visible,
