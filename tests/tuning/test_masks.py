@@ -92,6 +92,18 @@ def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
         Masks().examples([clip], with_knobs(SETTINGS, {"difference.halved": True}))
 
 
+def test_of_a_clip_in_which_nothing_moves_whatever_is_found_is_false(clip: Clip) -> None:
+    still = replace(clip, name="still", truth=None, still=True)
+    family = Masks(after=False)
+    examples = family.examples([still], SETTINGS)
+    assert [example.clip for example in examples] == ["still"] * 9
+    assert not any(bool(example.content.truth.any()) for example in examples)
+    calm, alarmed = (
+        family.loss({"difference.threshold": torch.tensor(at)}, examples, 0.02).mean() for at in (60.0, 4.0)
+    )
+    assert float(calm) < 0.01 and float(alarmed) > 0.9
+
+
 def test_unlabelled_pixels_are_known_to_be_so(clip: Clip, examples: list[Example]) -> None:
     assert clip.truth is not None
     labels = labels_of(clip.truth, examples[0].frame)

@@ -1,7 +1,7 @@
 """The knobs of motion: masks of labelled frames, and how far soft ones are from them."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import cast
@@ -27,6 +27,8 @@ Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 # A soft mask reaches this many softnesses below the threshold: there it is 0.05.
 _REACH = 3.0
+# Of a clip in which nothing moves: so many frames are enough to tell what is false.
+_STILL = 12
 # Of the threshold: where it is tried what the hard steps after the hulls do with more than is drawn at the settings'.
 _FREER = 0.6
 
@@ -80,10 +82,10 @@ class Masks:
         return Masks(LOSSES[loss_name], self.passing, self.after)
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """The frames with masks. Raises InputError for a clip without any."""
+        """The frames with masks, and some of clips in which nothing moves. Raises InputError for other clips."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
-        bare = [clip.name for clip in clips if clip.truth is None or not clip.truth.masks]
+        bare = [clip.name for clip in clips if not clip.still and (clip.truth is None or not clip.truth.masks)]
         if bare:  # told before any clip is computed
             names = ", ".join(bare)
             has = "have" if len(bare) > 1 else "has"
@@ -145,16 +147,13 @@ def together(frames: Sequence[Labelled], device: torch.device) -> Labelled:
 
 
 def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[Example]:
-    truth = clip.truth
-    assert truth is not None, "asked for clips with masks alone"
+    wanted, labels_at = _true(clip)
     found = []
     # What would become of more than is drawn now: without it, whatever a lower threshold adds would seem to stay.
     freer = with_knobs(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
-    probes: Iterable[Recorded | None] = recorded(clip, freer, set(truth.masks)) if after else repeat(None)
-    for one, probe in zip(recorded(clip, settings, set(truth.masks)), probes, strict=False):
-        labels = labels_of(truth, one.frame)
-        if labels.shape != one.mask.shape:
-            raise InputError(f"{truth.masks[one.frame]} is {_size(labels)}, the frame itself {_size(one.mask)}")
+    probes: Iterable[Recorded | None] = recorded(clip, freer, wanted) if after else repeat(None)
+    for one, probe in zip(recorded(clip, settings, wanted), probes, strict=False):
+        labels = labels_at(one)
         # A frame without a window shows nothing, whatever the knobs.
         if one.window is not None and (labels >= 0).any():
             differences = differences_of(one.window, settings)
@@ -166,6 +165,24 @@ def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[E
     if not found:
         raise InputError(f"no labelled frame of {clip.name} hangs together with its neighbours: nothing to tune on")
     return found
+
+
+def _true(clip: Clip) -> tuple[Set[int], Callable[[Recorded], np.ndarray]]:
+    """Which frames of a clip are learned from, and their labels: 0 nothing moves, -1 unknown."""
+    truth = clip.truth
+    if truth is None or not truth.masks:
+        assert clip.still, "other clips are refused before"
+        every = max((clip.frames or len(clip.pictures)) // _STILL, 1)
+        return set(range(1, _STILL * every + 1, every)), lambda one: np.zeros(one.mask.shape, np.int32)
+    masks = truth.masks
+
+    def labels_at(one: Recorded) -> np.ndarray:
+        labels = labels_of(truth, one.frame)
+        if labels.shape != one.mask.shape:
+            raise InputError(f"{masks[one.frame]} is {_size(labels)}, the frame itself {_size(one.mask)}")
+        return labels
+
+    return set(masks), labels_at
 
 
 def _labelled(differences: Differences, labels: np.ndarray, settings: Settings) -> Labelled:
