@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import Settings, with_knobs
 
-Family = Literal["motion", "tracking", "people", "location"]
+Family = Literal["motion", "registration", "tracking", "people", "location"]
 Rounding = Literal["none", "whole", "odd"]
 
 # A value on the very edge of its range has no slope; it starts this share of the range away from it.
@@ -97,6 +97,8 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "blur_px", rounding="odd"),
     **_from_settings("motion", "morphology", "erode_px close_px", rounding="whole"),
     **_from_settings("motion", "gates", "min_area_px", rounding="whole"),
+    **_from_settings("registration", "registration", "ransac_px"),
+    **_from_settings("registration", "registration", "forward_backward_px", offset=0.01),
     **_from_settings("tracking", "track", "speed agility scatter size_scatter"),
     **_from_settings("tracking", "track", "tail upright rest_drift"),
     **_from_settings("tracking", "track", "births appearance_weight", offset=0.1),

@@ -21,6 +21,7 @@ Tick = Callable[[], object]
 
 FAMILIES: Mapping[str, str] = {
     "motion": "masks",
+    "registration": "registering",
     "tracking": "identities",
     "people": "recognition",
     "location": "places",

@@ -29,6 +29,7 @@ _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
 # Inliers of the refits, in RANSAC's tolerance. On half pictures 0.08 px at the corners with or without the rest.
 _TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
+LAST_TOLERANCE = _TOLERANCES[-1]
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def _step(
     start, end = start[tracked], end[tracked]
     if len(start) < 4:
         return judged(np.eye(3), len(start), 0, np.inf, size, knobs), end
-    later_from_earlier = _fit(start, end, knobs)
+    later_from_earlier = fit(start, end, knobs)
     miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
     inliers = miss < knobs.ransac_px
     error = float(np.median(miss[inliers])) if inliers.any() else np.inf
@@ -145,6 +146,21 @@ def _track(
     earlier: np.ndarray, later: np.ndarray, start: np.ndarray, knobs: RegistrationKnobs, predicted: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the points went, (N, 2) float32, and which of them were followed, (N,) bool."""
+    end, found, missed_px = there_and_back(earlier, later, start, knobs, predicted)
+    return end, found & (missed_px <= knobs.forward_backward_px)
+
+
+def there_and_back(
+    earlier: np.ndarray,
+    later: np.ndarray,
+    start: np.ndarray,
+    knobs: RegistrationKnobs,
+    predicted: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the points went, (N, 2) float32, which were found there and on the way back, and by how much that missed.
+
+    missed_px: (N,) of the start; 0 where the way back is left out. predicted: (3, 3), where to look first.
+    """
     levels, steps, side, flags = knobs.levels, knobs.iterations, knobs.window_px, 0
     guess: Any = None  # OpenCV's stubs know no None here
     if predicted is not None:
@@ -155,18 +171,19 @@ def _track(
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, knobs.epsilon_px)
     search: dict[str, Any] = {"winSize": (side, side), "maxLevel": levels, "criteria": criteria, "flags": flags}
     end, found, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess, **search)
-    tracked = found.ravel() == 1
+    tracked, missed_px = found.ravel() == 1, np.zeros(len(start))
     if knobs.forward_backward_px > 0:
         # The way back is searched from where it should end, at full resolution: a true match stays there. From nothing
         # it costs three times as much and moves the homography by 0.03 px at most.
         search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
         back, found, _ = cv2.calcOpticalFlowPyrLK(later, earlier, end, start.copy(), **search)
-        tracked &= (found.ravel() == 1) & (np.linalg.norm(back - start, axis=1) <= knobs.forward_backward_px)
+        tracked &= found.ravel() == 1
+        missed_px = np.linalg.norm(back - start, axis=1)
     height, width = later.shape
-    return end, tracked & ((end >= 0) & (end <= (width - 1, height - 1))).all(axis=1)
+    return end, tracked & ((end >= 0) & (end <= (width - 1, height - 1))).all(axis=1), missed_px
 
 
-def _fit(start: np.ndarray, end: np.ndarray, knobs: RegistrationKnobs) -> np.ndarray:
+def fit(start: np.ndarray, end: np.ndarray, knobs: RegistrationKnobs) -> np.ndarray:
     """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy."""
     affine, model, refit = knobs.model == "affine", None, None
     if affine:

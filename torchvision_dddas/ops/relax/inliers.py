@@ -24,7 +24,7 @@ def weights(
 def fitted(
     earlier_px: Float[Tensor, "B N 2"],
     later_px: Float[Tensor, "B N 2"],
-    valid: Bool[Tensor, "B N"],
+    valid: Bool[Tensor, "B N"] | Float[Tensor, "B N"],
     guess: Float[Tensor, "B 3 3"],
     tolerance_px: float | Tensor,
     fit: Fit,
@@ -32,8 +32,8 @@ def fitted(
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B"]]:
     """later_from_earlier by least squares over the inliers of a guess, and their share of the valid pairs.
 
-    fit: as `homography.fit` takes pairs and weights. The gradient reaches the points and the tolerance; that of the
-    guess is left out, for a refit forgets what it began with.
+    valid: whether a pair counts, or how much. fit: as `homography.fit` takes pairs and weights. The gradient reaches
+    the points, the tolerance and what counts; that of the guess is left out, for a refit forgets what it began with.
     """
     weight = weights(transfer_error(guess.detach(), earlier_px, later_px), tolerance_px, softness) * valid
     matrix, solved = fit(earlier_px, later_px, weight)
