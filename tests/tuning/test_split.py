@@ -1,7 +1,7 @@
 """Which examples are learned from and which are watched."""
 
 from tests.tuning.toys import pieces
-from torchvision_dddas.tuning.split import batch_of, parted
+from torchvision_dddas.tuning.split import batch_of, parted, shares
 
 
 def test_the_last_part_of_each_clip_is_watched_and_never_learned_from() -> None:
@@ -22,10 +22,21 @@ def test_of_many_some_are_watched_from_all_over() -> None:
 
 
 def test_every_example_has_its_turn_before_any_has_another() -> None:
-    taken = [i for step in range(5) for i in batch_of(step, 10, 4, seed=3)]
+    taken = [i for step in range(5) for i in batch_of(step, ["one"] * 10, 4, seed=3)]
     assert sorted(taken[:10]) == sorted(taken[10:]) == list(range(10))
     assert taken[:10] != taken[10:]
 
 
 def test_a_batch_is_no_larger_than_what_there_is() -> None:
-    assert sorted(batch_of(7, 3, 8, seed=0)) == [0, 1, 2]
+    assert sorted(batch_of(7, ["one", "two", "one"], 8, seed=0)) == [0, 1, 2]
+
+
+def test_a_clip_with_few_labelled_frames_has_the_say_of_one_with_many() -> None:
+    clips = ["long"] * 9 + ["short"] * 2
+    taken = [i for step in range(9) for i in batch_of(step, clips, 2, seed=0)]
+    assert sorted(taken[:18]) == [*range(9), *[9] * 4, *[10] * 5] or sorted(taken[:18]) == [
+        *range(9),
+        *[9] * 5,
+        *[10] * 4,
+    ]
+    assert [round(share, 3) for share in shares(clips)] == [0.056] * 9 + [0.25] * 2

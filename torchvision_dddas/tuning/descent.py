@@ -20,7 +20,7 @@ from torchvision_dddas.settings import Settings
 from torchvision_dddas.tuning import checkpoint
 from torchvision_dddas.tuning.blame import blamed
 from torchvision_dddas.tuning.family import Example, Family
-from torchvision_dddas.tuning.split import batch_of, parted
+from torchvision_dddas.tuning.split import batch_of, parted, shares
 
 FADED = 0.1
 """Of the rate, at the last step."""
@@ -160,6 +160,7 @@ class _Run:
     ) -> None:
         self._family, self._knobs, self._plan, self._cost = family, knobs, plan, cost
         self._learned, self._watched = parted(examples, plan.watched, plan.most_watched)
+        self._clips = [example.clip for example in self._learned]
         self._adam = torch.optim.Adam(knobs.parameters(), lr=plan.rate, betas=(0.9, 0.99))
         self._moved: set[str] = set()
         self._best: dict[str, Tensor] = {}
@@ -179,7 +180,7 @@ class _Run:
         """One step; None where it could not be taken."""
         number = self.history[-1].step + 1
         softness = self._softness(number)
-        batch = [self._learned[i] for i in batch_of(number - 1, len(self._learned), self._plan.batch, self._plan.seed)]
+        batch = [self._learned[i] for i in batch_of(number - 1, self._clips, self._plan.batch, self._plan.seed)]
         values = self._knobs.values()
         for value in values.values():
             if value.requires_grad:
@@ -276,11 +277,13 @@ class _Run:
             self.ended = f"no gain on the watched examples since step {self._best_step}"
 
     def _mean(self, values: Mapping[str, Tensor]) -> float:
-        """The mean loss of the watched examples, as hard as at the last step, with the cost."""
-        size = self._plan.batch
-        parts = [self._watched[i : i + size] for i in range(0, len(self._watched), size)]
-        total = math.fsum(float(self._family.loss(values, part, self._hardest).sum()) for part in parts)
-        return total / len(self._watched) + float(self._charge(values))
+        """The mean loss of the watched examples, every clip with the same say, as hard as at the last step, charged."""
+        size, total = self._plan.batch, 0.0
+        share = shares([example.clip for example in self._watched])
+        for i in range(0, len(self._watched), size):
+            losses = self._family.loss(values, self._watched[i : i + size], self._hardest)
+            total += math.fsum(loss * part for loss, part in zip(losses.tolist(), share[i : i + size], strict=True))
+        return total + float(self._charge(values))
 
     def _charge(self, values: Mapping[str, Tensor]) -> Tensor:
         """For time, and for what the knobs are away from where they began."""

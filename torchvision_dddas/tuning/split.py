@@ -1,5 +1,6 @@
 """Which examples a step learns from, and which are only watched."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import torch
@@ -27,24 +28,47 @@ def parted(examples: Sequence[Example], watched: float, most: int) -> tuple[list
     return learned, kept
 
 
-def batch_of(step: int, count: int, batch: int, seed: int) -> list[int]:
-    """Which of `count` examples a step takes, from step 0: all in an order of chance, then all in another.
+def batch_of(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
+    """Which examples a step takes, from step 0; clips: of which clip each example is.
 
-    It depends on nothing else, so that a descent can be taken up at any step.
+    Every clip has the same say, whatever number of its frames is labelled: all examples come in an order of chance,
+    those of clips with fewer several times, then all in another order. It depends on nothing else, so that a descent
+    can be taken up at any step.
     """
-    batch = min(batch, count)
+    batch = min(batch, len(clips))
+    mine: dict[str, list[int]] = {}
+    for place, clip in enumerate(clips):
+        mine.setdefault(clip, []).append(place)
+    count = len(mine) * max(len(places) for places in mine.values())
     first = step * batch
     orders: dict[int, list[int]] = {}
     found = []
     for place in range(first, first + batch):
         turn, here = divmod(place, count)
         if turn not in orders:
-            orders[turn] = _order(count, seed, turn)
+            orders[turn] = _order(list(mine.values()), seed, turn)
         found.append(orders[turn][here])
     return found
 
 
-def _order(count: int, seed: int, turn: int) -> list[int]:
+def shares(clips: Sequence[str]) -> list[float]:
+    """What each example counts in a mean of which every clip has the same share; clips: of which clip each is."""
+    count = Counter(clips)
+    return [1 / (len(count) * count[clip]) for clip in clips]
+
+
+def _order(clips: Sequence[Sequence[int]], seed: int, turn: int) -> list[int]:
+    """A turn: as many examples of each clip as the largest has."""
     generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
+    most = max(len(places) for places in clips)
+    drawn = [
+        places[i]
+        for places in clips
+        for i in [i for _ in range(-(-most // len(places))) for i in _shuffled(len(places), generator)][:most]
+    ]
+    return [drawn[i] for i in _shuffled(len(drawn), generator)]
+
+
+def _shuffled(count: int, generator: torch.Generator) -> list[int]:
     order: list[int] = torch.randperm(count, generator=generator).tolist()
     return order
