@@ -99,6 +99,16 @@ def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tune
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
+def test_a_pull_holds_the_knob_where_it_began(clips, tuned, tmp_path) -> None:
+    result = asked(clips, *ASKED, "--clips", "one", "--pull", "100", "--out", str(tmp_path))
+    assert result.exit_code == 0, result.output
+    held, free = (json.loads((out / "run.json").read_text())["history"] for out in (tmp_path, tuned[0]))
+    moved = [abs(steps[-1]["knobs"][THRESHOLD] - steps[0]["knobs"][THRESHOLD]) for steps in (held, free)]
+    assert moved[0] < moved[1] / 2
+    wrong = asked(clips, *ASKED, "--pull", "-1", "--out", str(tmp_path / "wrong"))
+    assert wrong.exit_code == 2 and "the pull is -1; wanted 0 or more" in wrong.output
+
+
 def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_path, monkeypatch) -> None:
     calls = list[float]()
 

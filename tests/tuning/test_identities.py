@@ -178,6 +178,20 @@ def test_links_to_false_alarms_are_never_true(tmp_path: Path):
     assert losses[1] > losses[0] + 0.1
 
 
+def test_a_true_link_to_a_detection_is_asked_for_with_a_margin(tmp_path: Path):
+    """What is sure anyway has no slope; without a margin false alarms close the gate, with it they do so less."""
+    settings, clip = Settings(), seen(walk(), tmp_path, 6)
+    family = Identities().at(5, "tracking")
+    slopes = []
+    for one in (replace(family, missed=0.0), family):
+        knobs = Knobs(settings, ["track.prior"])
+        one.loss(knobs.values(), one.examples([clip], settings), 1.0).mean().backward()
+        slopes.append(knobs.free[0].grad.item())
+    assert family.missed > 0
+    assert Identities().at(5, "association").missed == 0
+    assert slopes[1] < slopes[0] - 0.01
+
+
 def test_a_wrong_knob_gets_better_by_descending():
     settings = Settings().model_copy(update={"track": Settings().track.model_copy(update={"scatter": 0.5})})
     family = Identities(interval=5)

@@ -56,6 +56,10 @@ def tune(
     ] = False,
     batch: Annotated[int, typer.Option(metavar="N", help="Examples of a step.")] = 8,
     rate: Annotated[float, typer.Option(help="Of a step: 0.05 is about 5 % of a knob.")] = 0.05,
+    pull: Annotated[
+        float,
+        typer.Option(help="To where the knobs began, 0.1 or so where examples are few: a factor e costs half of it."),
+    ] = 0.0,
     patience: Annotated[int, typer.Option(metavar="N", help="Looks, one every 5 steps, without a gain.")] = 10,
     minutes: Annotated[float | None, typer.Option(help="No step is begun after so many.")] = None,
     device: Annotated[str, typer.Option(help="Where the steps are computed: cpu, cuda, cuda:1.")] = "cpu",
@@ -93,7 +97,7 @@ def tune(
     if cost is not None and not 0 <= cost < float("inf"):
         raise InputError(f"--cost is {cost:g}; wanted 0 or more: the loss that a frame of twice the time is worth")
     longest_s = float("inf") if minutes is None else 60 * minutes
-    plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s)
+    plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull)
     spec = asked(study, config, set_ or [], backend and backend.value, None)
     # The settings are read again for the figures before: tuned.toml may not have taken their place by then.
     read = [study, *([Path(spec.config)] if spec.config else [])]
