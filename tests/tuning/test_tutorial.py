@@ -5,9 +5,13 @@ import runpy
 from importlib import import_module
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from tests.tuning.test_colours import scene
 from torchvision_dddas import demo
+from torchvision_dddas.sources.colours import read_colours
 from torchvision_dddas.tuning import descent
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -23,8 +27,28 @@ def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, c
     assert "F on the clips tuned on: " in told and "F on the clips held out: " in told
 
 
+def code_of(heading: str) -> str:
+    """The lines of Python under a heading of the text."""
+    section = (DOCS / "tuning.md").read_text().partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    (code,) = re.findall(r"^```python\n(.+?)^```", section, re.M | re.S)
+    return code
+
+
+def test_the_lines_on_colours_write_a_file_that_is_read_again(tmp_path, monkeypatch) -> None:
+    for name in ("pictures", "labels"):
+        (tmp_path / name).mkdir()
+    for seed in range(2):
+        picture, labels = scene(seed)
+        cv2.imwrite(str(tmp_path / "pictures" / f"{seed}.png"), picture)
+        cv2.imwrite(str(tmp_path / "labels" / f"{seed}.png"), labels.astype(np.uint8))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "few.py").write_text(code_of("Colours of landmarks"))
+    runpy.run_path("few.py")
+    assert read_colours("colours.toml").names == ("red", "blue")
+
+
 def test_the_ten_lines_of_the_text_run_as_they_are(tmp_path, monkeypatch, capsys) -> None:
-    (code,) = re.findall(r"^```python\n(.+?)^```", (DOCS / "tuning.md").read_text(), re.M | re.S)
+    code = code_of("As a library")
     assert len([line for line in code.splitlines() if line]) <= 10
     for seed, name in enumerate(("one", "held")):
         demo.film_into(tmp_path / "clips" / name, seed, frames=6, size=(160, 120))

@@ -1,4 +1,8 @@
-"""A motion history that forgets softly: stamps fade around the duration, and half a silhouette is half a stamp."""
+"""A motion history that forgets softly: stamps fade around the duration, and half a silhouette is half a stamp.
+
+For losses of one's own on silhouettes over time; no family of `tuning` takes it. The pipeline's history parts blobs, by
+counting, and tells headings: a mask has no slope by how long it lasts.
+"""
 
 from jaxtyping import Float
 from torch import Tensor
