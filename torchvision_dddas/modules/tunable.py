@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.settings import Settings, with_knobs
 
-Family = Literal["motion", "registration", "tracking", "people", "location"]
+Family = Literal["motion", "registration", "tracking", "paper", "people", "location"]
 Rounding = Literal["none", "whole", "odd"]
 
 # A value on the very edge of its range has no slope; it starts this share of the range away from it.
@@ -104,6 +104,8 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("tracking", "track", "births appearance_weight", offset=0.1),
     **_from_settings("tracking", "track", "rest_price missed border left", offset=0.1),
     **_from_settings("tracking", "track", "prior appearance_offset", log=False),
+    **_from_settings("paper", "paper", "weight lowest_dispersion", log=False),
+    **_from_settings("paper", "paper", "threshold location_cut appearance_cut", offset=0.05),
     **_from_settings("people", "people", "threshold probability_even height_share width_share feet_share", log=False),
     **_from_settings("people", "people", "probability_slope"),
     **_from_settings("location", "ground", "body_height_sigma_m height_sigma feet_sigma", offset=1e-3),

@@ -13,11 +13,26 @@ def clusters(dissimilarity: Float[np.ndarray, "N N"], cut: float) -> Int[np.ndar
     """A number for each target: average linkage, the tree cut at a dissimilarity (eq. 10 and G)."""
     if len(dissimilarity) < 2:
         return np.ones(len(dissimilarity), np.int64)
-    from scipy.cluster.hierarchy import fcluster, linkage  # here, as only the source's association needs them
+    from scipy.cluster.hierarchy import fcluster  # here, as only the source's association needs it
+
+    return fcluster(_tree(dissimilarity), cut, "distance").astype(np.int64)
+
+
+def joined_at(dissimilarity: Float[np.ndarray, "N N"]) -> Float[np.ndarray, "N N"]:
+    """The cut from which each two targets are in one of `clusters`: what is within a cut of a target is its cluster."""
+    if len(dissimilarity) < 2:
+        return np.zeros_like(dissimilarity)
+    from scipy.cluster.hierarchy import cophenet
     from scipy.spatial.distance import squareform
 
-    tree = linkage(squareform(dissimilarity, checks=False), "average")
-    return fcluster(tree, cut, "distance").astype(np.int64)
+    return np.asarray(squareform(cophenet(_tree(dissimilarity))))
+
+
+def _tree(dissimilarity: Float[np.ndarray, "N N"]) -> np.ndarray:
+    from scipy.cluster.hierarchy import linkage
+    from scipy.spatial.distance import squareform
+
+    return np.asarray(linkage(squareform(dissimilarity, checks=False), "average"))
 
 
 def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
@@ -30,16 +45,26 @@ def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
 
 def dispersion(feature: Float[np.ndarray, "N D"], cut: float) -> float:
     """Ndm of a frame's targets by the Jaccard dissimilarity of a feature."""
+    return normalized_entropy(clusters(dissimilarity(feature), cut))
+
+
+def dissimilarity(feature: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N N"]:
+    """1 - S of each two targets of a frame, 0 of a target to itself."""
     apart = 1 - similarity(feature, feature)
     np.fill_diagonal(apart, 0.0)
-    return normalized_entropy(clusters(apart, cut))
+    return apart
 
 
 def of_window(of_frames: Sequence[float], counts: Sequence[int], knobs: PaperKnobs) -> float:
     """The dispersion that speaks for a window, newest frame first, by the reading that `dispersion_of` names."""
+    return min(of_frames[: speaking(counts, knobs)])
+
+
+def speaking(counts: Sequence[int], knobs: PaperKnobs) -> int:
+    """How many frames of a window, from the newest on, have a say: the smallest of their dispersions counts."""
     differ = len(set(counts)) > 1
     smallest = knobs.dispersion_of == "smallest" or (knobs.dispersion_of == "smallest_if_counts_differ" and differ)
-    return min(of_frames) if smallest else of_frames[0]
+    return len(counts) if smallest else 1
 
 
 def location_weight(location: float, appearance: Callable[[], float], lowest: float) -> tuple[float, float | None]:

@@ -4,6 +4,8 @@ A target that no triplet holds stays alone: it takes the dummy, index 0, on both
 dummy is worth nothing, and the source's problem is to choose triplets that share no target and gain the most.
 """
 
+from typing import Any
+
 import numpy as np
 
 from torchvision_dddas.errors import InputError
@@ -33,6 +35,11 @@ def gain_over_alone(tensor: Float[np.ndarray, "N1 M1 L1"]) -> Float[np.ndarray, 
     gain -= first[:, None, None]
     gain[0, 0, 0] = 0.0
     return gain
+
+
+def pair_gain_over_alone(score: Any) -> Any:
+    """What each pair scores above both left with the dummy: (..., N + 1, M + 1) -> (..., N, M), arrays or tensors."""
+    return score[..., 1:, 1:] - score[..., 1:, :1] - score[..., :1, 1:]
 
 
 def with_the_rest_alone(chosen: Int[np.ndarray, "C 3"], shape: tuple[int, ...]) -> Int[np.ndarray, "Z 3"]:

@@ -15,6 +15,7 @@ from torchvision_dddas.settings import PaperKnobs, Settings
 from torchvision_dddas.shapes import Float, Int
 from torchvision_dddas.targets import assignment, jaccard, relaxation
 from torchvision_dddas.targets.dispersion import dispersion, location_weight, of_window
+from torchvision_dddas.targets.dummies import pair_gain_over_alone
 from torchvision_dddas.targets.gating import gate
 from torchvision_dddas.types import Detections, Tracks
 
@@ -75,8 +76,8 @@ def associate(window: Sequence[Look], knobs: PaperKnobs) -> Association:
         weight = knobs.weight
     else:
         weight, asked = location_weight(location, appearance, knobs.lowest_dispersion)
-    by_location = _affinity([look.centre_px for look in window], knobs) if weight > 0 else None
-    by_appearance = _affinity([look.histogram(knobs.histogram) for look in window], knobs) if weight < 1 else None
+    by_location = affinity([look.centre_px for look in window], knobs) if weight > 0 else None
+    by_appearance = affinity([look.histogram(knobs.histogram) for look in window], knobs) if weight < 1 else None
     return Association(assign(by_location, by_appearance, weight, knobs), weight, location, asked)
 
 
@@ -103,7 +104,8 @@ def assign(
     return relaxation.triplets(score, knobs.gap).triplets
 
 
-def _affinity(features: Sequence[np.ndarray], knobs: PaperKnobs) -> np.ndarray:
+def affinity(features: Sequence[np.ndarray], knobs: PaperKnobs) -> np.ndarray:
+    """Of the targets of two or three frames by one feature, newest first, with a dummy first on each axis."""
     if len(features) == 2:
         return jaccard.pairs(features[0], features[1])
     return jaccard.triplets(features[0], features[1], features[2], knobs.dummy)
@@ -111,7 +113,7 @@ def _affinity(features: Sequence[np.ndarray], knobs: PaperKnobs) -> np.ndarray:
 
 def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
     """As `triplets_exact`, for two frames: what a pair gains over leaving both with the dummy is SciPy's matter."""
-    matched = assignment.pairs(score[1:, 1:] - score[1:, :1] - score[:1, 1:]) + 1
+    matched = assignment.pairs(pair_gain_over_alone(score)) + 1
     rows = [matched]
     for axis, size in enumerate(score.shape):
         alone = np.zeros((size - 1 - len(matched), 2), np.int64)

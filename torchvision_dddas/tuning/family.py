@@ -23,6 +23,7 @@ FAMILIES: Mapping[str, str] = {
     "motion": "masks",
     "registration": "registering",
     "tracking": "identities",
+    "paper": "affinities",
     "people": "recognition",
     "location": "places",
 }
@@ -83,6 +84,15 @@ class Timed(Protocol):
 
     def at(self, interval_frames: int, task: Task) -> Family:
         """The family for a study's interval and for the task that its measure is of."""
+        ...
+
+
+@runtime_checkable
+class Particular(Protocol):
+    """A family whose knobs have a say under some settings alone."""
+
+    def check(self, names: Sequence[str], settings: Settings) -> None:
+        """Raises InputError in one line, with what to set, where one of its knobs would be tuned for nothing."""
         ...
 
 

@@ -13,7 +13,7 @@ from torchvision_dddas.studies.goals import Goal, check_possible, goal_of
 from torchvision_dddas.studies.record import Spec
 from torchvision_dddas.studies.running import plan
 from torchvision_dddas.studies.tried import parted
-from torchvision_dddas.tuning.family import Example, Family, Tick, Timed, family_of, with_loss
+from torchvision_dddas.tuning.family import Example, Family, Particular, Tick, Timed, family_of, with_loss
 
 
 @dataclass
@@ -48,12 +48,14 @@ def prepare(
 
     names: of knobs, as `tunable.chosen` takes them. holdout, clips: patterns of clips' names. measure: in place of the
     family's. loss: one of those that the family offers. tick: called once an example. Raises InputError for a knob that
-    cannot be tuned, knobs of several families, a loss that the family has not, clips without the truth that is needed,
-    and as `running.plan` does.
+    cannot be tuned or has no say under the settings, knobs of several families, a loss that the family has not, clips
+    without the truth that is needed, and as `running.plan` does.
     """
     settings = load(spec.config, spec.overrides)
     family = _family(names)
     knobs = Knobs(settings, names)
+    if isinstance(family, Particular):
+        family.check(knobs.names, settings)
     goal = goal_of(measure or family.measure)
     if isinstance(family, Timed):
         family = family.at(spec.interval, goal.task)
