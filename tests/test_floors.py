@@ -109,6 +109,8 @@ FLOORS: dict[str, set[str]] = {
     "modules.people": {"torch", "ops", "targets.persons"},
     # The tracker's own formulas, on tensors.
     "modules.links": {"torch", "ops", "targets", "settings"},
+    # The source's own formulas, on tensors.
+    "modules.affinities": {"torch", "ops", "targets", "settings"},
     "tuning": {"torch", "*"},
     "exporting": {"torch", "*"},
     "onboard": {"*"},
