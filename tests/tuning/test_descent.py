@@ -1,18 +1,21 @@
 """Descent on bowls: it gets to the bottom, repeats, goes on where it was, stops in time, says what is no number."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.tuning.toys import Bowl, pieces
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.modules.tunable import Knobs
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
+from torchvision_dddas.tuning.family import Example
 
 THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
 QUICK = Plan(steps=12, batch=4, rate=0.1, look_every=3)
@@ -222,3 +225,19 @@ def test_without_examples_there_is_one_line() -> None:
 def test_a_plan_that_will_not_do_is_refused(wrong: dict) -> None:
     with pytest.raises(InputError, match="wanted"):
         replace(QUICK, **wrong)
+
+
+class _Between(Bowl):
+    """Best half way between whole sizes, which no setting can have."""
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        side = knobs["morphology.erode_px"]
+        return ((2 * torch.pi * side).cos() + 0.1 * side).expand(len(batch))
+
+
+def test_states_are_looked_at_as_the_settings_round_them() -> None:
+    found = descend(_Between(), Knobs(Settings(), ["morphology.erode_px"]), pieces(), Plan(steps=20, look_every=1))
+    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    watched = [step.watched for step in found.history]
+    assert any(abs(side - round(side)) > 0.3 for side in sides)
+    assert watched == pytest.approx([1 + 0.1 * round(side) for side in sides])

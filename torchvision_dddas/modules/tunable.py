@@ -157,6 +157,13 @@ class Knobs(nn.Module):
         ways = [(free - start) ** 2 for free, start in zip(self.free, self._starts, strict=True)]
         return torch.stack(ways).sum()
 
+    def settled(self) -> dict[str, Tensor]:
+        """Each knob's value as the settings would have it, without a gradient: as `values` else."""
+        settings = self.settings()
+        return {
+            name: free.new_tensor(float(_of(settings, name))) for name, free in zip(self.names, self.free, strict=True)
+        }
+
     def settings(self) -> Settings:
         """The settings with these values, whole and odd ones rounded; knobs that have not moved stay as they were."""
         moved = {

@@ -256,9 +256,11 @@ class _Run:
         """Take note of the knobs as they are now, and where they are looked at of how good they are."""
         with torch.no_grad():
             values = self._knobs.values()
-            watched = self._mean(values) if look else None
+            # Rounded as settings are: between whole sizes a blend may do well, and either of them badly.
+            settled = self._knobs.settled() if look else {}
+            watched = self._mean(settled) if look else None
         if watched is not None and not math.isfinite(watched):
-            self._fail(number, self._watched, values, self._hardest)
+            self._fail(number, self._watched, settled, self._hardest)
             watched = None
         step = Step(number, softness, loss, watched, {name: float(value) for name, value in values.items()})
         if watched is not None:
