@@ -1,6 +1,7 @@
 """The soft association of the source beside the hard one: the same links, and knobs that are found again."""
 
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from torchvision_dddas.tuning.affinities import together, window_of
 ALL = ("threshold", "lowest_dispersion", "location_cut", "appearance_cut")
 
 
-def looks_of(count: int, seed: int, pictured: bool = True, leaving: int = 1, hues: int = 256, walk: float = 6.0):
+def looks_of(
+    count: int, seed: int, pictured: bool = True, leaving: int = 1, hues: int = 256, walk: float = 6.0
+) -> tuple[tuple[Look, Look], tuple[np.ndarray, np.ndarray]]:
     """Two frames, newer first: people who walk a little, of whom some leave and as many of whom come; identities."""
     draw = np.random.default_rng(seed)
     place = draw.uniform(60, 600, (count + leaving, 2))
@@ -30,8 +33,7 @@ def looks_of(count: int, seed: int, pictured: bool = True, leaving: int = 1, hue
         counts = draw.poisson(2.0, (count, 3, 256)).astype(float)
         counts[np.arange(count), :, level[who]] += 300
         box = np.column_stack([centre - (10, 20), np.tile((20.0, 40.0), (count, 1))])
-        shown = counts.reshape(count, 768)
-        found.append((Look(box, (lambda shown=shown: shown) if pictured else None), who))
+        found.append((Look(box, partial(counts.reshape, count, 768) if pictured else None), who))
     (now, who_now), (before, who_before) = found
     return (now, before), (who_now, who_before)
 
@@ -102,7 +104,8 @@ def test_nobody_and_targets_that_fill_up_change_nothing_and_all_is_finite():
     alone = torch.cat([wrong_links(knobs, together([part]), 0.05) for part in parts])
     torch.testing.assert_close(both, alone, rtol=0, atol=1e-3)
     assert both[0] == 0
-    (slope,) = torch.autograd.grad(both.sum() + unlikeliness(knobs, together(parts), 0.05).sum(), knobs.threshold)
+    threshold: Any = knobs.threshold
+    (slope,) = torch.autograd.grad(both.sum() + unlikeliness(knobs, together(parts), 0.05).sum(), threshold)
     assert torch.isfinite(slope)
 
 

@@ -60,6 +60,10 @@ def tune(
         float,
         typer.Option(help="To where the knobs began, 0.1 or so where examples are few: a factor e costs half of it."),
     ] = 0.0,
+    watched: Annotated[
+        float,
+        typer.Option(help="Share of each clip's examples that nothing is learned from: they tell which step is best."),
+    ] = 0.25,
     patience: Annotated[int, typer.Option(metavar="N", help="Looks, one every 5 steps, without a gain.")] = 10,
     minutes: Annotated[float | None, typer.Option(help="No step is begun after so many.")] = None,
     device: Annotated[str, typer.Option(help="Where the steps are computed: cpu, cuda, cuda:1.")] = "cpu",
@@ -97,7 +101,9 @@ def tune(
     if cost is not None and not 0 <= cost < float("inf"):
         raise InputError(f"--cost is {cost:g}; wanted 0 or more: the loss that a frame of twice the time is worth")
     longest_s = float("inf") if minutes is None else 60 * minutes
-    plan = Plan(steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull)
+    plan = Plan(
+        steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull, watched=watched
+    )
     spec = asked(study, config, set_ or [], backend and backend.value, None)
     # The settings are read again for the figures before: tuned.toml may not have taken their place by then.
     read = [study, *([Path(spec.config)] if spec.config else [])]
