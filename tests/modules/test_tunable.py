@@ -79,3 +79,13 @@ def test_a_knob_that_cannot_be_tuned_is_told_with_those_that_can(name: str) -> N
     with pytest.raises(InputError, match=r"difference\.threshold \(0\.1 to 255\)") as caught:
         Knobs(Settings(), [name])
     assert "\n" not in str(caught.value) and f"'{name}'" in str(caught.value)
+
+
+def test_whole_sizes_have_no_gradient_and_the_others_have() -> None:
+    knobs = Knobs(Settings(), ["morphology.erode_px", "difference.threshold"])
+    with torch.no_grad():
+        knobs.free[0] += 0.15
+    values = knobs.values(whole=True)
+    assert float(knobs.values()["morphology.erode_px"].detach()) != 3 and float(values["morphology.erode_px"]) == 3
+    assert not values["morphology.erode_px"].requires_grad and values["difference.threshold"].requires_grad
+    assert Knobs(Settings(), ["morphology.erode_px"]).values(whole=True)["morphology.erode_px"].requires_grad

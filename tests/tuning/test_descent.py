@@ -241,3 +241,19 @@ def test_states_are_looked_at_as_the_settings_round_them() -> None:
     watched = [step.watched for step in found.history]
     assert any(abs(side - round(side)) > 0.3 for side in sides)
     assert watched == pytest.approx([1 + 0.1 * round(side) for side in sides])
+
+
+class _Sized(Bowl):
+    """A bowl that is deeper where the erosion is wider."""
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        return super().loss(knobs, batch, softness) - 0.1 * knobs["morphology.erode_px"]
+
+
+def test_in_the_second_half_sizes_stay_and_the_rest_follows() -> None:
+    names = ["morphology.erode_px", THRESHOLD]
+    start, plan = with_knobs(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0)
+    found = descend(_Sized(), Knobs(start, names), pieces(), plan)
+    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    assert len(set(sides[:11])) == 11 and len(set(sides[10:])) == 1
+    assert len({step.knobs[THRESHOLD] for step in found.history[10:]}) > 5

@@ -148,9 +148,17 @@ class Knobs(nn.Module):
         self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in starts])
         self._starts = starts
 
-    def values(self) -> dict[str, Tensor]:
-        """Each knob's value with its gradient: numbers without axes, float64."""
-        return {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
+    def values(self, whole: bool = False) -> dict[str, Tensor]:
+        """Each knob's value with its gradient: numbers without axes, float64.
+
+        whole: sizes as the settings round them, without a gradient; where all knobs are sizes they go on as they are.
+        """
+        found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
+        sizes = [name for name in self.names if TUNABLE[name].rounding != "none"]
+        if whole and sizes and len(sizes) < len(found):
+            settled = self.settled()
+            found |= {name: settled[name] for name in sizes}
+        return found
 
     def moved(self) -> Tensor:
         """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient."""

@@ -25,6 +25,9 @@ from torchvision_dddas.tuning.split import batch_of, parted, shares
 FADED = 0.1
 """Of the rate, at the last step."""
 
+SIZED = 0.5
+"""Of the steps: after them sizes are whole, and what is no size follows."""
+
 GAIN = 1e-5
 """A loss that is less by no more than this is rounding, and no reason to move a knob."""
 
@@ -181,7 +184,7 @@ class _Run:
         number = self.history[-1].step + 1
         softness = self._softness(number)
         batch = [self._learned[i] for i in batch_of(number - 1, self._clips, self._plan.batch, self._plan.seed)]
-        values = self._knobs.values()
+        values = self._knobs.values(whole=number > SIZED * self._plan.steps)
         for value in values.values():
             if value.requires_grad:
                 value.retain_grad()
