@@ -14,7 +14,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "results"
-TEXTS = ("README.md", "eval/README.md")
+TEXTS = {"README.md": "readme", "eval/README.md": "eval", "docs/tuning.md": "tuning"}
+"""The texts of this project that hold what was measured, and what the files of their results begin with."""
 
 Block = str | dict[str, Any]
 
@@ -32,8 +33,7 @@ class Result:
     @property
     def path(self) -> Path:
         """Where it is kept."""
-        text = "readme" if self.into == "README.md" else "eval"
-        return FOLDER / f"{text}-{self.mark.replace(' ', '-').replace('_', '-')}.json"
+        return FOLDER / f"{TEXTS[self.into]}-{self.mark.replace(' ', '-').replace('_', '-')}.json"
 
     def text(self) -> str:
         """What stands between the marks."""
@@ -55,7 +55,8 @@ def read(path: Path) -> Result:
 
 def every() -> list[Result]:
     """All that are kept and are pieces of a text."""
-    return [read(path) for path in sorted(FOLDER.glob("*.json")) if path.name.startswith(("readme-", "eval-"))]
+    begins = tuple(f"{begin}-" for begin in TEXTS.values())
+    return [read(path) for path in sorted(FOLDER.glob("*.json")) if path.name.startswith(begins)]
 
 
 def keep(name: str, content: dict[str, Any]) -> None:

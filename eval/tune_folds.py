@@ -9,6 +9,7 @@ is every labelled frame. A last fold holds nothing out: its knobs are what would
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,6 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+import report
 
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.modules.tunable import Knobs, chosen
@@ -52,7 +56,8 @@ def main() -> None:
         row = {"held_out": held, "knobs": knobs, "f": after, "alarmed": alarmed, "step": found.best, "s": spent}
         rows.append(row)
         print(_line(held or "none", before, after, alarmed, knobs), flush=True)
-    print("\n".join(table(rows)))
+    text = "\n".join(table(rows))
+    print(text)
     if given.json:
         told = {
             "study": spec.name,
@@ -130,6 +135,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--pull", type=float, default=0.0)
     parser.add_argument("--jobs", type=int)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--write", type=Path, help="a text with marks for the table")
     return parser.parse_args()
 
 

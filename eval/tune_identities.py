@@ -19,6 +19,7 @@ import itertools
 import json
 import math
 import random
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,9 @@ from typing import Any
 
 import numpy as np
 import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+import report
 
 from torchvision_dddas.datasets.kinds import read
 from torchvision_dddas.datasets.record import Clip
@@ -134,14 +138,26 @@ def _compare(sequences: Sequences, phases: Sequence[int], learned: Sequence[int]
             told = "  ".join(f"{way} {100 * v:5.1f} {100 * (v - shipped[name]):+5.1f}" for way, v in values.items())
             print(f"{name:24} shipped {100 * shipped[name]:5.1f}  {told}")
         print(f"  {seconds:.0f} s, steps or points {points}: {ways['gradient']}", flush=True)
+    text = "\n".join(table(rows, list(ways)))
+    print(text)
+    if given.json:
+        given.json.write_text(json.dumps({"asked": vars(given), "rows": rows}, indent=1, default=str) + "\n")
+    if given.write is not None:
+        report.put(given.write, "tune_identities", text)
+
+
+def table(rows: Sequence[Mapping[str, Any]], ways: Sequence[str]) -> list[str]:
+    """As Markdown: IDF1 in percent of each sequence held out, and the mean gain of each way."""
+    names = ["shipped", *ways]
+    lines = [f"| sequence | {' | '.join(names)} |", "| --- |" + " ---: |" * len(names)]
+    lines += [f"| {row['sequence']} | " + " | ".join(f"{100 * row[name]:.1f}" for name in names) + " |" for row in rows]
+    told = []
     for way in ways:
         gain = np.array([100 * (row[way] - row["shipped"]) for row in rows])
         drawn = np.random.default_rng(0).choice(gain, (10_000, len(gain))).mean(axis=1)
         low, high = np.percentile(drawn, [2.5, 97.5])
-        spread = f"95 % of draws of the sequences {low:+.2f} to {high:+.2f}"
-        print(f"{way}: mean gain {gain.mean():+.2f} points of IDF1, {spread}")
-    if given.json:
-        given.json.write_text(json.dumps({"asked": vars(given), "rows": rows}, indent=1, default=str) + "\n")
+        told.append(f"{gain.mean():+.2f} ({low:+.2f} to {high:+.2f})")
+    return [*lines, "| mean gain, and 95 % of draws of the sequences | | " + " | ".join(told) + " |"]
 
 
 def _searched(
@@ -249,6 +265,7 @@ def _arguments() -> argparse.Namespace:
     ask.add_argument("--skip", default="", help="names of sequences to leave out altogether")
     ask.add_argument("--looks", type=int, default=12, help="of a stretch that is learned from")
     ask.add_argument("--json", type=Path)
+    ask.add_argument("--write", type=Path, help="a text with marks for the table")
     return ask.parse_args()
 
 

@@ -50,7 +50,7 @@ def main() -> None:
     lines = one_step() if given.step else recovery(given.seeds, given.steps)
     print("\n".join(lines))
     if given.write is not None:
-        report.write(given.write, "tune_recovery" + ("_step" if given.step else ""), "\n".join(lines))
+        report.put(given.write, "tune_recovery" + ("_step" if given.step else ""), "\n".join(lines))
 
 
 def recovery(seeds: int, steps: int) -> list[str]:

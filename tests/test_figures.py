@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(
     not (ROOT / "docs" / "results").is_dir(), reason="results and studies are in a checkout, not in a package"
 )
 
-TEXTS = ("README.md", "eval/README.md")
+TEXTS = ("README.md", "eval/README.md", "docs/tuning.md")
 # A table with a column of numbers, which are set to the right.
 MEASURED = re.compile(r"^\|[- |:]*---:[- |:]*\|$", re.M)
 
