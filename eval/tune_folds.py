@@ -65,7 +65,9 @@ def main() -> None:
             "plan": vars(given) | {"study": str(given.study)},
             "rows": rows,
         }
-        given.json.write_text(json.dumps(told, indent=1, default=str) + "\n", encoding="utf-8")
+        given.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    if given.write is not None:
+        report.put(given.write, f"tune_folds_{Path(given.config or 'default').stem}", text)
 
 
 class Judge:
