@@ -59,12 +59,7 @@ def main() -> None:
     text = "\n".join(table(rows))
     print(text)
     if given.json:
-        told = {
-            "study": spec.name,
-            "config": spec.config,
-            "plan": vars(given) | {"study": str(given.study)},
-            "rows": rows,
-        }
+        told = {"study": spec.name, "asked": {key: str(value) for key, value in vars(given).items()}, "rows": rows}
         given.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     if given.write is not None:
         report.put(given.write, f"tune_folds_{Path(given.config or 'default').stem}", text)
