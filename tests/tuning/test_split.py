@@ -1,5 +1,7 @@
 """Which examples are learned from and which are watched."""
 
+import pytest
+
 from tests.tuning.toys import pieces
 from torchvision_dddas.tuning.split import batch_of, parted, shares
 
@@ -14,6 +16,12 @@ def test_the_last_part_of_each_clip_is_watched_and_never_learned_from() -> None:
 def test_where_clips_are_too_short_all_are_learned_from_and_watched() -> None:
     learned, watched = parted(pieces(("one", "two"), 2), 0.25, 99)
     assert learned == watched and len(learned) == 4
+
+
+@pytest.mark.parametrize("frames", [3, 4, 5])
+def test_of_a_short_clip_something_is_learned_whatever_share_is_watched(frames: int) -> None:
+    learned, watched = parted(pieces(("one", "two"), frames), 0.9, 99)
+    assert {one.clip for one in learned} == {one.clip for one in watched} == {"one", "two"}
 
 
 def test_of_many_some_are_watched_from_all_over() -> None:

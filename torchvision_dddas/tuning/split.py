@@ -9,9 +9,9 @@ from torchvision_dddas.tuning.family import Example
 
 
 def parted(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
-    """The examples to learn from, and those to watch: of each clip its last ones, of three and more at least one.
+    """The examples to learn from, and those to watch: of each clip its last ones.
 
-    most: to watch; of more, some that lie evenly among them. Neighbours in time are alike, so that a part in one piece
+    Of a clip of three and more at least one is learned from and one watched. most: to watch; of more, some that lie evenly among them. Neighbours in time are alike, so that a part in one piece
     tells more than single frames. Where no clip has three, or none is to be watched, all are learned from and watched.
     """
     clips: dict[str, list[Example]] = {}
@@ -19,7 +19,7 @@ def parted(examples: Sequence[Example], watched: float, most: int) -> tuple[list
         clips.setdefault(example.clip, []).append(example)
     learned, kept = list[Example](), list[Example]()
     for mine in clips.values():
-        count = max(1, round(watched * len(mine))) if watched and len(mine) >= 3 else 0
+        count = min(max(1, round(watched * len(mine))), len(mine) - 1) if watched and len(mine) >= 3 else 0
         learned += mine[: len(mine) - count]
         kept += mine[len(mine) - count :]
     kept = kept or learned
