@@ -13,7 +13,7 @@ from torchvision_dddas.following import follow_table
 from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.metrics.truth import Truth
 from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings
+from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.sources.detections import read_detections
 from torchvision_dddas.targets.tracks import Tracker
 from torchvision_dddas.tuning import identities
@@ -107,6 +107,13 @@ def test_stretches_of_several_sizes_are_filled_up_with_nobody():
 def test_a_clip_without_identities_is_refused_by_name():
     with pytest.raises(InputError, match="nobody has no true identities"):
         Identities().examples([walk("nobody", true=False)], Settings())
+
+
+def test_knobs_that_the_sources_association_never_asks_are_refused():
+    settings = with_knobs(Settings(), {"track.mode": "paper"})
+    with pytest.raises(InputError, match=r"track.speed: no say under track.mode=paper; add --set track.mode=default"):
+        Identities().check(["track.speed"], settings)
+    Identities().check(["track.speed"], Settings())
 
 
 def test_the_family_is_found_by_its_name_and_takes_the_interval_of_a_study():

@@ -96,15 +96,17 @@ def test_what_is_no_registration_to_be_believed_costs(examples: list[Example]) -
 
 def test_what_cannot_be_tuned_is_told_in_a_line(clip: Clip, examples: list[Example]) -> None:
     assert clip.truth is not None
+    bare, told = replace(clip, name="bare", truth=replace(clip.truth, masks={})), list[int]()
     with pytest.raises(InputError, match="bare has no masks of what moves"):
-        Registering().examples([replace(clip, name="bare", truth=replace(clip.truth, masks={}))], SETTINGS)
+        Registering().examples([clip, bare], SETTINGS, lambda: told.append(1))
+    assert not told, "a clip was computed before"
     with pytest.raises(InputError, match=r"registration\.halved"):
-        Registering().examples([clip], with_knobs(SETTINGS, {"registration.halved": True}))
+        Registering().check([RANSAC], with_knobs(SETTINGS, {"registration.halved": True}))
     unchecked = with_knobs(SETTINGS, {CHECK: 0.0})
     free = Registering().examples([clip], unchecked)
     assert bool(torch.isfinite(Registering().loss({RANSAC: torch.tensor(2.0).double()}, free, 0.1)).all())
     with pytest.raises(InputError, match="forward_backward_px = 0 leaves the check out"):
-        Registering().loss(Knobs(unchecked, [CHECK]).values(), free, 0.1)
+        Registering().check([RANSAC, CHECK], unchecked)
     assert clip.truth.masks
     alone = replace(clip, truth=replace(clip.truth, masks={5: clip.truth.masks[5]}))
     with pytest.raises(InputError, match="no two frames after each other"):

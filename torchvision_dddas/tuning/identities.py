@@ -68,6 +68,12 @@ class Identities:
         measure = self.measure.replace("association", task)
         return replace(self, interval=interval_frames, task=task, measure=measure, missed=MISSED)
 
+    def check(self, names: Sequence[str], settings: Settings) -> None:
+        """Raises InputError where these settings associate by another rule. See `family.Particular`."""
+        if settings.track.mode != "default":
+            mine = f"{', '.join(names)}: no say under track.mode={settings.track.mode}"
+            raise InputError(f"{mine}; add --set track.mode=default, or tune paper.threshold and its like")
+
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """Stretches of the clips' true tracks, by true boxes or by detections. See `family.Family`."""
         found = []

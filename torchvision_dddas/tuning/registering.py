@@ -57,14 +57,20 @@ class Registering:
     softness = (0.3, 0.02)
     """Shares of the tolerances."""
 
-    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """The frames with masks that have a next one. Raises InputError for a clip without any."""
+    def check(self, names: Sequence[str], settings: Settings) -> None:
+        """Raises InputError for settings that cannot be tuned. See `family.Particular`."""
         if settings.registration.halved:
             raise InputError("registration.halved = true cannot be tuned by gradient; set it to false")
+        if CHECK in names and settings.registration.forward_backward_px == 0:
+            raise InputError(f"{CHECK} = 0 leaves the check out, which cannot be tuned; set it above 0")
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """The frames with masks that have a next one. Raises InputError for a clip without any."""
         found: list[Example] = []
-        for clip in clips:
+        for clip in clips:  # told before any clip is computed
             if clip.truth is None or not clip.truth.masks:
                 raise InputError(f"{clip.name} has no masks of what moves; choose with --clips such as have")
+        for clip in clips:
             before = len(found)
             for example in _examples(clip, settings):
                 found.append(example)
@@ -126,8 +132,6 @@ def _examples(clip: Clip, settings: Settings) -> Iterator[Example]:
 
 def _lost(pair: Step, knobs: Mapping[str, Tensor], softness: float) -> Tensor:
     fixed, points = pair.knobs, pair.points
-    if CHECK in knobs and fixed.forward_backward_px == 0:
-        raise InputError(f"{CHECK} = 0 leaves the check out, which cannot be tuned; set it above 0")
     tolerance_px = knobs.get(RANSAC, torch.tensor(fixed.ransac_px, dtype=torch.float64))
     check_px = knobs.get(CHECK, torch.tensor(fixed.forward_backward_px, dtype=torch.float64))
     kept = (points.missed_px <= check_px).numpy() if fixed.forward_backward_px else np.ones(len(points.still), bool)
