@@ -234,6 +234,28 @@ def test_an_unfinished_descent_is_kept_beside_the_new_one(clips, tmp_path) -> No
     assert json.loads((tmp_path / "run.json").read_text())["taken"] == 5
 
 
+def test_an_unfinished_descent_that_was_set_aside_can_be_gone_on_with_at_its_own_cost(
+    clips, tmp_path, monkeypatch
+) -> None:
+    class Stopped(Bowl):
+        def loss(self, knobs, batch, softness):
+            if len(self.calls) > 8:
+                raise KeyboardInterrupt
+            return super().loss(knobs, batch, softness)
+
+    words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
+    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
+    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
+    assert asked(clips, *words).exit_code == 0
+    for name in ("checkpoint", "cost"):
+        end = "pt" if name == "checkpoint" else "json"
+        (tmp_path / f"{name}.old.{end}").replace(tmp_path / f"{name}.{end}")
+    result = asked(clips, *words, "--resume")
+    assert result.exit_code == 0, result.output
+    assert json.loads((tmp_path / "run.json").read_text())["taken"] == 5
+
+
 def test_without_torch_one_line_says_what_to_install(clips, monkeypatch) -> None:
     for name in ("torch", "kornia"):
         monkeypatch.setitem(sys.modules, name, None)

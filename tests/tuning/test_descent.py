@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -257,3 +257,62 @@ def test_in_the_second_half_sizes_stay_and_the_rest_follows() -> None:
     sides = [step.knobs["morphology.erode_px"] for step in found.history]
     assert len(set(sides[:11])) == 11 and len(set(sides[10:])) == 1
     assert len({step.knobs[THRESHOLD] for step in found.history[10:]}) > 5
+
+
+def test_sizes_that_stay_are_not_pulled_back() -> None:
+    start, plan = with_knobs(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0, pull=0.1)
+    found = descend(_Sized(), Knobs(start, ["morphology.erode_px", THRESHOLD]), pieces(), plan)
+    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    assert sides[10] != sides[0] and len(set(sides[10:])) == 1
+
+
+class _Idle(Bowl):
+    """A bowl in the erosion alone."""
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        return (knobs["morphology.erode_px"].log() - 2).square().expand(len(batch))
+
+
+def test_sizes_go_on_where_nothing_else_has_a_say() -> None:
+    found = descend(_Idle(), Knobs(Settings(), ["morphology.erode_px", NOISE]), pieces(), Plan(steps=20, watched=0))
+    assert found.idle == (NOISE,)
+    assert len({step.knobs["morphology.erode_px"] for step in found.history}) == 21
+
+
+@pytest.mark.parametrize("pull", [0.0, 0.1])
+def test_a_knob_without_a_say_is_told_and_not_pulled_about(pull: float) -> None:
+    class Deaf(Bowl):
+        def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+            return torch.ones(len(batch), dtype=torch.float64)
+
+    with pytest.raises(InputError, match=f"the loss of motion does not depend on {NOISE}"):
+        descend(Deaf(), Knobs(Settings(), [NOISE]), pieces(), replace(QUICK, pull=pull))
+
+
+def test_examples_on_which_no_knob_has_a_say_stop_nothing() -> None:
+    class Hush(Bowl):
+        def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+            lost = super().loss(knobs, batch, softness)
+            return lost.detach() if batch[0].clip == "two" else lost
+
+    found = descend(Hush(), knobs(), pieces(), replace(QUICK, batch=1))
+    assert found.failed == "" and found.history[-1].step == 12 and found.idle == ()
+
+
+@dataclass
+class _Timed(Bowl):
+    interval: int = 1
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (_Timed(task="tracking"), "other task, motion and not tracking"),
+        (_Timed(interval=5), "other interval, 1 and not 5"),
+    ],
+)
+def test_a_checkpoint_of_another_task_or_interval_is_refused(tmp_path: Path, other: Bowl, words: str) -> None:
+    place = tmp_path / "checkpoint.pt"
+    descend(_Timed(), knobs(), pieces(), QUICK, place=place)
+    with pytest.raises(InputError, match=words):
+        descend(other, knobs(), pieces(), QUICK, place=place, resume=True)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.tuning.verdict import Side, Verdict
 
 CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
-OLD = "checkpoint.old.pt"
-FILES = (CHECKPOINT, OLD, COST, TUNED, REPORT, RUN)
+OLD, OLD_COST = "checkpoint.old.pt", "cost.old.json"
+FILES = (CHECKPOINT, OLD, COST, OLD_COST, TUNED, REPORT, RUN)
 
 
 @explained
@@ -162,7 +162,7 @@ class _Tuning:
         place = self._folder / CHECKPOINT
         if resume and not place.is_file():
             self._say(f"there is no checkpoint at {place}: it begins anew")
-        tell = partial(self._tell, {"state": "running", "study": ready.spec.name}, resume)
+        tell = partial(self._tell, {"state": "running", "study": ready.spec.name}, resume, cost)
         found = descend(ready.family, ready.knobs, ready.examples, self._plan, cost, tell, place, resume)
         self._clock("descent", began)
         self._toml(ready, found, None)
@@ -199,15 +199,18 @@ class _Tuning:
         count = costing.REPEATS * len(costing.points(settings, names))
         with progress("what time costs", count, self._quiet) as tick:
             cost = costing.measured(clip, ready.goal.task, settings, names, weight, backend, tick=tick)
-        costing.write(place, cost)
         self._clock("cost", began)
         return cost
 
-    def _tell(self, state: dict[str, str], resume: bool, step: "Step") -> None:
+    def _tell(self, state: dict[str, str], resume: bool, cost: "TimeCost | None", step: "Step") -> None:
         """A line for each look, and every few seconds; with the first step the run has begun."""
+        from torchvision_dddas.tuning import costing
+
         if not self._state:
             if not resume:
                 self._set_aside()
+            if cost is not None:  # not before: that of an earlier descent is needed to go on with it
+                costing.write(self._folder / COST, cost)
             self._write(RUN, _json(state))
             self._state = state
         if self._quiet:
@@ -225,11 +228,11 @@ class _Tuning:
         self._say(told)
 
     def _set_aside(self) -> None:
-        """A checkpoint that could be gone on with is not written over."""
+        """A checkpoint that could be gone on with is not written over, nor what was measured for it."""
         from torchvision_dddas.tuning.checkpoint import set_aside
 
         place, aside = self._folder / CHECKPOINT, self._folder / OLD
-        if steps := set_aside(place, aside):
+        if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
             self._say(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
 
     def _judged(self, ready: "Prepared") -> "Verdict":

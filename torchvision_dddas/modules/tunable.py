@@ -154,15 +154,27 @@ class Knobs(nn.Module):
         whole: sizes as the settings round them, without a gradient; where all knobs are sizes they go on as they are.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
-        sizes = [name for name in self.names if TUNABLE[name].rounding != "none"]
-        if whole and sizes and len(sizes) < len(found):
+        if whole and self._held:
             settled = self.settled()
-            found |= {name: settled[name] for name in sizes}
+            found |= {name: settled[name] for name in self._held}
         return found
 
-    def moved(self) -> Tensor:
-        """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient."""
-        ways = [(free - start) ** 2 for free, start in zip(self.free, self._starts, strict=True)]
+    @property
+    def _held(self) -> tuple[str, ...]:
+        """What is without a gradient where sizes are whole: they, beside others."""
+        sizes = tuple(name for name in self.names if TUNABLE[name].rounding != "none")
+        return sizes if len(sizes) < len(self.names) else ()
+
+    def moved(self, whole: bool = False) -> Tensor:
+        """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient.
+
+        whole: without that of sizes, as in `values`.
+        """
+        held = self._held if whole else ()
+        ways = [
+            ((free.detach() if name in held else free) - start) ** 2
+            for name, free, start in zip(self.names, self.free, self._starts, strict=True)
+        ]
         return torch.stack(ways).sum()
 
     def settled(self) -> dict[str, Tensor]:

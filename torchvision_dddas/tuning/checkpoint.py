@@ -5,6 +5,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -15,13 +16,15 @@ from torchvision_dddas.settings import changes
 from torchvision_dddas.sinks.whole import cannot_write, write_whole
 from torchvision_dddas.tuning.family import Family, loss_of
 
-FORMAT = 2
+FORMAT = 3
 
 
 def facts(family: Family, knobs: Knobs, plan: Mapping[str, Any], seen: Sequence[str], cost: object) -> dict[str, Any]:
     """What a descent depends on, in words and numbers. seen: its examples, in order."""
     return {
         "family": family.name,
+        "task": family.task,
+        "interval": getattr(family, "interval", 1),
         "loss": loss_of(family),
         "knobs": ", ".join(knobs.names),
         "settings": json.dumps(changes(knobs.base), default=str),
@@ -64,19 +67,22 @@ def read(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
     return state
 
 
-def set_aside(place: Path, aside: Path) -> int:
-    """Keep a checkpoint that a new descent would overwrite, and the steps that it took; 0 where nothing is kept.
+def set_aside(place: Path, aside: Path, more: Mapping[Path, Path] = MappingProxyType({})) -> int:
+    """Keep a checkpoint that a new descent would overwrite; how many steps it took, 0 where nothing is kept.
 
     Kept is what could still be gone on with: a descent that did not come to its end, of more steps than one that lies
-    there already. Raises InputError where the disk refuses.
+    there already. more: files that belong to it, and where to, as far as they are there. Raises InputError where the
+    disk refuses.
     """
     steps = _unfinished(place)
     if steps == 0 or steps < _unfinished(aside):
         return 0
-    try:
-        place.replace(aside)
-    except OSError as error:
-        raise cannot_write(aside, error) from error
+    for here, there in {**more, place: aside}.items():
+        try:
+            if here.is_file():
+                here.replace(there)
+        except OSError as error:
+            raise cannot_write(there, error) from error
     return steps
 
 

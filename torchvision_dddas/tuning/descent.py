@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import Knobs
+from torchvision_dddas.modules.tunable import TUNABLE, Knobs
 from torchvision_dddas.settings import Settings
 from torchvision_dddas.tuning import checkpoint
 from torchvision_dddas.tuning.blame import blamed
@@ -26,7 +26,7 @@ FADED = 0.1
 """Of the rate, at the last step."""
 
 SIZED = 0.5
-"""Of the steps: after them sizes are whole, and what is no size follows."""
+"""Of the steps: after them sizes are whole, and what is no size follows; where such has no say, sizes go on."""
 
 GAIN = 1e-5
 """A loss that is less by no more than this is rounding, and no reason to move a knob."""
@@ -184,19 +184,23 @@ class _Run:
         number = self.history[-1].step + 1
         softness = self._softness(number)
         batch = [self._learned[i] for i in batch_of(number - 1, self._clips, self._plan.batch, self._plan.seed)]
-        values = self._knobs.values(whole=number > SIZED * self._plan.steps)
+        follow = any(TUNABLE[name].rounding == "none" for name in self._moved)
+        whole = number > SIZED * self._plan.steps and follow
+        values = self._knobs.values(whole)
         for value in values.values():
             if value.requires_grad:
                 value.retain_grad()
         losses = self._family.loss(values, batch, softness)
-        loss = losses.mean() + self._charge(values)
+        charged = losses.mean() + self._price(values)
+        loss = charged + self._pull(whole)
         if not bool(torch.isfinite(loss)):
             self._fail(number, batch, values, softness)
             return None
-        if not loss.requires_grad:
+        if not (charged.requires_grad or self._moved or self._heard(values, softness)):
             raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(self._knobs.names)}")
         self._adam.zero_grad()
-        loss.backward()
+        if loss.requires_grad:
+            loss.backward()
         if any(value.grad is not None and not bool(torch.isfinite(value.grad).all()) for value in values.values()):
             self._fail(number, batch, values, softness)
             return None
@@ -288,12 +292,23 @@ class _Run:
         for i in range(0, len(self._watched), size):
             losses = self._family.loss(values, self._watched[i : i + size], self._hardest)
             total += math.fsum(loss * part for loss, part in zip(losses.tolist(), share[i : i + size], strict=True))
-        return total + float(self._charge(values))
+        return total + float(self._price(values) + self._pull())
 
-    def _charge(self, values: Mapping[str, Tensor]) -> Tensor:
-        """For time, and for what the knobs are away from where they began."""
-        charge = torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
-        return charge + self._plan.pull / 2 * self._knobs.moved() if self._plan.pull else charge
+    def _price(self, values: Mapping[str, Tensor]) -> Tensor:
+        """For time."""
+        return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
+
+    def _pull(self, whole: bool = False) -> Tensor:
+        """For what the knobs are away from where they began; whole: sizes stay where they are."""
+        if not self._plan.pull:
+            return torch.zeros((), dtype=torch.float64)
+        return self._plan.pull / 2 * self._knobs.moved(whole)
+
+    def _heard(self, values: Mapping[str, Tensor], softness: float) -> bool:
+        """Whether any example that is learned from depends on a knob; that of one batch may not."""
+        size = self._plan.batch
+        parts = (self._learned[i : i + size] for i in range(0, len(self._learned), size))
+        return any(self._family.loss(values, part, softness).requires_grad for part in parts)
 
     def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
         self.failed = f"{self._unfit(batch, values, softness) or 'the cost is no number'}, at step {number}"
