@@ -11,8 +11,9 @@ from torchvision_dddas.tuning.family import Example
 def parted(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
     """The examples to learn from, and those to watch: of each clip its last ones.
 
-    Of a clip of three and more at least one is learned from and one watched. most: to watch; of more, some that lie evenly among them. Neighbours in time are alike, so that a part in one piece
-    tells more than single frames. Where no clip has three, or none is to be watched, all are learned from and watched.
+    Of a clip of three and more at least one is learned from and one watched. most: to watch; of more, some that lie
+    evenly among them. Neighbours in time are alike, so that a part in one piece tells more than single frames. Where no
+    clip has three, or none is to be watched, all are learned from and watched.
     """
     clips: dict[str, list[Example]] = {}
     for example in examples:
