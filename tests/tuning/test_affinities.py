@@ -37,6 +37,9 @@ def test_a_threshold_is_learned_where_people_come_and_go():
     found = descend(family, Knobs(settings, ["paper.threshold"]), examples, Plan(5, 8, 0.3, look_every=5))
     assert not found.failed
     assert found.idle == ()
+    first, last = found.history[0].watched, found.history[-1].watched
+    assert first is not None and last is not None and last < first
+    assert found.settings.paper.threshold > 0.7
 
 
 @pytest.mark.parametrize(
