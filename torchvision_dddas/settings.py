@@ -120,10 +120,10 @@ class DifferenceKnobs(Group):
     wide_frames: int = knob(6, "frames", 0, 60, meaning="distance of the pair that fills large targets; 0 is none")
     noise_levels: float = knob(4.0, "grey levels", 0.1, 50, meaning="noise of a flat region (normalized)")
     gradient_share: float = knob(
-        0.15, "-", 0, 2, meaning="share of the local gradient that counts as noise, for errors of registration"
+        0.12, "-", 0, 2, meaning="share of the local gradient that counts as noise, for errors of registration"
     )
     threshold: float = knob(
-        4.0, "-", 0.1, 255, meaning="a larger difference is foreground: noise units if normalized, else grey levels"
+        3.5, "-", 0.1, 255, meaning="a larger difference is foreground: noise units if normalized, else grey levels"
     )
     peak: float = knob(7.0, "-", 0, 255, meaning="a target's largest difference reaches at least this, same unit")
     blur_px: Odd = knob(5, "px", 1, 31, meaning="Gaussian kernel on the difference, odd; 1 is none")
@@ -150,7 +150,7 @@ class RefineKnobs(Group):
     """Redrawing a target's outline by its motion and its colours."""
 
     on: bool = knob(True, "-", meaning="refine outlines; false leaves the blobs of the morphology")
-    spatial_px: float = knob(60.0, "px", 1, 500, meaning="how far evidence spreads where colours do not change")
+    spatial_px: float = knob(90.0, "px", 1, 500, meaning="how far evidence spreads where colours do not change")
     colour_levels: float = knob(80.0, "grey levels", 1, 1000, meaning="change of colour that stops the spread")
     share: float = knob(0.55, "-", 0.05, 0.95, meaning="share of foreground evidence that makes a pixel foreground")
     shadow_share: float = knob(

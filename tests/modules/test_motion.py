@@ -5,21 +5,19 @@ import torch
 from torchvision_dddas.modules.motion import Core, Differences, Regions, SoftMotion
 from torchvision_dddas.settings import Settings, with_knobs
 
-SETTINGS = with_knobs(
-    Settings(), {"morphology.close_px": 7, "gates.min_area_px": 20, "difference.peak": 5.0, "morphology.erode_px": 2}
-)
-# Where noise is the unit, nothing is many units above it.
-NOISY = with_knobs(SETTINGS, {"difference.threshold": 1.5, "difference.peak": 1.6})
-KNOBS = {
+KNOBS: dict[str, float] = {
     "difference.noise_levels": 4.0,
     "difference.gradient_share": 0.15,
     "difference.threshold": 4.0,
-    "difference.blur_px": 5.0,
-    "morphology.erode_px": 2.0,
-    "morphology.close_px": 7.0,
+    "difference.blur_px": 5,
+    "morphology.erode_px": 2,
+    "morphology.close_px": 7,
     "difference.peak": 5.0,
-    "gates.min_area_px": 20.0,
+    "gates.min_area_px": 20,
 }
+SETTINGS = with_knobs(Settings(), KNOBS)
+# Where noise is the unit, nothing is many units above it.
+NOISY = with_knobs(SETTINGS, {"difference.threshold": 1.5, "difference.peak": 1.6})
 
 
 def differences(

@@ -51,7 +51,7 @@ def record(**changed):
         "state": "complete",
         "study": {"name": "a <b> study"},
         "family": "motion",
-        "plan": {"batch": 8, "seed": 3, "steps": 4},
+        "plan": {"batch": 8, "seed": 3, "steps": 4, "watched": 0.25},
         "examples": 20,
         "knobs": knobs,
         "best": 4,
@@ -129,3 +129,9 @@ def test_on_a_phone_nothing_hangs_over_the_edge(tmp_path):
     with Browser(tmp_path / "profile") as browser:
         browser.open(path, 390, 844)
         assert browser.value("document.documentElement.scrollWidth") <= 390
+
+
+def test_the_page_says_what_was_watched() -> None:
+    told = record()
+    assert "last 25% of each clip" in tuning_report(told)
+    assert "What is learned from is watched as well" in tuning_report(told | {"plan": told["plan"] | {"watched": 0.0}})

@@ -89,10 +89,16 @@ def _gain(name: str, side: Mapping[str, Any]) -> str:
 
 def _descent_note(told: Mapping[str, Any]) -> str:
     plan = told["plan"]
+    which = (
+        f"The watched ones are the last {plan['watched']:.0%} of each clip that has three or more: nothing is "
+        "learned from them."
+        if plan["watched"]
+        else "What is learned from is watched as well."
+    )
+    count = min(plan["batch"], told["examples"])
     return (
-        f'<p class="soft">Each step learns from {plan["batch"]} examples, softened. The watched ones are the last part '
-        "of each clip: nothing is learned from them, they are as hard as at the last step, and their least loss "
-        "decides which state is kept.</p>"
+        f'<p class="soft">Each step learns from {count} examples, softened. {which} They are looked at as hard as '
+        "at the last step, and their least loss decides which state is kept.</p>"
     )
 
 
