@@ -10,20 +10,20 @@ the hard tracker's mean IDF1 on the other sequences for as many seconds as the g
 import argparse
 import json
 import random
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from torchvision_dddas.datasets.kinds import read
+sys.path.insert(0, str(Path(__file__).parent))
+import draws
+from sequences import identified, idf1
+
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.modules.tunable import TUNABLE, Knobs
 from torchvision_dddas.settings import Settings, load, with_knobs
-from torchvision_dddas.studies.record import Source
-from torchvision_dddas.studies.scoring import score
-from torchvision_dddas.studies.stages import find
-from torchvision_dddas.studies.summary import measures
 from torchvision_dddas.tuning.affinities import Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
 
@@ -48,7 +48,11 @@ def main() -> None:
     given = ask.parse_args()
     torch.set_num_threads(1)
     shipped = with_knobs(load("paper"), {"paper.window": 2, "paper.rule": given.rule})
-    clips = {clip.name: clip for clip in _clips(given.data) if not given.only or clip.name in given.only.split(",")}
+    clips = {
+        clip.name: clip
+        for clip in identified(given.data, ("motchallenge", "cvml"))
+        if not given.only or clip.name in given.only.split(",")
+    }
     family, names, examples, took = Affinities(interval=given.interval), KNOBS[given.rule], {}, {}
     for name, clip in clips.items():
         began = time.perf_counter()
@@ -63,17 +67,17 @@ def main() -> None:
         done = descend(family, Knobs(shipped, names), [one for name in learned for one in examples[name]], plan)
         seconds = time.perf_counter() - began + sum(took[name] for name in learned)
         found = _searched([clips[name] for name in learned], shipped, names, given.interval, seconds, given.seed)
-        values = {name: getattr(done.settings.paper, name.split(".")[1]) for name in names}
-        print(f"step {done.best}, {seconds:.0f} s: {values}", flush=True)
+        knobs = {name: getattr(done.settings.paper, name.split(".")[1]) for name in names}
+        print(f"step {done.best}, {seconds:.0f} s: {knobs}", flush=True)
         for name in fold:
-            idf1 = [_idf1(clips[name], each, given.interval) for each in (shipped, done.settings, found)]
-            rows.append({"sequence": name, **dict(zip(("shipped", "tuned", "random"), idf1, strict=True))})
-            print(f"{name:24}" + "".join(f"{100 * value:7.1f}" for value in idf1), flush=True)
+            values = [
+                idf1(clips[name], "association", each, given.interval) for each in (shipped, done.settings, found)
+            ]
+            rows.append({"sequence": name, **dict(zip(("shipped", "tuned", "random"), values, strict=True))})
+            print(f"{name:24}" + "".join(f"{100 * value:7.1f}" for value in values), flush=True)
     for way in ("tuned", "random"):
-        gain = np.array([100 * (row[way] - row["shipped"]) for row in rows])
-        drawn = np.random.default_rng(0).choice(gain, (10_000, len(gain))).mean(axis=1)
-        low, high = np.percentile(drawn, [2.5, 97.5])
-        print(f"{way}: mean gain {gain.mean():+.2f} points of IDF1, 95 % of draws {low:+.2f} to {high:+.2f}")
+        gains = [100 * (row[way] - row["shipped"]) for row in rows]
+        print(f"{way}: mean gain in points of IDF1, and 95 % of draws of the sequences: {draws.told(gains)}")
     if given.json:
         given.json.write_text(json.dumps({**vars(given), "data": "", "json": "", "rows": rows}, indent=1) + "\n")
 
@@ -85,28 +89,13 @@ def _searched(
     chance, best, most, end = random.Random(seed), shipped, -1.0, time.perf_counter() + seconds
     settings = shipped
     while True:
-        mean = float(np.mean([_idf1(clip, settings, interval) for clip in clips]))
+        mean = float(np.mean([idf1(clip, "association", settings, interval) for clip in clips]))
         if mean > most:
             best, most = settings, mean
         if time.perf_counter() >= end:
             return best
         drawn = {name: TUNABLE[name].rounded(chance.uniform(TUNABLE[name].low, TUNABLE[name].high)) for name in names}
         settings = with_knobs(shipped, drawn)
-
-
-def _clips(data: Path) -> list[Clip]:
-    """The sequences with true identities of several targets."""
-    found: dict[str, Clip] = {}
-    for kind in ("motchallenge", "cvml"):
-        for clip in read(Source(kind, data), data).clips:
-            if clip.truth is not None and clip.truth.tracks is not None:
-                found.setdefault(clip.name, clip)
-    return list(found.values())
-
-
-def _idf1(clip: Clip, settings: Settings, interval: int) -> float:
-    found = find(clip, "association", settings, "onboard", interval)
-    return float(measures([score(clip, "association", found, interval)])["tracks"]["idf1"])
 
 
 if __name__ == "__main__":

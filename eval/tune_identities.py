@@ -31,19 +31,17 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+import draws
 import report
+from sequences import identified, idf1
 
-from torchvision_dddas.datasets.kinds import read
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.metrics.matching import TrackTable
 from torchvision_dddas.modules.tunable import TUNABLE, Knobs
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.studies import sweep
 from torchvision_dddas.studies.axes import Range
-from torchvision_dddas.studies.record import Source, Task
-from torchvision_dddas.studies.scoring import score
-from torchvision_dddas.studies.stages import find
-from torchvision_dddas.studies.summary import measures
+from torchvision_dddas.studies.record import Task
 from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.identities import Identities
@@ -75,13 +73,8 @@ class Sequences:
 
     def idf1(self, name: str, settings: Settings, phases: Sequence[int]) -> float:
         """The mean of a sequence's phases, hard decisions."""
-        values = []
-        for phase in phases:
-            clip = self.clips[name][phase]
-            found = find(clip, self.task, settings, "onboard", self.interval)
-            group = measures([score(clip, self.task, found, self.interval)])["tracks"]
-            values.append(float(group["idf1"]))
-        return float(np.mean(values))
+        clips = [self.clips[name][phase] for phase in phases]
+        return float(np.mean([idf1(clip, self.task, settings, self.interval) for clip in clips]))
 
 
 def main() -> None:
@@ -94,8 +87,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         task: Task = "tracking" if given.detections else "association"
         clips = {
-            clip.name: {phase: shifted(clip, phase, Path(place)) for phase in {*phases, *learned}}
-            for clip in _clips(given.data)
+            clip.name: {phase: shifted(replace(clip, pictures=()), phase, Path(place)) for phase in {*phases, *learned}}
+            for clip in identified(given.data, ("motchallenge", "cvml", "sdd"))
             if clip.name not in skipped and (clip.given is not None or not given.detections)
         }
         _compare(Sequences(clips, task, given.interval), phases, learned, given)
@@ -151,12 +144,7 @@ def table(rows: Sequence[Mapping[str, Any]], ways: Sequence[str]) -> list[str]:
     names = ["shipped", *ways]
     lines = [f"| sequence | {' | '.join(names)} |", "| --- |" + " ---: |" * len(names)]
     lines += [f"| {row['sequence']} | " + " | ".join(f"{100 * row[name]:.1f}" for name in names) + " |" for row in rows]
-    told = []
-    for way in ways:
-        gain = np.array([100 * (row[way] - row["shipped"]) for row in rows])
-        drawn = np.random.default_rng(0).choice(gain, (10_000, len(gain))).mean(axis=1)
-        low, high = np.percentile(drawn, [2.5, 97.5])
-        told.append(f"{gain.mean():+.2f} ({low:+.2f} to {high:+.2f})")
+    told = [draws.told([100 * (row[way] - row["shipped"]) for row in rows]) for way in ways]
     return [*lines, "| mean gain, and 95 % of draws of the sequences | | " + " | ".join(told) + " |"]
 
 
@@ -232,16 +220,6 @@ def shifted(clip: Clip, phase: int, place: Path) -> Clip:
 def _later(table: TrackTable, phase: int) -> TrackTable:
     kept = table.at(table.frame > phase)
     return kept._replace(frame=kept.frame - phase)
-
-
-def _clips(data: Path) -> list[Clip]:
-    """The sequences with true identities of several targets, without their pictures."""
-    found = {}
-    for kind in ("motchallenge", "cvml", "sdd"):
-        for clip in read(Source(kind, data), data).clips:
-            if clip.truth is not None and clip.truth.tracks is not None:
-                found.setdefault(clip.name, replace(clip, pictures=()))
-    return list(found.values())
 
 
 def _arguments() -> argparse.Namespace:

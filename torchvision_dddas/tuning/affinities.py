@@ -21,6 +21,7 @@ from torchvision_dddas.studies.record import Task
 from torchvision_dddas.targets.dispersion import dissimilarity, joined_at, speaking
 from torchvision_dddas.targets.gating import alternatives
 from torchvision_dddas.targets.paper import Look, affinity
+from torchvision_dddas.tuning.boxed import boxed
 from torchvision_dddas.tuning.family import Example, Tick
 
 WINDOWS = 10
@@ -179,24 +180,8 @@ def window_of(
 
 def _looks(clip: Clip, table: TrackTable, interval: int) -> Iterator[tuple[int, np.ndarray, Look]]:
     """Number, identities and look of each frame from the first to the last with boxes."""
-    from torchvision_dddas.studies.stages import opened
     from torchvision_dddas.vision.histograms import rgb_histograms
 
-    def at(number: int) -> tuple[np.ndarray, np.ndarray]:
-        rows = table.frame == number
-        return table.identity[rows], np.asarray(table.box_px[rows], float)
-
-    if not len(table.frame):
-        return
-    first, last = int(table.frame.min()), int(table.frame.max())
-    if not clip.pictures:
-        for number in range(first, last + 1, interval):
-            identity, box_px = at(number)
-            yield number, identity, Look(box_px, None)
-        return
-    for frame in opened(clip).every(interval):
-        if frame.number > last:
-            return
-        identity, box_px = at(frame.number)
-        counted = rgb_histograms(frame.image, box_px)
-        yield frame.number, identity, Look(box_px, lambda counted=counted: counted)  # type: ignore[misc]
+    for number, identity, box_px, image in boxed(clip, table, interval):
+        counted = None if image is None else rgb_histograms(image, box_px)
+        yield number, identity, Look(box_px, None if counted is None else lambda counted=counted: counted)  # type: ignore[misc]

@@ -26,6 +26,7 @@ from torchvision_dddas.targets.kalman import carried_boxes
 from torchvision_dddas.targets.likeness import blended, likeness, visible_share
 from torchvision_dddas.targets.links import births_of, near_border
 from torchvision_dddas.targets.pace import Pace
+from torchvision_dddas.tuning.boxed import boxed
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.owners import Owned, owned
 
@@ -212,27 +213,17 @@ def _shown(
     clip: Clip, table: TrackTable, settings: Settings, interval: int
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]]:
     """Number, identities, boxes, camera's motion and histograms of each look from the first to the last with boxes."""
-    from torchvision_dddas.studies.stages import opened
     from torchvision_dddas.vision import load
     from torchvision_dddas.vision.appearance import strips
     from torchvision_dddas.vision.camera import Camera
 
-    def at(number: int) -> tuple[np.ndarray, np.ndarray]:
-        rows = table.frame == number
-        return table.identity[rows], np.asarray(table.box_px[rows], float)
-
-    last = int(table.frame.max())
-    if not clip.pictures:
-        for number in range(int(table.frame.min()), last + 1, interval):
-            yield number, *at(number), None, None
-        return
     camera, looks_matter = Camera(load("onboard", settings)), settings.track.appearance != "never"
-    for frame in opened(clip).every(interval):
-        if frame.number > last:
-            return
-        identity, box_px = at(frame.number)
-        step, _ = camera.step(frame.image)
-        yield frame.number, identity, box_px, step, strips(frame.image, box_px) if looks_matter else None
+    for number, identity, box_px, image in boxed(clip, table, interval):
+        if image is None:
+            yield number, identity, box_px, None, None
+            continue
+        step, _ = camera.step(image)
+        yield number, identity, box_px, step, strips(image, box_px) if looks_matter else None
 
 
 def _stacked(looks: Sequence[_Look], birth_score: float) -> dict[str, np.ndarray]:

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.truth import labels_of
 from torchvision_dddas.modules.motion import Differences, SoftMotion, Values
 from torchvision_dddas.ops.relax.passing import through
 from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.labelling import regions_of
+from torchvision_dddas.tuning.masked import check_masks, labels_at
 from torchvision_dddas.tuning.overlap import LOSSES, f_loss
 from torchvision_dddas.tuning.recorded import Recorded, differences_of, recorded
 
@@ -86,11 +86,7 @@ class Masks:
         """The frames with masks, and some of clips in which nothing moves. Raises InputError for other clips."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
-        bare = [clip.name for clip in clips if not clip.still and (clip.truth is None or not clip.truth.masks)]
-        if bare:  # told before any clip is computed
-            names = ", ".join(bare)
-            has = "have" if len(bare) > 1 else "has"
-            raise InputError(f"{names} {has} no masks of what moves; choose with --clips such as have")
+        check_masks(clips, still=True)
         return [example for clip in clips for example in _examples(clip, settings, self.after, tick)]
 
     def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
@@ -148,13 +144,13 @@ def together(frames: Sequence[Labelled], device: torch.device) -> Labelled:
 
 
 def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[Example]:
-    wanted, labels_at = _true(clip)
+    wanted, true = _true(clip)
     found = []
     # What would become of more than is drawn now: without it, whatever a lower threshold adds would seem to stay.
     freer = with_knobs(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
     probes: Iterable[Recorded | None] = recorded(clip, freer, wanted) if after else repeat(None)
     for one, probe in zip(recorded(clip, settings, wanted), probes, strict=False):
-        labels = labels_at(one)
+        labels = true(one)
         # A frame without a window shows nothing, whatever the knobs.
         if one.window is not None and (labels >= 0).any():
             differences = differences_of(one.window, settings)
@@ -175,15 +171,7 @@ def _true(clip: Clip) -> tuple[Set[int], Callable[[Recorded], np.ndarray]]:
         assert clip.still, "other clips are refused before"
         every = max((clip.frames or len(clip.pictures)) // _STILL, 1)
         return set(range(1, _STILL * every + 1, every)), lambda one: np.zeros(one.mask.shape, np.int32)
-    masks = truth.masks
-
-    def labels_at(one: Recorded) -> np.ndarray:
-        labels = labels_of(truth, one.frame)
-        if labels.shape != one.mask.shape:
-            raise InputError(f"{masks[one.frame]} is {_size(labels)}, the frame itself {_size(one.mask)}")
-        return labels
-
-    return set(masks), labels_at
+    return set(truth.masks), lambda one: labels_at(truth, one.frame, one.mask.shape)
 
 
 def _labelled(differences: Differences, labels: np.ndarray, settings: Settings) -> Labelled:
@@ -200,10 +188,6 @@ def _as_drawn(frame: Labelled, mask: np.ndarray, freer_mask: np.ndarray, freer: 
         hull = masks_of(batch, {}, 0.0) > 0.5
         freer_hull = masks_of(replace(batch, settings=freer), {}, 0.0) > 0.5
     return replace(frame, away=(hull & ~final) | (freer_hull & ~hull & ~freer_final), added=final & ~hull)
-
-
-def _size(picture: np.ndarray) -> str:
-    return f"{picture.shape[1]}x{picture.shape[0]}"
 
 
 def family() -> Masks:

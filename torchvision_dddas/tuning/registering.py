@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchvision_dddas.datasets.record import Clip
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.truth import labels_of
 from torchvision_dddas.modules.registering import Followed, refitted
 from torchvision_dddas.ops import affine, homography
 from torchvision_dddas.ops.threshold import step
@@ -25,6 +24,7 @@ from torchvision_dddas.settings import RegistrationKnobs, Settings
 from torchvision_dddas.studies.record import Task
 from torchvision_dddas.studies.stages import opened
 from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.tuning.masked import check_masks, labels_at
 from torchvision_dddas.types import Frame
 from torchvision_dddas.vision import load
 from torchvision_dddas.vision.exposure import in_one_light
@@ -66,10 +66,8 @@ class Registering:
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The frames with masks that have a next one. Raises InputError for a clip without any."""
+        check_masks(clips)
         found: list[Example] = []
-        for clip in clips:  # told before any clip is computed
-            if clip.truth is None or not clip.truth.masks:
-                raise InputError(f"{clip.name} has no masks of what moves; choose with --clips such as have")
         for clip in clips:
             before = len(found)
             for example in _examples(clip, settings):
@@ -121,10 +119,7 @@ def _examples(clip: Clip, settings: Settings) -> Iterator[Example]:
     for frame, later in frames:
         if frame.number not in truth.masks or later.number != frame.number + 1:
             continue
-        labels = labels_of(truth, frame.number)
-        if labels.shape != frame.image.shape[:2]:
-            sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in (labels, frame.image)]
-            raise InputError(f"{truth.masks[frame.number]} is {sizes[0]}, the frame itself {sizes[1]}")
+        labels = labels_at(truth, frame.number, frame.image.shape)
         points = followed(vision, frame.image, later.image, labels)
         if int(points.still.sum()) >= _FEWEST:
             yield Example(clip.name, frame.number, Step(points, settings.registration))
