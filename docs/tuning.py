@@ -7,10 +7,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from torchvision_dddas.demo import film_into
-from torchvision_dddas.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.descent import Plan, Step, descend
-from torchvision_dddas.tuning.preparing import prepare
+from torchvision_dddas.tuning.preparation import prepare
 from torchvision_dddas.tuning.verdict import judge
 
 

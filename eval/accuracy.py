@@ -19,14 +19,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 import plain_chain
 import report
 
-from torchvision_dddas.metrics import detection, segmentation
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.detection import Boxes, OneTarget
-from torchvision_dddas.metrics.segmentation import Pixels
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import load
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.vision import load as load_vision
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics import detection, segmentation
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.io.sources import open_source
 
 Found = tuple[np.ndarray, np.ndarray]
 Figures = dict[str, float]
@@ -70,10 +70,10 @@ def _clips(folder: Path) -> list[Path]:
 
 def by_us(config: str, backend: str) -> Callable[[Path], Iterator[Found]]:
     """This package under a configuration."""
-    settings = load(None if config == "default" else config)
+    settings = load_config(None if config == "default" else config)
 
     def chain(place: Path) -> Iterator[Found]:
-        for scene in run(open_source(place / "frames"), load_vision(backend, settings), settings):
+        for scene in run(open_source(place / "frames"), load_engine(backend, settings), settings):
             yield scene.mask, scene.detections.box_px
 
     return chain

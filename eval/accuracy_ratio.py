@@ -20,15 +20,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import report
 from footage import film_of, sequences, truth_of
 
-from torchvision_dddas.following import Follower
-from torchvision_dddas.metrics import clear, identity, windows
-from torchvision_dddas.metrics.matching import TrackTable, pair
-from torchvision_dddas.metrics.windows import Windows
-from torchvision_dddas.settings import Settings, load
-from torchvision_dddas.sources import open_source
+from torchvision_dddas.config import Settings, load_config
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics import clear, identity, windows
+from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.windows import Windows
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.tracking.camera_motion import Camera
+from torchvision_dddas.tracking.sequence import Follower
 from torchvision_dddas.types import Detections, Followed, Tracks
-from torchvision_dddas.vision import load as load_vision
-from torchvision_dddas.vision.camera import Camera
 
 SAME = 0.9
 PAPER = ["track.mode=paper"]
@@ -61,7 +61,7 @@ def main() -> None:
     for place, clip in filmed:
         for name, (pictures, overrides) in TRACKERS.items():
             if name.startswith(options.only):
-                found = measured(place, clip if pictures else None, options.interval, load(overrides=overrides))
+                found = measured(place, clip if pictures else None, options.interval, load_config(overrides=overrides))
                 lines.append(f"| {place.name} | {name} | {found} |")
                 print(lines[-1], file=sys.stderr, flush=True)
     print("\n".join(lines))
@@ -92,7 +92,7 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
     truth = truth.at(order[np.argsort(truth.frame[order], kind="stable")])
     last, source = int(truth.frame.max()), open_source(str(clip)) if clip else None
     size = source.size if source else tuple((truth.box_px[:, :2] + truth.box_px[:, 2:]).max(axis=0).tolist())
-    vision = load_vision("onboard", settings) if source else None
+    vision = load_engine("onboard", settings) if source else None
     followers = [Follower(settings, interval, size) for _ in range(interval)]
     cameras = [Camera(vision) for _ in range(interval)] if vision else []
     looked = 0

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from footage import frames_of, truth_of
 
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.ops import affinity
-from torchvision_dddas.targets import jaccard
-from torchvision_dddas.targets.dispersion import dispersion
-from torchvision_dddas.vision.histograms import rgb_histograms
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.functional import affinity
+from torchvision_dddas.tracking import jaccard
+from torchvision_dddas.tracking.dispersion import dispersion
+from torchvision_dddas.tracking.histograms import rgb_histograms
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ import association_data as data
 import association_plots as plots
 import footage
 
-from torchvision_dddas.metrics.accuracy_ratio import accuracy_ratio
-from torchvision_dddas.settings import PaperKnobs
-from torchvision_dddas.targets import jaccard
-from torchvision_dddas.targets.dispersion import location_weight, of_window
-from torchvision_dddas.targets.paper import assign
+from torchvision_dddas.config import PaperKnobs
+from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
+from torchvision_dddas.tracking import jaccard
+from torchvision_dddas.tracking.dispersion import location_weight, of_window
+from torchvision_dddas.tracking.source_tracker import assign
 
 # An earlier measurement at an interval of 5; None is the weight by the dispersions. Its pictures of PETS09-S2L1 cannot
 # have been those of the strongly compressed video: of the figures that use them, those of single pictures come close.

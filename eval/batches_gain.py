@@ -17,13 +17,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import results
 
-from torchvision_dddas.run import Clip, run
-from torchvision_dddas.settings import Settings, load
+from torchvision_dddas.config import Settings, load_config
+from torchvision_dddas.detection.detector import Clip, run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.studies.batches import scenes_together
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scene import render
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.studies.batches import scenes_together
 from torchvision_dddas.types import Frame, Scene
-from torchvision_dddas.vision import load as load_vision
 
 Way = Callable[[dict[str, Clip], Settings, str], dict[str, list[bytes]]]
 
@@ -61,7 +61,9 @@ def main() -> None:
     print("| configuration | way | processor ms a frame | processor, ratio | clock, ratio |")
     print("| --- | --- | ---: | ---: | ---: |")
     for config in options.configs.split(","):
-        rows(clips, load(None if config == "default" else config), config, options.backend, options.rounds, count)
+        rows(
+            clips, load_config(None if config == "default" else config), config, options.backend, options.rounds, count
+        )
 
 
 def hold(threads: int) -> None:
@@ -114,7 +116,7 @@ def alone(batch: int) -> Way:
     """One clip after the other."""
 
     def way(clips: dict[str, Clip], settings: Settings, backend: str) -> dict[str, list[bytes]]:
-        vision = load_vision(backend, settings)
+        vision = load_engine(backend, settings)
         return {name: [digits(s) for s in run(clip, vision, settings, batch=batch)] for name, clip in clips.items()}
 
     return way
@@ -123,7 +125,7 @@ def alone(batch: int) -> Way:
 def together(clips: dict[str, Clip], settings: Settings, backend: str) -> dict[str, list[bytes]]:
     """All at once."""
     found: dict[str, list[bytes]] = {name: [] for name in clips}
-    for name, scene in scenes_together(clips, load_vision(backend, settings), settings):
+    for name, scene in scenes_together(clips, load_engine(backend, settings), settings):
         if isinstance(scene, Scene):
             found[name].append(digits(scene))
     return found

@@ -23,18 +23,18 @@ import report
 from footage import film_of, sequences, truth_of
 from simulated_camera import CAMERAS, Filmed, flight, seen, translation
 
-from torchvision_dddas.following import Follower, follow_clip, follow_scenes
-from torchvision_dddas.metrics import clear, identity
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.matching import LEAST, TrackTable, pair
-from torchvision_dddas.metrics.tracking import ONE_TARGET_LEAST
-from torchvision_dddas.run import run, scenes
-from torchvision_dddas.settings import load
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.detector import run, scenes
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics import clear, identity
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
+from torchvision_dddas.evaluation.metrics.tracking import ONE_TARGET_LEAST
+from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scene import LEAST_PX, SIZE, render
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.detections import DetectionTable
+from torchvision_dddas.tracking.sequence import Follower, follow_clip, follow_scenes
 from torchvision_dddas.types import Followed, Frame, Scene, Tracks
-from torchvision_dddas.vision import load as load_vision
 
 Step = np.ndarray | None
 Told = Callable[[Step, tuple[int, int]], Step]
@@ -46,7 +46,7 @@ TOLD: dict[str, Told] = {
     "nothing": lambda step, size: None,
 }
 _SEEDS = range(4)  # scenes of the demo
-_NO_LOOKS = load(overrides=["track.appearance=never"])
+_NO_LOOKS = load_config(overrides=["track.appearance=never"])
 
 
 def main() -> None:
@@ -97,7 +97,7 @@ def _told(table: DetectionTable, maps: np.ndarray, told: Told, size: tuple[int, 
 
 
 def _measured(table: DetectionTable, source: Filmed) -> Iterator[Followed]:
-    return follow_clip(source, table, load_vision("onboard", _NO_LOOKS), _NO_LOOKS, INTERVAL)
+    return follow_clip(source, table, load_engine("onboard", _NO_LOOKS), _NO_LOOKS, INTERVAL)
 
 
 def _detections(truth: TrackTable) -> DetectionTable:
@@ -133,7 +133,7 @@ def of_clips(folder: Path) -> list[str]:
 
 
 def _own(found: list[Scene], truth: TrackTable, told: Told, interval: int, size: tuple[int, int]) -> str:
-    tracks = _table(follow_scenes((_less(scene, told, size) for scene in found), load(), interval, size))
+    tracks = _table(follow_scenes((_less(scene, told, size) for scene in found), load_config(), interval, size))
     # Elsewhere nothing is labelled, so that nothing there is wrong.
     both = pair(truth, tracks.at(np.isin(tracks.frame, truth.frame)))
     switches = clear.count(both, ONE_TARGET_LEAST).switches
@@ -150,16 +150,16 @@ def _less(scene: Scene, told: Told, size: tuple[int, int]) -> Scene:
 
 
 def _clips(folder: Path) -> Iterator[tuple[str, list[Scene], TrackTable, tuple[int, int]]]:
-    settings = load()
+    settings = load_config()
     for place in sorted(path.parent for path in folder.rglob("frames") if path.is_dir()):
         if truths.find(place) is not None:
             truth, source = truths.load(place), open_source(str(place / "frames"))
             labels = truth.tracks or _boxes({n: truths.read_mask(path) for n, path in truth.masks.items()})
-            yield place.name, list(run(source, load_vision("onboard", settings), settings)), labels, source.size
+            yield place.name, list(run(source, load_engine("onboard", settings), settings)), labels, source.size
     for seed in _SEEDS:
         clip = render(seed)
         frames = [Frame(number, (number - 1) / 10, image) for number, image in enumerate(clip.images, 1)]
-        found = list(scenes(frames, load_vision("onboard", settings), settings))
+        found = list(scenes(frames, load_engine("onboard", settings), settings))
         yield f"demo, scene {seed}", found, _boxes(dict(enumerate(clip.masks, 1))), SIZE
 
 

@@ -19,12 +19,11 @@ import numpy as np
 import plain_chain
 from films import Size, there_and_back
 
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.detector import Loop
+from torchvision_dddas.detection.engine import Foreground, View, Vision, Window, load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.run import Loop
-from torchvision_dddas.settings import load
 from torchvision_dddas.types import Frame, Registration
-from torchvision_dddas.vision import Foreground, View, Vision, Window
-from torchvision_dddas.vision import load as load_vision
 
 TURN, WARM_UP = 8, 3
 STAGES = ("prepare", "register", "foreground", "targets")
@@ -105,8 +104,8 @@ class Chain:
             self._one = self._graph
             return
         backend, config, *batch = name.split()
-        settings = load(None if config == "default" else config)
-        vision = Clocked(load_vision(backend, settings), self.watch)
+        settings = load_config(None if config == "default" else config)
+        vision = Clocked(load_engine(backend, settings), self.watch)
         self.loop = Loop(vision, settings, 10.0, batch=int(batch[0][1:]) if batch else 1)
         self._one = self._ours
 
@@ -149,7 +148,7 @@ def _can_run(name: str, sizes: Sequence[Size], graphs: Path | None) -> bool:
     if backend == "torch" and not (find_spec("torch") and find_spec("kornia")):
         return False
     try:
-        load(None if config == "default" else config)
+        load_config(None if config == "default" else config)
     except InputError:
         return False
     return True
@@ -240,7 +239,7 @@ def quartiles(name: str, values: np.ndarray) -> dict[str, float]:
 
 def alone(name: str, path: str, graphs: str = "") -> None:
     """One chain through a video, as a process that does nothing else. `nothing`: the video is only read."""
-    from torchvision_dddas.sources import open_source
+    from torchvision_dddas.io.sources import open_source
 
     source = open_source(path)
     chain = Chain(name, source.size, Path(graphs)) if name != "nothing" else None

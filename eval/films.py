@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas.sources import open_source
+from torchvision_dddas.io.sources import open_source
 
 Size = tuple[int, int]
 """Width and height, px."""

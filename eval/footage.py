@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.datasets import motchallenge
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.images import ImageSource, read_image
+from torchvision_dddas.evaluation.datasets import motchallenge
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.io.images import ImageSource, read_image
+from torchvision_dddas.io.sources import open_source
 
 
 def sequences(folder: Path) -> list[Path]:

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.settings import GroundKnobs
-from torchvision_dddas.targets.fusion import associate, together
-from torchvision_dddas.targets.ranging import sight
+from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.geo.fusion import associate, together
+from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.types import Camera, Poses, Sightings
 
 KNOBS = GroundKnobs()

@@ -14,13 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas import run as loop
-from torchvision_dddas import settings as knobs
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.segmentation import Pixels, count, measures
-from torchvision_dddas.sources import open_source
+from torchvision_dddas import config as knobs
+from torchvision_dddas.detection import detector as loop
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.segmentation import Pixels, count, measures
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame
-from torchvision_dddas.vision import load
 
 KINDS = ("as it is", "steps", "flashes", "flicker")
 LEVELS = (0.85, 1.0, 1.15)
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--only", help="clips whose name contains this")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    settings = knobs.load(chosen.config)
+    settings = knobs.load_config(chosen.config)
     print("clip | F as it is | " + " | ".join(f"{kind}: F, lost" for kind in KINDS[1:]) + " | frames not trusted")
     rows = []
     for clip in sorted(chosen.folder.iterdir()):
@@ -77,7 +77,7 @@ def lit(frames: Sequence[Frame], gain: np.ndarray) -> list[Frame]:
 def score(frames: Sequence[Frame], truth: truths.Truth, backend: str, settings: knobs.Settings) -> tuple[float, int]:
     """F over the labelled frames, and how many frames were not to be trusted."""
     pixels, untrusted = Pixels(), 0
-    for scene in loop.scenes(frames, load(backend, settings), settings):
+    for scene in loop.scenes(frames, load_engine(backend, settings), settings):
         untrusted += not scene.reliable
         if path := truth.masks.get(scene.frame.number):
             pixels = pixels.plus(count(scene.mask, truths.read_mask(path)))

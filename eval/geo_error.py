@@ -43,13 +43,13 @@ from geo_scene import (
     swapped,
 )
 
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.geodesy import lonlat
-from torchvision_dddas.targets.plane import absolute, ground_points, homography_fix
-from torchvision_dddas.targets.pose import expected_of, fit_pose, prior_of
-from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.plane import absolute, ground_points, homography_fix
+from torchvision_dddas.geo.pose_estimation import expected_of, fit_pose, prior_of
+from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import Fix, Flight, Marks
-from torchvision_dddas.vision import load_solver
 
 METHODS = ("pose", "homography", "paper")
 ORIGIN = (-110.9, 32.2)

@@ -27,11 +27,11 @@ from geo_error import INSIDE, flight_of
 from geo_scene import ALTITUDE_SIGMA, FOCAL_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, TILT_SIGMA, looking, turned
 from ranging_error import SIZES, People, detected, fitted, identities, read_truth, tsai
 
-from torchvision_dddas.settings import GroundKnobs, Settings, with_knobs
-from torchvision_dddas.targets.plane import ground_points
-from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.config import GroundKnobs, Settings, with_knobs
+from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.plane import ground_points
+from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.types import Camera, Flight, Marks
-from torchvision_dddas.vision import load_solver
 
 RATE_HZ = {"PETS09-S2L1": 7.0, "TUD-Stadtmitte": 25.0}
 SIGMA_M = 0.02

@@ -26,9 +26,9 @@ import report
 from geo_error import flight_of, marks_of, settings_for
 from geo_scene import CAMERA, Case, scenes
 
-from torchvision_dddas.targets.geodesy import east_north, lonlat
-from torchvision_dddas.targets.registrar import Registrar
-from torchvision_dddas.vision import load_solver
+from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geometry import east_north, lonlat
 
 ORIGIN = (-110.95, 32.23)
 SETS, POINTS, FRAMES = 10_000, 1_000_000, 50

@@ -14,13 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas import run as loop
-from torchvision_dddas import settings as knobs
-from torchvision_dddas import windows
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.targets.projective import chain, corner_error
+from torchvision_dddas import config as knobs
+from torchvision_dddas.detection import detector as loop
+from torchvision_dddas.detection import windows
+from torchvision_dddas.detection.engine import View, Vision, Window, load_engine
+from torchvision_dddas.geometry import chain, corner_error
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame, Registration
-from torchvision_dddas.vision import View, Vision, Window, load
 
 VIDEOS = {".mp4", ".avi", ".mkv", ".mov"}
 
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--only", help="clips whose name contains this")
     parser.add_argument("--no-masks", action="store_true", help="leave the final masks out")
     chosen = parser.parse_args()
-    settings = knobs.load(chosen.config)
+    settings = knobs.load_config(chosen.config)
     print(
         "clip | corner error px: median worst, one-sided | core IoU: mean least | mask IoU: pooled least | time: b1 b8"
     )
@@ -47,7 +47,7 @@ def main() -> None:
 
 def compare(frames: Sequence[Frame], settings: knobs.Settings, masks: bool) -> list[str]:
     """The figures of one clip, as words."""
-    engines = [load("onboard", settings), load("torch", settings)]
+    engines = [load_engine("onboard", settings), load_engine("torch", settings)]
     images = [frame.image for frame in frames]
     onboard, single, batched = Look(engines[0], images, 1), Look(engines[1], images, 1), Look(engines[1], images, 8)
     size = images[0].shape[1], images[0].shape[0]

@@ -16,8 +16,8 @@ import json, sys
 from pathlib import Path
 import cv2
 import numpy as np
-from torchvision_dddas.settings import load
-from torchvision_dddas.recognizing import recognizer_of
+from torchvision_dddas.config import load_config
+from torchvision_dddas.people.detector import recognizer_of
 from torchvision_dddas.targets import scan
 
 def held_mb():
@@ -25,7 +25,7 @@ def held_mb():
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 width, height, frames, threads, *chosen = sys.argv[1:]
-size, knobs = (int(width), int(height)), load(None, chosen).people
+size, knobs = (int(width), int(height)), load_config(None, chosen).people
 cv2.setNumThreads(int(threads))
 held = [held_mb()]
 recognizer = recognizer_of(knobs, "onboard")

@@ -23,9 +23,9 @@ from people_curves import CLIPS, Clip, Curve, Found, curve, matched, plot, read
 from people_opencv import Setting
 from scipy.optimize import minimize
 
-from torchvision_dddas.recognizing import people_in, recognizer_of
-from torchvision_dddas.settings import PeopleKnobs, load
-from torchvision_dddas.targets.persons import probability
+from torchvision_dddas.config import PeopleKnobs, load_config
+from torchvision_dddas.people.boxes import probability
+from torchvision_dddas.people.detector import people_in, recognizer_of
 from torchvision_dddas.types import People
 
 DEFAULTS = Setting(1.0, 1.05, 8, 0, 2, 0.0)
@@ -49,7 +49,7 @@ def main() -> None:
     places = [options.data / name for name in CLIPS if (options.data / name / "gt/gt.txt").is_file()]
     if not places:
         sys.exit(f"{options.data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
-    knobs = load(overrides=options.set).people
+    knobs = load_config(overrides=options.set).people
     clips = [read(place, options.every) for place in places]
     ours = [recognized(clip, knobs) for clip in clips]
     if options.calibrate:

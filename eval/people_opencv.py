@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from people_curves import Clip, Curve, Found, curve, matched
 
-from torchvision_dddas.targets.suppress import group
+from torchvision_dddas.people.suppression import group
 
 STRIDE, PADDING, LEAST = 4, 32, -0.5
 

@@ -31,12 +31,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas.recognizing import people_in
-from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.classifiers import read_classifier
-from torchvision_dddas.targets import scan, suppress
-from torchvision_dddas.vision import Recognizer, load_recognizer
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people import suppression as suppress
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.detector import people_in
+from torchvision_dddas.people.scorer import Recognizer, load_recognizer
 
 # What detectMultiScale does unless told otherwise, whatever the project's defaults.
 PLAIN = PeopleKnobs(

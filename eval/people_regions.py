@@ -21,14 +21,14 @@ from footage import film_of, truth_of
 from people_curves import CLIPS, matched
 
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.recognizing import recognize, recognizer_of
-from torchvision_dddas.run import scenes
-from torchvision_dddas.settings import Settings, load, with_knobs
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.detections import DetectionTable
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.detection.detector import scenes
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.people.detector import recognize, recognizer_of
+from torchvision_dddas.people.scorer import Recognizer
 from torchvision_dddas.types import Frame, Recognized
-from torchvision_dddas.vision import Recognizer
-from torchvision_dddas.vision import load as load_vision
 
 LIKELY = 0.5
 MODES = {
@@ -51,7 +51,7 @@ def main() -> None:
     places = [options.data / name for name in CLIPS if (options.data / name / "gt/gt.txt").is_file()]
     if not places:
         sys.exit(f"{options.data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
-    settings = load(overrides=options.set)
+    settings = load_config(overrides=options.set)
     engine = recognizer_of(settings.people, options.backend)
     rows = [
         "| clip | searched | recall % | of everywhere % | false boxes a frame | windows % | time |",
@@ -108,7 +108,7 @@ def movers(frames: Iterator[Frame], settings: Settings, rate_hz: float) -> Detec
     """What `dddas detect` finds, as a table."""
     found = [
         (scene.frame.number, *box)
-        for scene in scenes(frames, load_vision("onboard", settings), settings, rate_hz)
+        for scene in scenes(frames, load_engine("onboard", settings), settings, rate_hz)
         for box in scene.detections.box_px
     ]
     rows = np.array(found, float).reshape(-1, 5)

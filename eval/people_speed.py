@@ -29,15 +29,15 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from torchvision_dddas.settings import PeopleKnobs
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.onnx_scorer import OnboardRecognizer, opened
+from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.simulation.scene import render
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.classifiers import read_classifier
-from torchvision_dddas.targets import scan
 from torchvision_dddas.types import Part
-from torchvision_dddas.vision import load_recognizer
-from torchvision_dddas.vision.graphs import SHIPPED
-from torchvision_dddas.vision.onboard_people import OnboardRecognizer, opened
 
 KNOBS = PeopleKnobs(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
 SVM = read_classifier("opencv", 3780)

@@ -28,12 +28,12 @@ from people_curves import CLIPS, Clip, Found, curve, read
 
 from export.train_people import Plan, crops, train, write
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.recognizing import classifier_of
-from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.targets.persons import people_of
-from torchvision_dddas.targets.scan import everywhere, windows
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.people.boxes import people_of
+from torchvision_dddas.people.detector import classifier_of
+from torchvision_dddas.people.pyramid import everywhere, windows
+from torchvision_dddas.people.torch_scorer import TorchRecognizer
 from torchvision_dddas.types import LinearSvm
-from torchvision_dddas.vision.torch_people import TorchRecognizer
 
 CROP = (64, 128)  # INRIA's window in its crops
 PLAIN = ("bms_cars1", "bms_cars4", "bms_cars6", "davis_car-shadow", "davis_drift-chicane", "uav123_building4")

@@ -23,10 +23,10 @@ import report
 from footage import truth_of
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from torchvision_dddas.metrics.detection import iou
-from torchvision_dddas.settings import GroundKnobs
-from torchvision_dddas.sources.detections import read_detections
-from torchvision_dddas.targets.ranging import sight, touches_border
+from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.geo.ranging import sight, touches_border
+from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.types import Camera, Poses, Sightings
 
 SIZES = {"PETS09-S2L1": (768, 576), "TUD-Stadtmitte": (640, 480)}

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import plain_chain
 
-from torchvision_dddas.settings import load
-from torchvision_dddas.targets.projective import transfer
-from torchvision_dddas.vision import load as load_vision
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.geometry import transfer
 
 
 def errors(frames: list[np.ndarray], configs: tuple[str, ...] = ("fast", "default")) -> dict[str, dict[str, float]]:
@@ -43,7 +43,7 @@ def plain(grey: np.ndarray, later: np.ndarray) -> np.ndarray:
 
 def onboard(frames: list[np.ndarray], config: str) -> list[np.ndarray]:
     """later_from_earlier of successive frames."""
-    vision = load_vision("onboard", load(None if config == "default" else config))
+    vision = load_engine("onboard", load_config(None if config == "default" else config))
     views = [vision.prepare(frame) for frame in frames]
     return [vision.register([pair])[0].later_from_earlier for pair in pairwise(views)]
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchvision_dddas.datasets.kinds import read
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.settings import Settings
-from torchvision_dddas.studies.record import Source, Task
-from torchvision_dddas.studies.scoring import score
-from torchvision_dddas.studies.stages import find
-from torchvision_dddas.studies.summary import measures
+from torchvision_dddas.config import Settings
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Source, Task
+from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.stages import find
+from torchvision_dddas.evaluation.studies.summary import measures
 
 
 def identified(data: Path, kinds: Sequence[str]) -> list[Clip]:

@@ -17,12 +17,12 @@ import numpy as np
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, usual, walking
 
-from torchvision_dddas.metrics import segmentation
-from torchvision_dddas.metrics.crowds import CrowdScorer
-from torchvision_dddas.run import run
-from torchvision_dddas.sources.simulator import SimulatorSource
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics import segmentation
+from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Followed, Surveyed, Tracks
-from torchvision_dddas.vision import load
 
 KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}
 FIXED: dict[str, Case] = {"morphology.erode_px": {}, "morphology.close_px": {"morphology.close_m": 0.0}}
@@ -46,7 +46,7 @@ def work(case: Case) -> Case:
         for size in sizes:
             settings = usual(source, {"crowds.join_m": 0.0, **FIXED[knob], **case["set"], knob: size})
             pixels, scorer = segmentation.Pixels(), CrowdScorer()
-            for scene in run(clip, load("onboard", settings), settings, clip.log):
+            for scene in run(clip, load_engine("onboard", settings), settings, clip.log):
                 number = scene.frame.number
                 if number <= SKIPPED:
                     continue
@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("--size", default="640x480", help="of the pictures; 640x480")
     parser.add_argument("--set", action="append", default=[], metavar="KNOB=VALUE", help="other settings")
     asked = parser.parse_args()
-    from torchvision_dddas.settings import parse_override
+    from torchvision_dddas.config import parse_override
 
     size, knobs = [int(side) for side in asked.size.split("x")], dict(map(parse_override, asked.set))
     cases = [

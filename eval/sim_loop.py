@@ -26,17 +26,16 @@ import numpy as np
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import CONFIG
 
-from torchvision_dddas.metrics.crowds import CrowdScorer
-from torchvision_dddas.mission import Begun, mission_of
-from torchvision_dddas.settings import load as load_settings
-from torchvision_dddas.settings import with_knobs
+from torchvision_dddas import geometry
+from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.control.mission_api import Begun, mission_of
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.pipeline import survey
 from torchvision_dddas.simulation.scenario import load as load_scenario
 from torchvision_dddas.simulation.scenario import settings_of
-from torchvision_dddas.sources.simulator import SimulatorSource
-from torchvision_dddas.surveying import survey
-from torchvision_dddas.targets import geodesy
+from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Command, Frame
-from torchvision_dddas.vision import load as load_vision
 
 OPEN: Case = {"steering.on": False, "interval.rule": False}
 
@@ -93,12 +92,12 @@ def work(case: Case) -> Case:
     scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
     source = SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"])
     knobs = {name: value for name, value in case["set"].items() if name != "every"}
-    settings = with_knobs(load_settings(CONFIG, (), settings_of(source.scenario)), knobs)
+    settings = with_knobs(load_config(CONFIG, (), settings_of(source.scenario)), knobs)
     timed = Timed(source, case["set"].get("every", 1))
     begun = Begun(timed)
     mission = mission_of(begun, settings, "onboard")
-    vision = load_vision("onboard", mission.settings)
-    scorer = CrowdScorer(partial(geodesy.east_north, origin_deg=source.origin_deg))
+    vision = load_engine("onboard", mission.settings)
+    scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
     stages: Counter[str] = Counter()
     judging = 0.0
     timed.cpu_s, start = 0.0, time.process_time()

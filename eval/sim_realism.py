@@ -26,8 +26,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import Settings
+from torchvision_dddas.config import Settings
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection.keypoint_grid import cell_side
+from torchvision_dddas.detection.opencv_registration import keypoints
+from torchvision_dddas.geometry import transfer
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scenario import (
     AircraftKnobs,
     CameraKnobs,
@@ -36,13 +41,8 @@ from torchvision_dddas.simulation.scenario import (
     TeamKnobs,
     WorldKnobs,
 )
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.simulator import SimulatorSource
-from torchvision_dddas.targets.projective import transfer
+from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Frame
-from torchvision_dddas.vision import load as load_vision
-from torchvision_dddas.vision.cells import cell_side
-from torchvision_dddas.vision.onboard_registration import keypoints
 
 FLIGHTS = ((50.0, 90.0, 0), (50.0, 45.0, 1), (100.0, 60.0, 2), (200.0, 90.0, 3), (20.0, 35.0, 4))
 """Altitude in metres, pitch in degrees below the horizon, and the seed."""
@@ -134,7 +134,7 @@ def flight(altitude_m: float, pitch_deg: float, seed: int, size: Sequence[int], 
 def statistics(frames: Sequence[Frame]) -> dict[str, float]:
     """Medians over the pairs of successive frames."""
     settings = Settings()
-    vision = load_vision("onboard", settings)
+    vision = load_engine("onboard", settings)
     rows = []
     for earlier, later in pairwise(frames):
         views = vision.prepare(earlier.image), vision.prepare(later.image)
@@ -193,7 +193,7 @@ class Clip:
 def blobs(clip: Clip) -> float:
     """What the detector finds in a frame, in the mean."""
     settings = Settings()
-    counts = [len(scene.detections) for scene in run(clip, load_vision("onboard", settings), settings)]
+    counts = [len(scene.detections) for scene in run(clip, load_engine("onboard", settings), settings)]
     return float(np.mean(counts))
 
 

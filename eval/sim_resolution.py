@@ -21,12 +21,11 @@ from films import resized
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, walking
 
-from torchvision_dddas.run import Loop
-from torchvision_dddas.settings import load as load_settings
-from torchvision_dddas.settings import with_knobs
-from torchvision_dddas.sources.simulator import SimulatorSource
+from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.detection.detector import Loop
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Frame
-from torchvision_dddas.vision import load as load_vision
 
 SIZES = ((320, 240), (640, 480), (800, 600), (960, 720), (1280, 720), (1920, 1080))
 CONFIGS = ("patrol", "fast", "source")
@@ -51,8 +50,8 @@ def work(case: Case) -> Case:
         frames[size] = [resized(frame.image, size) for frame in kept.frames]
         focal = source.camera.focal_px[0] * size[0] / largest[0]
         for config in CONFIGS:
-            settings = with_knobs(load_settings(config), {"gates.focal_px": focal})
-            loops[size, config] = Loop(load_vision("onboard", settings), settings, kept.rate_hz, kept.log)
+            settings = with_knobs(load_config(config), {"gates.focal_px": focal})
+            loops[size, config] = Loop(load_engine("onboard", settings), settings, kept.rate_hz, kept.log)
     times: dict[tuple[tuple[int, int], str], list[float]] = {key: [] for key in loops}
     order = list(range(len(kept.frames)))
     order += order[-2:0:-1]

@@ -8,21 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.control import every_least
-from torchvision_dddas.geolocating import Locator, Site, Targets, Watch, gathered, local, site_of
-from torchvision_dddas.metrics.crowd_frames import shown
-from torchvision_dddas.metrics.crowds import CrowdScorer
-from torchvision_dddas.mission import Begun, fitted
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.settings import load as load_settings
+from torchvision_dddas import geometry
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.control.mission_api import Begun, fitted
+from torchvision_dddas.control.rules import every_least
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection.gates import pixels_per_metre
+from torchvision_dddas.evaluation.metrics.crowd_frames import shown
+from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.geo import Locator, Site, Targets, Watch, gathered, local, site_of
+from torchvision_dddas.geo.elevation import about
+from torchvision_dddas.geo.solvers import load_colours, load_solver
 from torchvision_dddas.simulation.camera import view_of
 from torchvision_dddas.simulation.receiver import SIGMAS_95, Receivers
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
-from torchvision_dddas.sources.simulator import SimulatorSource
-from torchvision_dddas.targets import geodesy
-from torchvision_dddas.targets.elevation import about
-from torchvision_dddas.targets.gates import pixels_per_metre
+from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import (
     Colours,
     Command,
@@ -36,7 +37,6 @@ from torchvision_dddas.types import (
     Tracks,
     Truth,
 )
-from torchvision_dddas.vision import load, load_colours, load_solver
 
 CONFIG = "patrol"
 """The shipped configuration of a team that watches crowds."""
@@ -57,7 +57,7 @@ class Way:
 
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
     """What `dddas run sim:` takes, and more."""
-    return with_knobs(fitted(load_settings(CONFIG, (), settings_of(source.scenario)), source), more or {})
+    return with_knobs(fitted(load_config(CONFIG, (), settings_of(source.scenario)), source), more or {})
 
 
 class OnceAFrame:
@@ -88,7 +88,7 @@ class Eye:
         self._error_m = _errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
         self._watch: Watch | None = None
         origin = source.scenario.world.origin_deg
-        self._local = partial(geodesy.east_north, origin_deg=origin)
+        self._local = partial(geometry.east_north, origin_deg=origin)
 
     def step(self, scene: Scene, scorer: CrowdScorer, truth: Truth | None = None) -> float:
         """Locate the targets of the next scene; the truth of its frame has been fed to the scorer.
@@ -125,7 +125,7 @@ class Eye:
             return math.nan
         origin = locator.site.origin_deg
         assert origin is not None
-        laid = self._local(geodesy.lonlat(locator.places(fix, pixel[inside]), origin))
+        laid = self._local(geometry.lonlat(locator.places(fix, pixel[inside]), origin))
         return float(np.linalg.norm(laid - middle[inside, :2], axis=1).mean())
 
     def scorer(self) -> CrowdScorer:
@@ -163,7 +163,7 @@ class Eye:
         frame, which, place, sigma = table.frame[kept], table.landmark[kept], table.place[kept], table.sigma_m[kept]
         if self._way.gps95_m:
             metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
-            place = geodesy.lonlat(metres, self._source.scenario.world.origin_deg)
+            place = geometry.lonlat(metres, self._source.scenario.world.origin_deg)
             sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / SIGMAS_95)
         return Landmarks(
             tuple(table.names[k] for k in self._kept), frame, np.searchsorted(self._kept, which),
@@ -201,7 +201,7 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
     scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
     least = every_least(scale, source.rate_hz, settings.steering)
     source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
-    for scene in run(begun, load("onboard", settings), settings):
+    for scene in run(begun, load_engine("onboard", settings), settings):
         truths |= {truth.frame: truth for truth in source.truths()}
         truth = truths.pop(scene.frame.number, None)
         if truth is None:

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.targets.kalman import carried_boxes
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.tracking.kalman import carried_boxes
 from torchvision_dddas.types import Frame
 
 CAMERAS = {

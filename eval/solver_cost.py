@@ -26,8 +26,8 @@ from footage import sequences, truth_of
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
-from torchvision_dddas.targets.columns import best_columns
-from torchvision_dddas.targets.relaxation import triplets
+from torchvision_dddas.tracking.lagrangian import triplets
+from torchvision_dddas.tracking.triplets import best_columns
 
 INTERVAL = 5
 THRESHOLD = 0.4

@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 from plain_chain import LEAST_AREA_PX
 
-from torchvision_dddas.settings import load
-from torchvision_dddas.vision.cells import cell_side
-from torchvision_dddas.vision.graphs import opened
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.keypoint_grid import cell_side
+from torchvision_dddas.runtime import opened
 
 NAME = "graph step"
 Size = tuple[int, int]
@@ -40,7 +40,7 @@ class StepGraph:
 
     def __init__(self, folder: Path, size: Size) -> None:
         self.session = opened(folder, file_of(size), enable_cpu_mem_arena=False)
-        knobs = load("fast")
+        knobs = load_config("fast")
         cell = cell_side(*size, knobs.registration)
         count = (size[0] // cell) * (size[1] // cell)
         hypotheses = next(i.shape[0] for i in self.session.get_inputs() if i.name == "samples")
@@ -79,9 +79,9 @@ def parity(frames: list[np.ndarray], graph: StepGraph, size: Size) -> dict[str, 
     import registration_error
     import torch
 
-    from torchvision_dddas.exporting import traced
+    from torchvision_dddas.export import traced_graphs as traced
 
-    module = traced.module("step", load("fast"), size)
+    module = traced.module("step", load_config("fast"), size)
     given = [torch.from_numpy(value) for value in graph.given.values()]
     greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
     corners, overlaps, ours, plain = [], [], [], []

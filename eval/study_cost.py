@@ -21,10 +21,10 @@ import machine
 import numpy as np
 from films import scene
 
-from torchvision_dddas.studies.jobs import share
-from torchvision_dddas.studies.record import Source, Spec
-from torchvision_dddas.studies.running import order, plan, run_study
-from torchvision_dddas.studies.working import Job
+from torchvision_dddas.evaluation.studies.jobs import share
+from torchvision_dddas.evaluation.studies.record import Source, Spec
+from torchvision_dddas.evaluation.studies.running import order, plan, run_study
+from torchvision_dddas.evaluation.studies.working import Job
 
 SIZE = (640, 480)
 SHORT = 60

@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 import draws
 from sequences import identified, idf1
 
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings, load, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.affinities import Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 
 KNOBS = {
     "dispersion": ("paper.threshold", "paper.lowest_dispersion", "paper.location_cut", "paper.appearance_cut"),
@@ -47,7 +47,7 @@ def main() -> None:
     ask.add_argument("--json", type=Path)
     given = ask.parse_args()
     torch.set_num_threads(1)
-    shipped = with_knobs(load("paper"), {"paper.window": 2, "paper.rule": given.rule})
+    shipped = with_knobs(load_config("paper"), {"paper.window": 2, "paper.rule": given.rule})
     clips = {
         clip.name: clip
         for clip in identified(given.data, ("motchallenge", "cvml"))

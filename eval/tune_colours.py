@@ -23,15 +23,15 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 
-from torchvision_dddas.metrics.segmentation import ratio
-from torchvision_dddas.settings import load
+from torchvision_dddas.config import load_config
+from torchvision_dddas.evaluation.metrics.segmentation import ratio
+from torchvision_dddas.geo.colour_calibration import hsv_of, hue_apart, pooled, ranges_of, standing_out
+from torchvision_dddas.geo.opencv_colours import OnboardColours
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Fault, Scenario
 from torchvision_dddas.simulation.simulator import Shot, Simulator
 from torchvision_dddas.simulation.team import plates
-from torchvision_dddas.targets.calibration import hsv_of, hue_apart, pooled, ranges_of, standing_out
 from torchvision_dddas.tuning.colours import fit_colours
 from torchvision_dddas.types import Colours
-from torchvision_dddas.vision.onboard_colours import OnboardColours
 
 TEAM = 4
 SUNS_DEG = (12.0, 35.0, 75.0)
@@ -87,7 +87,7 @@ def ways(learned: Sequence[Seen], steps: int) -> dict[str, Colours]:
 
 def unlabelled(pictures: Sequence[np.ndarray], own: Colours) -> Colours | None:
     """What `dddas colours --count 4` finds, in the order of the team; None where a colour does not stand out."""
-    hsv, least = [hsv_of(picture) for picture in pictures], load().landmarks.least_area_px
+    hsv, least = [hsv_of(picture) for picture in pictures], load_config().landmarks.least_area_px
     groups = pooled([standing_out(one, least, k) for k, one in enumerate(hsv)], TEAM)
     middle = own.low[:, 0] + 7
     order = [min(range(len(groups)), key=lambda k: abs(hue_apart(groups[k][0].hue, hue))) for hue in middle]

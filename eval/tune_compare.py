@@ -19,14 +19,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.modules.tunable import TUNABLE
-from torchvision_dddas.settings import Settings, load, with_knobs
-from torchvision_dddas.studies import sweep as sweeping
-from torchvision_dddas.studies.axes import Range, possible
-from torchvision_dddas.studies.spec import read_spec
-from torchvision_dddas.studies.tried import Tried
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.evaluation.studies import sweep as sweeping
+from torchvision_dddas.evaluation.studies.axes import Range, possible
+from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.tried import Tried
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.preparing import Prepared, prepare
+from torchvision_dddas.tuning.parameters import TUNABLE
+from torchvision_dddas.tuning.preparation import Prepared, prepare
 
 MOST = 100_000
 
@@ -40,7 +40,7 @@ def main() -> None:
         began = time.perf_counter()
         ready = prepare(spec, base, names, holdout)
         prepared_s = time.perf_counter() - began
-        settings = load(spec.config, spec.overrides)
+        settings = load_config(spec.config, spec.overrides)
         rows: dict[str, Any] = {}
         judge = Tried(ready.spec, base, replace(ready.goal, by="mean"), 0, None, Path(place) / "judge")
         rows["as it was"] = _judged(judge, {}, ready, 0, 0.0)
@@ -128,7 +128,7 @@ def _axis(name: str, settings: Settings, factor: float) -> Range:
 
 
 def _judged(judge: Tried, knobs: Mapping[str, object], ready: Prepared, count: int, spent: float) -> dict[str, Any]:
-    with_knobs(load(judge.spec.config, judge.spec.overrides), knobs)
+    with_knobs(load_config(judge.spec.config, judge.spec.overrides), knobs)
     tuned, held = (judge.measured(knobs, clips)[0] for clips in (ready.tuned, ready.held))
     return {"tuned": tuned, "held_out": held, "points": count, "seconds": spent, "knobs": dict(knobs)}
 

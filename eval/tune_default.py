@@ -18,9 +18,9 @@ import draws
 import report
 from tune_recovery import f
 
-from torchvision_dddas.datasets import folder
-from torchvision_dddas.demo import film_into
-from torchvision_dddas.settings import load, with_knobs
+from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.evaluation.datasets import folder
+from torchvision_dddas.simulation.demo import film_into
 
 BEFORE = {"difference.threshold": 4.0, "difference.gradient_share": 0.15, "refine.spatial_px": 60.0}
 # Far from the seeds of other studies, of which none was looked at when the values were chosen.
@@ -50,7 +50,7 @@ def main() -> None:
 
 def _scene(seed: int) -> tuple[float, float]:
     """F before and with the shipped values."""
-    shipped = load()
+    shipped = load_config()
     with tempfile.TemporaryDirectory() as place:
         film_into(Path(place) / "scene", seed, FRAMES, SIZE)
         (clip,) = folder.read(Path(place), {}, lambda name: True).clips

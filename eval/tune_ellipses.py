@@ -28,15 +28,15 @@ import numpy as np
 import report
 from geo_scene import CAMERA, Case, Scenes, scenes
 
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.tuning.aerial_examples import Seen, kept, look_at
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.looks import Seen, kept, look_at
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 from torchvision_dddas.tuning.places import family
 from torchvision_dddas.types import Flight, Marks
-from torchvision_dddas.vision import load_solver
 
 TUNED = (
     "aerial.tilt_sigma_deg",

@@ -21,15 +21,15 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.modules.tunable import Knobs, chosen
-from torchvision_dddas.settings import Settings, load
-from torchvision_dddas.studies.record import Spec
-from torchvision_dddas.studies.running import plan, run_study
-from torchvision_dddas.studies.spec import read_spec
-from torchvision_dddas.studies.summary import measures
+from torchvision_dddas.config import Settings, load_config
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Spec
+from torchvision_dddas.evaluation.studies.running import plan, run_study
+from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.masks import Masks
+from torchvision_dddas.tuning.parameters import Knobs, chosen
 
 MEAN = "mean"
 
@@ -40,7 +40,7 @@ def main() -> None:
     torch.set_num_threads(1)
     spec = replace(read_spec(given.study), overrides=tuple(given.set or ()), tasks=("motion",))
     spec = replace(spec, config=given.config) if given.config else spec
-    settings, names = load(spec.config, spec.overrides), chosen(given.knobs.split(","))
+    settings, names = load_config(spec.config, spec.overrides), chosen(given.knobs.split(","))
     judged = Judge(spec, given.study.parent, given.jobs)
     clips = {job.clip.name: job.clip for job in plan(spec, given.study.parent, []).jobs}
     learned = {name: Masks().examples([thinned(clip, given.frames)], settings) for name, clip in clips.items()}

@@ -35,16 +35,16 @@ import draws
 import report
 from sequences import identified, idf1
 
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.studies import sweep
-from torchvision_dddas.studies.axes import Range
-from torchvision_dddas.studies.record import Task
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.studies import sweep
+from torchvision_dddas.evaluation.studies.axes import Range
+from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.identities import Identities
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 
 KNOBS = (
     "track.speed",

@@ -26,19 +26,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import report
 
-from torchvision_dddas.datasets import inria, motchallenge
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.metrics.detection import iou
-from torchvision_dddas.metrics.ranking import judged
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.recognizing import people_in, recognizer_of
-from torchvision_dddas.settings import PeopleKnobs, Settings
-from torchvision_dddas.studies.stages import opened
-from torchvision_dddas.targets import scan
-from torchvision_dddas.targets.persons import people_of
+from torchvision_dddas.config import PeopleKnobs, Settings
+from torchvision_dddas.evaluation.datasets import inria, motchallenge
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.ranking import judged
+from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people.boxes import people_of
+from torchvision_dddas.people.detector import people_in, recognizer_of
 from torchvision_dddas.tuning import recognition
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.types import People
 
 CROPS = "INRIA crops"

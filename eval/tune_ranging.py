@@ -18,13 +18,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from ranging_error import SIZES, People, detected, fitted, read_truth, seen, tsai
 
-from torchvision_dddas.metrics.metres import inside
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import GroundKnobs, Settings
+from torchvision_dddas.config import GroundKnobs, Settings
+from torchvision_dddas.evaluation.metrics.metres import inside
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.ground_examples import KNOBS, sighted
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.tuning.places import family
-from torchvision_dddas.tuning.ranged import KNOBS, sighted
 from torchvision_dddas.types import Camera
 
 

@@ -20,19 +20,19 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 
-from torchvision_dddas.datasets import folder
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.demo import film_into
-from torchvision_dddas.metrics import segmentation
-from torchvision_dddas.metrics.segmentation import Pixels
-from torchvision_dddas.metrics.truth import labels_of
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import Settings, load, with_knobs
-from torchvision_dddas.studies.stages import opened
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.datasets import folder
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics import segmentation
+from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.evaluation.metrics.truth import labels_of
+from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.masks import Masks
-from torchvision_dddas.vision import load as load_vision
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 
 KNOBS = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
@@ -55,7 +55,7 @@ def main() -> None:
 
 def recovery(seeds: int, steps: int) -> list[str]:
     """The table of all seeds."""
-    shipped = with_knobs(load(), BASE)
+    shipped = with_knobs(load_config(), BASE)
     rows = []
     for seed in range(seeds):
         with tempfile.TemporaryDirectory() as place:
@@ -106,14 +106,14 @@ def f(clip: Clip, settings: Settings) -> float:
     """Pixels' F of the hard pipeline."""
     assert clip.truth is not None
     total = Pixels()
-    for scene in run(opened(clip), load_vision("onboard", settings), settings):
+    for scene in run(opened(clip), load_engine("onboard", settings), settings):
         total = total.plus(segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
     return float(np.nan_to_num(segmentation.measures(total)["f"]))
 
 
 def one_step(frames: int = 8, rounds: int = 10) -> list[str]:
     """Time of a step on a batch of windows, by the clock and of all processors, and the most memory taken."""
-    settings = load()
+    settings = load_config()
     with tempfile.TemporaryDirectory() as place:
         clip = filmed(Path(place), 0)
         family = Masks()

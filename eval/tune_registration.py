@@ -22,15 +22,15 @@ import report
 from registration_error import distance
 from tune_recovery import BASE, FRAMES, SIZE, f, filmed
 
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings, load, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import RATE_HZ
-from torchvision_dddas.studies.stages import opened
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.registering import CHECK, RANSAC, family
-from torchvision_dddas.vision import load as load_vision
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.registration import CHECK, RANSAC, family
 
 FACTORS = {"three times": 3.0, "a third": 1 / 3}
 
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--write", type=Path, help="a text with marks for the table")
     given = parser.parse_args()
     found: dict[str, list[list[float]]] = {name: [] for name in FACTORS}
-    shipped = with_knobs(load(), BASE)
+    shipped = with_knobs(load_config(), BASE)
     for seed in range(given.seeds):
         with tempfile.TemporaryDirectory() as place:
             numbers = 2 * seed, 2 * seed + 1
@@ -80,7 +80,7 @@ def judged(clip: Clip, seed: int, settings: Settings) -> tuple[float, float]:
     """Mean error of the registrations over the corners, px, and pixels' F of the hard pipeline."""
     maps = [view.image_from_ground for view in flight(seed, FRAMES, SIZE, RATE_HZ)]
     true = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(maps)]
-    vision = load_vision("onboard", settings)
+    vision = load_engine("onboard", settings)
     views = [vision.prepare(frame.image) for frame in opened(clip)]
     ours = [vision.register([pair])[0].later_from_earlier for pair in pairwise(views)]
     error_px = float(np.mean([distance(a, b, *SIZE) for a, b in zip(ours, true, strict=True)]))

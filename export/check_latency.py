@@ -19,13 +19,14 @@ from itertools import islice
 
 import numpy as np
 
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection.detector import Loop
+from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.run import Loop
-from torchvision_dddas.settings import load
-from torchvision_dddas.sources import open_source
+from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.people.scorer import load_recognizer
 from torchvision_dddas.types import Frame
-from torchvision_dddas.vision import load as load_vision
-from torchvision_dddas.vision import load_recognizer, load_solver
 
 WARM_UP = 10
 
@@ -65,10 +66,10 @@ def homography_ms() -> list[float]:
 
 def people_ms(images: list[np.ndarray]) -> list[float]:
     """All windows of whole pictures on all levels: the dearest search there is."""
-    from torchvision_dddas.sources.classifiers import read_classifier
-    from torchvision_dddas.targets.scan import everywhere
+    from torchvision_dddas.people.classifiers import read_classifier
+    from torchvision_dddas.people.pyramid import everywhere
 
-    knobs = load(None, []).people
+    knobs = load_config(None, []).people
     recognizer = load_recognizer("onboard", knobs, read_classifier(knobs.classifier, knobs.features))
     parts = everywhere(images[0].shape[1::-1], knobs)
     return [spent_ms(lambda image=image: recognizer.scores([image], [parts])) for image in images][1:]  # type: ignore[misc]
@@ -77,8 +78,8 @@ def people_ms(images: list[np.ndarray]) -> list[float]:
 def checked(options: argparse.Namespace) -> bool:
     """Measure and print; whether the rate is kept."""
     width, _, height = options.size.partition("x")
-    settings = load(options.config, [])
-    loop = Loop(load_vision("onboard", settings), settings, options.rate)
+    settings = load_config(options.config, [])
+    loop = Loop(load_engine("onboard", settings), settings, options.rate)
     ms: list[float] = []
     last = None
     for i, image in enumerate(pictures(options.clip, (int(width), int(height)), options.frames + WARM_UP)):

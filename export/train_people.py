@@ -31,15 +31,15 @@ import numpy as np
 import torch
 
 from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.config import PeopleKnobs, load_config
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.ops import hog
-from torchvision_dddas.settings import PeopleKnobs, load
-from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, remove, temporary, write_whole
-from torchvision_dddas.sources.images import IMAGE_SUFFIXES
-from torchvision_dddas.targets.scan import everywhere, levels
+from torchvision_dddas.functional import hog
+from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, remove, temporary, write_whole
+from torchvision_dddas.io.images import IMAGE_SUFFIXES
+from torchvision_dddas.people.pyramid import everywhere, levels
+from torchvision_dddas.people.torch_scorer import TorchRecognizer
+from torchvision_dddas.people.torch_scorer import layout as descriptor
 from torchvision_dddas.types import LinearSvm, Part
-from torchvision_dddas.vision.torch_people import TorchRecognizer
-from torchvision_dddas.vision.torch_people import layout as descriptor
 
 CHOICES = (0.003, 0.01, 0.03, 0.1, 0.3)
 BATCH = 256
@@ -90,7 +90,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--quiet", action="store_true")
     options = parser.parse_args(words)
     try:
-        knobs = load(options.config, options.overrides).people
+        knobs = load_config(options.config, options.overrides).people
         plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
         check(plan)
         check_out(options.out, (options.positives, options.negatives))

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.settings import AerialKnobs, Settings
-from torchvision_dddas.targets.projection import axes_of, project
-from torchvision_dddas.targets.rotation import turned
+from torchvision_dddas.config import AerialKnobs, Settings
+from torchvision_dddas.geo.projection import axes_of, project
+from torchvision_dddas.geometry import turned
 from torchvision_dddas.types import Camera, CameraPose, Flight, Marks
 
 FOCAL_PX = 960 / np.tan(np.radians(35))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tests.upright import pixels
-from torchvision_dddas.targets.geodesy import lonlat
+from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import Camera
 
 ORIGIN = (-110.95, 32.23)

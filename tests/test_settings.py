@@ -7,8 +7,7 @@ from typing import Annotated
 import pytest
 from pydantic import Field, ValidationError
 
-from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import (
+from torchvision_dddas.config import (
     Group,
     Knob,
     Settings,
@@ -16,10 +15,11 @@ from torchvision_dddas.settings import (
     changes,
     config_names,
     knob,
-    load,
+    load_config,
     range_of,
     with_knobs,
 )
+from torchvision_dddas.errors import InputError
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.toml"))
 KNOBS = {row.name: row for row in all_knobs()}
@@ -45,7 +45,7 @@ def test_every_default_lies_in_its_own_range() -> None:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_a_shipped_configuration_loads_and_holds_only_what_differs_from_the_defaults(path: Path) -> None:
     written = {f"{group}.{name}" for group, knobs in tomllib.loads(path.read_text()).items() for name in knobs}
-    assert written == set(changes(load(path.stem)))
+    assert written == set(changes(load_config(path.stem)))
 
 
 def test_source_and_fast_are_shipped() -> None:
@@ -55,7 +55,7 @@ def test_source_and_fast_are_shipped() -> None:
 def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("[registration]\nkeypoints = 300\nlevels = 2\n")
-    settings = load(path, ["registration.keypoints=400", "registration.model=affine", "interval.rule=false"])
+    settings = load_config(path, ["registration.keypoints=400", "registration.model=affine", "interval.rule=false"])
     assert changes(settings) == {
         "registration.model": "affine",
         "registration.keypoints": 400,
@@ -74,7 +74,7 @@ def test_a_list_of_numbers_can_be_a_knob() -> None:
 
 
 def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
-    assert load(None, ["registration.ransac_px=2"]).registration.ransac_px == 2.0
+    assert load_config(None, ["registration.ransac_px=2"]).registration.ransac_px == 2.0
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
 )
 def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: str, wanted: list[str]) -> None:
     with pytest.raises(InputError) as error:
-        load(None, [override])
+        load_config(None, [override])
     line = str(error.value)
     assert "\n" not in line
     for part in wanted:
@@ -126,7 +126,7 @@ def test_a_mistake_in_a_file_names_the_file(tmp_path: Path, text: str, wanted: l
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError) as error:
-        load(path)
+        load_config(path)
     line = str(error.value)
     assert "\n" not in line
     for part in [str(path), *wanted]:
@@ -137,14 +137,14 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="cannot be read as text"):
-        load(path)
+        load_config(path)
 
 
 def test_an_unknown_configuration_lists_those_that_there_are(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'sauce'.*fast.*source"):
-        load("sauce")
+        load_config("sauce")
     with pytest.raises(InputError, match="no such configuration file"):
-        load(tmp_path / "absent.toml")
+        load_config(tmp_path / "absent.toml")
 
 
 def test_settings_cannot_be_changed_in_place() -> None:
@@ -153,10 +153,10 @@ def test_settings_cannot_be_changed_in_place() -> None:
 
 
 def test_settings_survive_a_round_trip_through_plain_data() -> None:
-    settings = load("source")
+    settings = load_config("source")
     assert Settings.model_validate_json(settings.model_dump_json()) == settings
 
 
 def test_pauses_before_a_stream_is_opened_again_cannot_shrink():
     with pytest.raises(InputError, match=r"retry_most_s = 1 is below retry_s = 4"):
-        load(None, ["live.retry_s=4", "live.retry_most_s=1"])
+        load_config(None, ["live.retry_s=4", "live.retry_most_s=1"])

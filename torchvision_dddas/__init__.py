@@ -16,10 +16,10 @@ _HOME = {
     "InputError": ("errors", "InputError"),
     "Registration": ("types", "Registration"),
     "Scene": ("types", "Scene"),
-    "Settings": ("settings", "Settings"),
+    "Settings": ("config", "Settings"),
     "Telemetry": ("types", "Telemetry"),
-    "load_settings": ("settings", "load"),
-    "open_source": ("sources", "open_source"),
+    "load_settings": ("config", "load_config"),
+    "open_source": ("io.sources", "open_source"),
 }
 
 __all__ = ["__version__", *_HOME]

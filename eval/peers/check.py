@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.evaluate import evaluate
-from torchvision_dddas.metrics import truth as true_boxes
-from torchvision_dddas.studies.record import Found
-from torchvision_dddas.studies.scoring import as_written, score
-from torchvision_dddas.studies.summary import measures
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.evaluate import evaluate
+from torchvision_dddas.evaluation.metrics import truth as true_boxes
+from torchvision_dddas.evaluation.studies.record import Found
+from torchvision_dddas.evaluation.studies.scoring import as_written, score
+from torchvision_dddas.evaluation.studies.summary import measures
 
 HERE = Path(__file__).resolve().parent
 PEERS = HERE.parents[1] / ".venv-peers/bin/python"

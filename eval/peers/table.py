@@ -27,11 +27,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import report
 from footage import sequences
 
-from torchvision_dddas.datasets import motchallenge
-from torchvision_dddas.metrics import clear, hota, identity, mot_text, tracking
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.matching import TrackTable, pair
-from torchvision_dddas.metrics.tracking import TrackCounts
+from torchvision_dddas.evaluation.datasets import motchallenge
+from torchvision_dddas.evaluation.metrics import clear, hota, identity, mot_text, tracking
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
 
 ROOT = Path(__file__).resolve().parents[2]
 TRACKERS, NORFAIR = ROOT / ".venv-peers/bin/python", ROOT / ".venv-norfair/bin/python"
@@ -307,10 +307,10 @@ def our_seconds(sequence: Sequence) -> float:
     """Time of our tracker in a fresh process, as the peers have it."""
     program = (
         "import sys, time\n"
-        "from torchvision_dddas.settings import load\n"
-        "from torchvision_dddas.sources.detections import read_detections\n"
-        "from torchvision_dddas.targets.tracks import Tracker\n"
-        "table, tracker = read_detections(sys.argv[1]), Tracker(load(), 1)\n"
+        "from torchvision_dddas.config import load_config\n"
+        "from torchvision_dddas.io.detection_tables import read_detections\n"
+        "from torchvision_dddas.tracking.tracker import Tracker\n"
+        "table, tracker = read_detections(sys.argv[1]), Tracker(load_config(), 1)\n"
         "given = [table.at(f) for f in range(1, int(sys.argv[2]) + 1)]\n"
         "begun = time.perf_counter()\n"
         "for f, detections in enumerate(given, 1): tracker.feed(f, detections)\n"

@@ -31,20 +31,20 @@ def stub_engine(found=True, after=None):
         return types.SimpleNamespace(name=f"stub {backend}")
 
     modules = {f"torchvision_dddas.{name}": types.ModuleType(name) for name in ("run", "vision")}
-    modules["torchvision_dddas.run"].__dict__["run"] = run
-    modules["torchvision_dddas.vision"].__dict__["load"] = load
+    modules["torchvision_dddas.detection.detector"].__dict__["run"] = run
+    modules["torchvision_dddas.detection.engine"].__dict__["load_engine"] = load
     return modules
 
 
 @pytest.fixture
 def engine(monkeypatch):
-    from torchvision_dddas import surveying
+    from torchvision_dddas import pipeline as surveying
 
     def install(**how):
         stubs = stub_engine(**how)
         for name, module in stubs.items():
             monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.setattr(surveying, "run", stubs["torchvision_dddas.run"])
+        monkeypatch.setattr(surveying, "run", stubs["torchvision_dddas.detection.detector"])
 
     install()
     return install

@@ -5,7 +5,7 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.upright import boxes, camera
-from torchvision_dddas.sources.cameras import read_camera
+from torchvision_dddas.io.camera_files import read_camera
 
 PERSON = ("--body-height", 1.8, "--distance", 9)
 

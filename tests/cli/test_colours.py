@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.cli.mistakes import bad
-from torchvision_dddas.sources.colours import read_colours
+from torchvision_dddas.io.colour_files import read_colours
 
 BOXES = {"red": (20, 30, 24, 16), "blue": (90, 60, 24, 16)}
 BGR = {"red": (40, 30, 200), "blue": (190, 60, 40)}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.cli import progress as progress_module
-from torchvision_dddas.demo import film_into
+from torchvision_dddas.simulation.demo import film_into
 
 
 def test_help_loads_nothing_heavy():
@@ -29,7 +29,7 @@ def test_version_and_help(dddas):
 
 
 def test_settings_lists_every_knob_on_its_line(dddas):
-    from torchvision_dddas.settings import all_knobs
+    from torchvision_dddas.config import all_knobs
 
     lines = dddas("settings").stdout.splitlines()
     for knob in all_knobs():
@@ -118,7 +118,7 @@ def test_metrics_that_cannot_be_written_are_one_line(dddas, engine, clip, tmp_pa
 
 
 def test_demo_films_detects_and_scores_twice_into_the_same_folder(dddas, engine, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.demo.film_into.__defaults__", (0, 3, (160, 120)))
+    monkeypatch.setattr("torchvision_dddas.simulation.demo.film_into.__defaults__", (0, 3, (160, 120)))
     for _ in range(2):
         result = dddas("demo", "--out", tmp_path / "demo")
         assert result.exit_code == 0, result.output

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.studies import world
+from tests.evaluation.studies import world
 
 
 @pytest.fixture

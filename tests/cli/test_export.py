@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchvision_dddas.vision.graphs import manifest, opened
+from torchvision_dddas.runtime import manifest, opened
 
 pytest.importorskip("torch")
 pytest.importorskip("onnx")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.upright import boxes, camera
-from torchvision_dddas.sources.positions import read_positions
+from torchvision_dddas.io.position_tables import read_positions
 
 CAMERA = "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheight_m = 1.2\n"
 PEOPLE = np.array([[-1.0, 10.0], [2.0, 14.0]])

@@ -85,7 +85,7 @@ def test_what_is_amiss_and_what_was_repaired_is_said_at_the_end(aerial):
 
 def test_longitudes_and_latitudes_are_those_of_the_metres(aerial, tmp_path):
     from tests.overflight import ORIGIN
-    from torchvision_dddas.targets.geodesy import lonlat
+    from torchvision_dddas.geometry import lonlat
 
     flight = Overflight(frames=2)
     found = located(aerial(flight), tmp_path / "out")

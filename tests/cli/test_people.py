@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.cli.mistakes import bad
-from torchvision_dddas.sources.detections import read_detections
+from torchvision_dddas.io.detection_tables import read_detections
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = tuple(
@@ -56,7 +56,7 @@ def stub(monkeypatch):
             loads.append(backend)
             return Stub(knobs, found)
 
-        monkeypatch.setattr("torchvision_dddas.recognizing.recognizer_of", load)
+        monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", load)
         return loads
 
     install()
@@ -293,10 +293,10 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
                     time.sleep(60)
             yield tick
 
-        import torchvision_dddas.recognizing
+        import torchvision_dddas.people.detector
 
         sys.modules["torchvision_dddas.cli.people"].progress = stopping
-        torchvision_dddas.recognizing.recognizer_of = lambda knobs, backend: Stub(knobs)
+        torchvision_dddas.people.detector.recognizer_of = lambda knobs, backend: Stub(knobs)
         torchvision_dddas.cli.main()
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "people", str(clip), *SMALL]

@@ -193,7 +193,7 @@ def test_positions_of_someone_else_are_neither_replaced_nor_removed(dddas, clip,
 
 
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
-    from torchvision_dddas import following
+    from torchvision_dddas.tracking import sequence as following
 
     whole_of = following.follow_scenes
 

@@ -14,8 +14,8 @@ import pytest
 
 from tests.cli.mistakes import bad
 from torchvision_dddas.cli.prepared import prepared
+from torchvision_dddas.io.stream_capture import without_secrets
 from torchvision_dddas.simulation.scene import render
-from torchvision_dddas.sources.stream import without_secrets
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.
@@ -80,7 +80,7 @@ def test_a_second_session_touches_nothing_of_the_first(dddas, frames, tmp_path):
 
 
 def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames, tmp_path, monkeypatch):
-    from torchvision_dddas.vision.onboard_vision import OnboardVision
+    from torchvision_dddas.detection.opencv_engine import OnboardVision
 
     prepare, asked = OnboardVision.prepare, []
 
@@ -102,8 +102,8 @@ def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames
 
 
 def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frames, tmp_path, monkeypatch):
+    from torchvision_dddas.detection.opencv_engine import OnboardVision
     from torchvision_dddas.live import runner
-    from torchvision_dddas.vision.onboard_vision import OnboardVision
 
     def broken(self, image):
         raise ValueError("no picture will do")

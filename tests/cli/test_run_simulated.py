@@ -8,8 +8,8 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
-from torchvision_dddas.sources.positions import read_positions
-from torchvision_dddas.targets import geodesy
+from torchvision_dddas import geometry
+from torchvision_dddas.io.position_tables import read_positions
 
 FAULTS = ({"what": "frozen", "time_s": 1.0, "seconds": 0.25}, {"what": "dropped", "time_s": 1.5, "seconds": 0.15})
 
@@ -56,7 +56,7 @@ def test_results_and_truth_are_places_on_the_same_earth(made):
     nearest = []
     for frame, place in zip(found.frame.tolist(), found.lonlat_deg, strict=True):
         crowd = true.lonlat_deg[(true.frame == frame) & (kind == "person")]
-        nearest.append(np.linalg.norm(geodesy.east_north(crowd, (place[0], place[1])), axis=1).min())
+        nearest.append(np.linalg.norm(geometry.east_north(crowd, (place[0], place[1])), axis=1).min())
     assert np.median(nearest) < 2.0
 
 
@@ -87,7 +87,7 @@ def test_the_record_says_how_good_it_was(made):
 
 
 def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dddas, monkeypatch):
-    from torchvision_dddas.sinks.flown import FlownOutput
+    from torchvision_dddas.simulation.closed_loop_output import FlownOutput
 
     survey = FlownOutput.survey
 

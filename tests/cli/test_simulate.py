@@ -9,15 +9,15 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
-from torchvision_dddas.metrics import truth as judges
+from torchvision_dddas import geometry
+from torchvision_dddas.evaluation.metrics import truth as judges
+from torchvision_dddas.io.camera_files import poses_at, read_camera, read_poses
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.position_tables import read_positions
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.simulation.scenario import load, names
-from torchvision_dddas.sources import open_source
-from torchvision_dddas.sources.cameras import poses_at, read_camera, read_poses
-from torchvision_dddas.sources.colours import read_colours
-from torchvision_dddas.sources.landmarks import read_landmarks
-from torchvision_dddas.sources.positions import read_positions
-from torchvision_dddas.sources.telemetry import read_telemetry
-from torchvision_dddas.targets import geodesy
 
 FAULTS = ({"what": "dropped", "time_s": 0.5, "seconds": 0.15}, {"what": "gps_dropout", "time_s": 1.0, "seconds": 0.55})
 
@@ -76,7 +76,7 @@ def test_reports_are_read_and_true(made):
     first = np.flatnonzero((landmarks.frame == 1) & ~landmarks.planned)
     places = np.array([[float(r["longitude_deg"]), float(r["latitude_deg"])] for r in true])
     origin = float(places[0, 0]), float(places[0, 1])
-    apart = geodesy.east_north(landmarks.place[first], origin) - geodesy.east_north(places, origin)
+    apart = geometry.east_north(landmarks.place[first], origin) - geometry.east_north(places, origin)
     assert np.abs(apart).max() < 0.02
 
 
@@ -99,9 +99,9 @@ def test_camera_and_colours_are_read(made):
 
 def test_the_elevation_is_that_of_the_world(made):
     pytest.importorskip("rasterio")
+    from torchvision_dddas.io.elevation import read_elevation
     from torchvision_dddas.simulation.relief import up
-    from torchvision_dddas.sources.elevation import read_elevation
-    from torchvision_dddas.sources.simulator import simulator_of
+    from torchvision_dddas.simulation.source import simulator_of
 
     folder, _ = made
     scenario = load(folder / "scenario.toml")
@@ -130,7 +130,7 @@ def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
     number = int(vehicles[1]["target"])
     assert true.lonlat_deg is not None
     lon, lat = true.lonlat_deg[(true.target == number) & (true.frame == 16)][0].tolist()
-    assert np.hypot(*geodesy.east_north(poses.place[1:], (lon, lat))[0]) < 0.1
+    assert np.hypot(*geometry.east_north(poses.place[1:], (lon, lat))[0]) < 0.1
     # Its receiver is silent at frames 11 and 16: nobody would know where the picture was taken.
     assert len(list((folder / "ground" / "ugv1").glob("*.jpg"))) == 2
 

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from tests.cli.mistakes import bad
 from torchvision_dddas.cli import app
-from torchvision_dddas.settings import load
+from torchvision_dddas.config import load_config
+from torchvision_dddas.evaluation.studies import tried
+from torchvision_dddas.evaluation.studies.tried import Tried
 from torchvision_dddas.simulation.scene import render
-from torchvision_dddas.studies import tried
-from torchvision_dddas.studies.tried import Tried
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
 
@@ -56,9 +56,9 @@ def test_the_best_of_a_grid_is_written_for_config_and_beats_the_settings_as_they
     assert [trial["number"] for trial in told["trials"]] == [0, 1, 2]
     values = [trial["value"] for trial in told["trials"]]
     assert told["best"] == 1 and values[1] > values[0] > values[2] - 1e-9
-    best = load(swept[0] / "best.toml")
+    best = load_config(swept[0] / "best.toml")
     assert best.difference.threshold == 10 and best.morphology.erode_px == 1
-    assert best.difference.kind == load("fast").difference.kind
+    assert best.difference.kind == load_config("fast").difference.kind
 
 
 def test_clips_held_out_have_no_say_and_are_told_apart(swept) -> None:
@@ -80,8 +80,8 @@ def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(st
     def none(*_, **__):
         raise AssertionError("something was computed again")
 
-    monkeypatch.setattr("torchvision_dddas.studies.stages.motion", none)
-    monkeypatch.setattr("torchvision_dddas.studies.scoring.score", none)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.stages.motion", none)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.scoring.score", none)
     out = study.parent / "again"
     assert asked(study, *GRID, "--holdout", "h*", "--out", str(out), "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):
@@ -137,6 +137,6 @@ def test_a_measure_that_is_none_is_one_line(study, swept, tmp_path, measure, tol
 
 
 def test_without_optuna_it_is_said_how_to_get_it(study, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torchvision_dddas.studies.sweep.find_spec", lambda name: None)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.sweep.find_spec", lambda name: None)
     asks = ("--optuna", "2", "--range", "difference.threshold=5:40", "--out", str(tmp_path / "out"))
     assert "torchvision-dddas[tune]" in bad(asked(study, *asks))

@@ -267,7 +267,7 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, table, tmp_path):
     """In a process of its own, with a true signal after the third frame was written."""
     program = """
         import sys, time
-        from torchvision_dddas.sinks.track_tables import TrackTables
+        from torchvision_dddas.io.output.track_tables import TrackTables
         honest, seen = TrackTables.write, []
 
         def write(self, followed):

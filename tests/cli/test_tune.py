@@ -11,12 +11,13 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.cli.mistakes import bad
-from tests.studies.world import filmed, study
+from tests.evaluation.studies.world import filmed, study
 from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
-from torchvision_dddas.metrics import paired
-from torchvision_dddas.settings import load
-from torchvision_dddas.tuning import costing, preparing
+from torchvision_dddas.config import load_config
+from torchvision_dddas.evaluation.metrics import paired
+from torchvision_dddas.tuning import costing
+from torchvision_dddas.tuning import preparation as preparing
 
 THRESHOLD = "difference.threshold"
 ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
@@ -50,7 +51,7 @@ def tuned(clips) -> tuple[Path, str]:
 
 
 def test_the_tuned_settings_are_written_for_config_and_keep_what_was_not_tuned(tuned) -> None:
-    settings, before = load(tuned[0] / "tuned.toml"), load("fast")
+    settings, before = load_config(tuned[0] / "tuned.toml"), load_config("fast")
     assert settings.difference.threshold == pytest.approx(6, rel=0.4) != before.difference.threshold
     assert settings.registration == before.registration and settings.refine == before.refine
 
@@ -173,7 +174,7 @@ def test_settings_that_tuning_would_overwrite_are_refused(clips, tmp_path) -> No
     config = str(tmp_path / "tuned.toml")
     result = asked(clips, *ASKED, "--config", config, "--out", str(tmp_path))
     assert "tuned.toml is a file that this run writes" in bad(result)
-    assert load(config).difference.threshold == 12
+    assert load_config(config).difference.threshold == 12
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed(clips, tmp_path) -> None:
@@ -269,7 +270,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
     assert result.exit_code == 2 and "Traceback" not in result.output
     last = result.output.strip().splitlines()[-1]
     assert last.startswith("dddas: ") and "one, frame 2" in last and THRESHOLD in last
-    assert load(tmp_path / "tuned.toml").difference.threshold <= 12
+    assert load_config(tmp_path / "tuned.toml").difference.threshold <= 12
     assert json.loads((tmp_path / "run.json").read_text())["state"] == "failed"
     assert "Stopped" in (tmp_path / "report.html").read_text()
 

@@ -11,10 +11,10 @@ pytest.importorskip("torch")
 from onnx import TensorProto
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.exporting.building import Graph
-from torchvision_dddas.exporting.checked import Check, Made
-from torchvision_dddas.exporting.manifest import write
-from torchvision_dddas.vision.graphs import MANIFEST, manifest, opened
+from torchvision_dddas.export.checked import Check, Made
+from torchvision_dddas.export.graph_builder import Graph
+from torchvision_dddas.export.manifest import write
+from torchvision_dddas.runtime import MANIFEST, manifest, opened
 
 
 def doubled(factor: float) -> Made:

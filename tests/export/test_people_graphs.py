@@ -15,16 +15,17 @@ import onnx
 import onnxruntime
 import torch
 
+from torchvision_dddas.config import PeopleKnobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.exporting import manifest, people
-from torchvision_dddas.exporting.checked import refuse_wrong
-from torchvision_dddas.ops import hog
-from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources.classifiers import read_classifier
+from torchvision_dddas.export import manifest
+from torchvision_dddas.export import people_graphs as people
+from torchvision_dddas.export.checked import refuse_wrong
+from torchvision_dddas.functional import hog
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.onnx_scorer import OnboardRecognizer
+from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import LinearSvm, Part
-from torchvision_dddas.vision import load_recognizer
-from torchvision_dddas.vision.graphs import SHIPPED
-from torchvision_dddas.vision.onboard_people import OnboardRecognizer
 
 NAMES = "people.onnx", "people_histograms.onnx", "people_scores.onnx"
 LAYOUTS = {

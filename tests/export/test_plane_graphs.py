@@ -11,11 +11,11 @@ import onnxruntime
 import torch
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.exporting import plane
-from torchvision_dddas.exporting.building import OPSET
-from torchvision_dddas.exporting.checked import refuse_wrong
-from torchvision_dddas.ops import homography
-from torchvision_dddas.vision.graphs import SHIPPED
+from torchvision_dddas.export import plane_graphs as plane
+from torchvision_dddas.export.checked import refuse_wrong
+from torchvision_dddas.export.graph_builder import OPSET
+from torchvision_dddas.functional import homography
+from torchvision_dddas.runtime import SHIPPED
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,11 @@ import onnx
 import onnxruntime
 import torch
 
+from torchvision_dddas.config import Settings, load_config, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.exporting import traced
-from torchvision_dddas.exporting.building import OPSET
-from torchvision_dddas.exporting.checked import Made
-from torchvision_dddas.settings import Settings, load, with_knobs
+from torchvision_dddas.export import traced_graphs as traced
+from torchvision_dddas.export.checked import Made
+from torchvision_dddas.export.graph_builder import OPSET
 
 SIZE, STEP_SIZE = (96, 80), (128, 96)
 LEAST = {
@@ -37,7 +37,7 @@ LEAST = {
 
 @pytest.fixture(scope="module")
 def fast() -> Settings:
-    return load("fast", [])
+    return load_config("fast", [])
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,14 @@ pytest.importorskip("sklearn")
 pytest.importorskip("torch")
 
 from export import train_people as script
+from torchvision_dddas.config import PeopleKnobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.recognizing import classifier_of, recognizer_of
-from torchvision_dddas.settings import PeopleKnobs
-from torchvision_dddas.sources.classifiers import read_classifier
-from torchvision_dddas.targets.persons import people_of
-from torchvision_dddas.targets.scan import everywhere, windows
+from torchvision_dddas.people.boxes import people_of
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.detector import classifier_of, recognizer_of
+from torchvision_dddas.people.pyramid import everywhere, windows
+from torchvision_dddas.people.scorer import load_recognizer
 from torchvision_dddas.types import LinearSvm, Part
-from torchvision_dddas.vision import load_recognizer
 
 SMALL = PeopleKnobs(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
 SET = [

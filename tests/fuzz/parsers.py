@@ -83,9 +83,9 @@ def _finite(*arrays: np.ndarray) -> None:
 
 
 def _detections(path: Path) -> None:
-    from torchvision_dddas.sources.agreement import agreed
-    from torchvision_dddas.sources.detections import read_detections
-    from torchvision_dddas.sources.rows import header_of, read_rows
+    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.table_checks import agreed
+    from torchvision_dddas.io.table_rows import header_of, read_rows
 
     table = read_detections(path)
     _finite(table.box_px, table.score)
@@ -99,7 +99,7 @@ def _detections(path: Path) -> None:
 
 
 def _truth(path: Path) -> None:
-    from torchvision_dddas.metrics import results, truth
+    from torchvision_dddas.evaluation.metrics import results, truth
 
     found = truth.load(path)
     _ = found.frames
@@ -108,7 +108,7 @@ def _truth(path: Path) -> None:
 
 def _evaluated(path: Path) -> None:
     """The input is the truth, the result or the record of a clip that is scored."""
-    from torchvision_dddas.evaluate import evaluate
+    from torchvision_dddas.evaluation.evaluate import evaluate
 
     evaluate(path.parents[1] / "true", path.parents[1] / "found")
 
@@ -127,22 +127,22 @@ def _clip(without: str) -> Mapping[str, bytes]:
 
 
 def _record(path: Path) -> None:
-    from torchvision_dddas.metrics import results
-    from torchvision_dddas.sinks import journal
+    from torchvision_dddas.evaluation.metrics import results
+    from torchvision_dddas.io.output import run_record as journal
 
     journal.read(path.parent)
     results.load(path.parent)
 
 
 def _positions(path: Path) -> None:
-    from torchvision_dddas.sources.positions import read_positions
+    from torchvision_dddas.io.position_tables import read_positions
 
     found = read_positions(path)
     _finite(found.east_north_m)
 
 
 def _landmarks(path: Path) -> None:
-    from torchvision_dddas.sources.landmarks import looks_swapped, read_landmarks
+    from torchvision_dddas.io.landmark_tables import looks_swapped, read_landmarks
 
     found = read_landmarks(path, 10.0, 0.5)
     _finite(found.frame)
@@ -150,21 +150,21 @@ def _landmarks(path: Path) -> None:
 
 
 def _measurements(path: Path) -> None:
-    from torchvision_dddas.sources.measurements import has_measurements, read_measurements
+    from torchvision_dddas.io.measurements import has_measurements, read_measurements
 
     has_measurements(path)
     _finite(*read_measurements(path))
 
 
 def _camera(path: Path) -> None:
-    from torchvision_dddas.sources.cameras import left_open, read_camera
+    from torchvision_dddas.io.camera_files import left_open, read_camera
 
     left_open(path)
     read_camera(path)
 
 
 def _poses(path: Path) -> None:
-    from torchvision_dddas.sources.cameras import poses_at, read_poses
+    from torchvision_dddas.io.camera_files import poses_at, read_poses
     from torchvision_dddas.types import Camera
 
     camera = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)
@@ -174,24 +174,24 @@ def _poses(path: Path) -> None:
 
 
 def _colours(path: Path) -> None:
-    from torchvision_dddas.sources.colours import read_colours
+    from torchvision_dddas.io.colour_files import read_colours
 
     read_colours(path)
 
 
 def _settings(path: Path) -> None:
-    from torchvision_dddas.settings import changes, load
+    from torchvision_dddas.config import changes, load_config
 
-    changes(load(path))
+    changes(load_config(path))
 
 
 def _overrides(path: Path) -> None:
-    from torchvision_dddas.settings import load
+    from torchvision_dddas.config import load_config
     from torchvision_dddas.simulation.scenario import load as load_scenario
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     load_scenario("four", [f"settings.{words}"])
-    load(None, [words])
+    load_config(None, [words])
 
 
 def _scenario(path: Path) -> None:
@@ -203,7 +203,7 @@ def _scenario(path: Path) -> None:
 
 
 def _telemetry(path: Path) -> None:
-    from torchvision_dddas.sources.telemetry import at, check_overlap, read_telemetry
+    from torchvision_dddas.io.telemetry import at, check_overlap, read_telemetry
 
     found = read_telemetry(path)
     rising = bool((np.diff(found.time_s) > 0).all()) and bool(np.isfinite(found.time_s).all())
@@ -216,42 +216,42 @@ def _telemetry(path: Path) -> None:
 
 
 def _classifier(path: Path) -> None:
-    from torchvision_dddas.settings import PeopleKnobs
-    from torchvision_dddas.sources.classifiers import read_classifier
+    from torchvision_dddas.config import PeopleKnobs
+    from torchvision_dddas.people.classifiers import read_classifier
 
     svm = read_classifier(path, seeds.FEATURES, PeopleKnobs().descriptor)
     _finite(svm.weights)
 
 
 def _manifest(path: Path) -> None:
-    from torchvision_dddas.settings import PeopleKnobs
-    from torchvision_dddas.vision.onboard_people import graphs
+    from torchvision_dddas.config import PeopleKnobs
+    from torchvision_dddas.people.onnx_scorer import graphs
 
     graphs(PeopleKnobs(graphs=str(path.parent)))
 
 
 def _folder(path: Path) -> None:
-    from torchvision_dddas.sources import open_source
+    from torchvision_dddas.io.sources import open_source
 
     for frame in open_source(path.parent):
         assert frame.image.dtype == np.uint8
 
 
 def _names_of_images(path: Path) -> None:
-    from torchvision_dddas.sources.images import natural_order
+    from torchvision_dddas.io.images import natural_order
 
     names = path.read_bytes().decode("utf-8", "surrogateescape").splitlines()
     sorted((name[:4096] for name in names), key=natural_order)  # no path is longer
 
 
 def _mask(path: Path) -> None:
-    from torchvision_dddas.metrics.truth import read_mask
+    from torchvision_dddas.evaluation.metrics.truth import read_mask
 
     read_mask(path)
 
 
 def _video(path: Path) -> None:
-    from torchvision_dddas.sources import open_source
+    from torchvision_dddas.io.sources import open_source
 
     source = open_source(path)
     numbers = [frame.number for frame in source.every(2)]
@@ -260,8 +260,8 @@ def _video(path: Path) -> None:
 
 def _input_name(path: Path) -> None:
     """A device or an address is not tried: what may be behind it is not this test's."""
+    from torchvision_dddas.io.sources import open_source
     from torchvision_dddas.simulation import scenario
-    from torchvision_dddas.sources import open_source
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     if words.startswith("sim:"):  # without its world, which takes seconds to be made
@@ -276,26 +276,26 @@ def _input_name(path: Path) -> None:
 
 
 def _elevation(path: Path) -> None:
-    from torchvision_dddas.sources.elevation import read_elevation
+    from torchvision_dddas.io.elevation import read_elevation
 
     read_elevation(path, np.array([[0.0, 0.0], [10.0, 10.0]]), None, 30.0)
 
 
 def _ortho(path: Path) -> None:
-    from torchvision_dddas.sources.elevation import read_ortho
+    from torchvision_dddas.io.elevation import read_ortho
 
     read_ortho(path, np.array([[0.0, 0.0], [10.0, 10.0]]), None, 30.0)
 
 
 def _address(path: Path) -> None:
-    from torchvision_dddas.live.serving import address_of
+    from torchvision_dddas.live.server import address_of
 
     _, port = address_of(path.read_bytes().decode("utf-8", "surrogateescape"))
     assert 0 <= port <= 65535
 
 
 def _camera_word(path: Path) -> None:
-    from torchvision_dddas.sources.stream import target_of, without_secrets
+    from torchvision_dddas.io.stream_capture import target_of, without_secrets
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     without_secrets(words)
@@ -304,7 +304,7 @@ def _camera_word(path: Path) -> None:
 
 def _stream_word(path: Path) -> None:
     """Files alone: of an address its host would be asked for."""
-    from torchvision_dddas.sinks.streams import About, open_stream
+    from torchvision_dddas.io.streams import About, open_stream
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     if "udp" not in words.lower() and not words.endswith("-"):
@@ -322,8 +322,8 @@ def _boxes_of_colours(path: Path) -> None:
 
 def _dataset(kind: str, path: Path) -> None:
     """What is wrong with a clip is told, and the clip left out; where none is left that counts as a refusal."""
-    from torchvision_dddas.datasets import kinds
-    from torchvision_dddas.studies.record import Source
+    from torchvision_dddas.evaluation.datasets import kinds
+    from torchvision_dddas.evaluation.studies.record import Source
 
     folder = next(place for place in path.parents if place.name == ROOT)
     found = kinds.read(Source(kind, folder), folder.parent)
@@ -339,7 +339,7 @@ def _dataset(kind: str, path: Path) -> None:
 
 
 def _study(path: Path) -> None:
-    from torchvision_dddas.studies.spec import read_spec
+    from torchvision_dddas.evaluation.studies.spec import read_spec
 
     read_spec(path)
 
@@ -369,13 +369,13 @@ _TOML = (
 
 
 def _graphs() -> Mapping[str, bytes]:
-    from torchvision_dddas.vision.graphs import SHIPPED
+    from torchvision_dddas.runtime import SHIPPED
 
     return {name: (SHIPPED / name).read_bytes() for name in ("people_histograms.onnx", "people_scores.onnx")}
 
 
 def _manifests() -> Sequence[bytes]:
-    from torchvision_dddas.vision.graphs import MANIFEST, SHIPPED
+    from torchvision_dddas.runtime import MANIFEST, SHIPPED
 
     return [(SHIPPED / MANIFEST).read_bytes()]
 

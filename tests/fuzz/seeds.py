@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.sources.flights import global_position, local_set, sentence, spread, tlog, transport_stream, ulog
+from tests.io.flights import global_position, local_set, sentence, spread, tlog, transport_stream, ulog
 
 FEATURES = 3780
 """Of the descriptor that the classifiers here fit."""

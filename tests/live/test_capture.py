@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.io.clips import number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
 from tests.live.streams import PATIENCE_S, FakeClock, FakeStream, Gate, Streams, after, grey, taken
-from tests.sources.clips import number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
+from torchvision_dddas.config import LiveKnobs
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live import Health, LiveSource
-from torchvision_dddas.settings import LiveKnobs
 
 APART_S = 0.04
 

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.output.live_session import SessionLog, claim
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.keeping import Keeping
-from torchvision_dddas.sinks.session import SessionLog, claim
+from torchvision_dddas.live.status import Keeping
 
 
 class Disk:

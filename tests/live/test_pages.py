@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 import pytest
 
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.keeping import now_of
 from torchvision_dddas.live.pages import health_json, html_page, metrics, trouble_of
+from torchvision_dddas.live.status import now_of
 
 # The text exposition format, version 0.0.4.
 _NAME, _LABEL = r"[a-zA-Z_:][a-zA-Z0-9_:]*", r'[a-zA-Z_][a-zA-Z0-9_]*="(?:[^"\\\n]|\\[\\"n])*"'

@@ -8,7 +8,7 @@ import urllib.request
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.live.serving import Serving, address_of
+from torchvision_dddas.live.server import Serving, address_of
 
 PATIENCE_S = 60.0
 

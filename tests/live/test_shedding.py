@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tests.live.streams import FakeClock
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.live import Health, Shedding
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.types import Adjustment, Frame
-from torchvision_dddas.vision import load
 
 BASE = with_knobs(
     Settings(),
@@ -99,7 +99,7 @@ def test_other_settings_between_frames_are_what_the_next_frames_are_seen_with(ke
     class Clip(list):
         rate_hz = 10.0
 
-    scenes = list(run(Clip(frames), load("onboard", BASE), BASE, retune=retune))
+    scenes = list(run(Clip(frames), load_engine("onboard", BASE), BASE, retune=retune))
     assert [scene.frame.number for scene in scenes] == list(range(1, 15))
     assert [record in scene.adjustments for scene in scenes] == [n == 8 for n in range(1, 15)]
     assert all(scene.reliable for scene in scenes)

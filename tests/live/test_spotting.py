@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.test_recognizing import SIZE, Brightest, Clip
+from tests.people.test_recognizing import SIZE, Brightest, Clip
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.recognizing import UNREAD
-from torchvision_dddas.settings import Settings
-from torchvision_dddas.spotting import Spotter
+from torchvision_dddas.people.detector import UNREAD
+from torchvision_dddas.people.live_tracker import Spotter
 from torchvision_dddas.types import Detections, Registration, Scene
 
 SETTINGS = Settings.model_validate({"people": {"search": "regions"}})
@@ -53,7 +53,7 @@ def test_what_is_not_settled_is_not_told_before_the_end():
 
 
 def test_people_settle_with_the_frames_of_what_moves():
-    from torchvision_dddas.following import follow_scenes
+    from torchvision_dddas.tracking.sequence import follow_scenes
 
     spotter = Spotter(Sure(), SETTINGS, 1, SIZE)
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from torchvision_dddas.live.stopping import Stopping
+from torchvision_dddas.live.shutdown import Stopping
 
 PATIENCE_S = 60.0
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchvision_dddas import geometry
 from torchvision_dddas.simulation.agents import Agents
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import (
@@ -20,7 +21,6 @@ from torchvision_dddas.simulation.scenario import (
     TeamKnobs,
     WorldKnobs,
 )
-from torchvision_dddas.targets import geodesy
 from torchvision_dddas.types import Command, Order
 
 
@@ -240,7 +240,7 @@ def test_a_jump_moves_what_is_said_by_its_size() -> None:
     origin = busy().world.origin_deg
     for one in faulty("gps_jump"):
         true = one.bodies.place_m[one.bodies.kind == "ugv", :2]
-        off = np.linalg.norm(geodesy.east_north(one.said_lonlat_deg, origin) - true, axis=1)
+        off = np.linalg.norm(geometry.east_north(one.said_lonlat_deg, origin) - true, axis=1)
         assert off[1] == pytest.approx(10.0 if within(one) else 0.0, abs=1e-4)
         assert off[[0, 2, 3]] == pytest.approx(0.0, abs=1e-4)
 
@@ -265,7 +265,7 @@ def test_orders_in_degrees_reach_the_vehicles_and_hold() -> None:
     scenario = busy(crowd=(), car=(), happening=())
     agents = Agents(scenario, world_of(trees=0))
     goal, seen = np.array([18.0, -12.0]), np.array([18.0, 40.0])
-    goal_deg, seen_deg = geodesy.lonlat(np.stack([goal, seen]), scenario.world.origin_deg)
+    goal_deg, seen_deg = geometry.lonlat(np.stack([goal, seen]), scenario.world.origin_deg)
     agents.step()
     agents.moment()
     agents.steer(Command(orders=(Order("ugv3", goal_deg, 3.0, seen_deg),)))

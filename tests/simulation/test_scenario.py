@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from tests.simulation.small import as_file, small
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.simulation.scenario import Scenario, as_toml, check, load, names, settings_of
 
 
@@ -195,7 +195,7 @@ def test_the_defaults_alone_are_a_scenario():
 
 
 def test_shipped_scenarios_are_no_configurations_of_the_settings(tmp_path):
-    from torchvision_dddas.settings import config_folder, config_names
+    from torchvision_dddas.config import config_folder, config_names
 
     assert not set(names()) & set(config_names())
     shutil.copytree(config_folder() / "scenarios", tmp_path / "scenarios")

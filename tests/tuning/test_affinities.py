@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from tests.tuning.test_identities import walk
+from torchvision_dddas.config import Settings, load_config, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings, load, with_knobs
 from torchvision_dddas.tuning.affinities import WINDOWS, Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import family_of, with_loss
+from torchvision_dddas.tuning.parameters import Knobs
 
-PAPER = with_knobs(load("paper"), {"paper.window": 2})
+PAPER = with_knobs(load_config("paper"), {"paper.window": 2})
 
 
 def test_a_clip_becomes_stretches_of_windows_each_with_a_loss_that_no_company_changes():

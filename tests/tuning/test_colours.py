@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.opencv_colours import OnboardColours
 from torchvision_dddas.tuning.colours import fit_colours
-from torchvision_dddas.vision.onboard_colours import OnboardColours
 
 NAMES = ("red", "green")
 PAINT = {1: (178, 190, 190), 2: (62, 150, 150)}

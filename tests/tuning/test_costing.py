@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings, with_knobs
+from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.costing import Curve, TimeCost, measured, points, read, write
 
 THRESHOLD, CLOSE, BLUR = "difference.threshold", "morphology.close_px", "difference.blur_px"

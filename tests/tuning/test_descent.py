@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from tests.tuning.toys import Bowl, pieces
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings, with_knobs
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.parameters import Knobs
 
 THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
 QUICK = Plan(steps=12, batch=4, rate=0.1, look_every=3)

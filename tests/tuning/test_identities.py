@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.following import follow_table
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.sources.detections import read_detections
-from torchvision_dddas.targets.tracks import Tracker
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.io.detection_tables import read_detections
+from torchvision_dddas.tracking.sequence import follow_table
+from torchvision_dddas.tracking.tracker import Tracker
 from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Timed, family_of
 from torchvision_dddas.tuning.identities import Identities, together
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.types import Detections
 
 PERSON = np.array([20.0, 50.0])
@@ -89,7 +89,7 @@ def test_what_the_tracker_knows_of_a_look_is_what_the_tracker_itself_knows(monke
     looks = example.content.looks
     speeds = {frame: speed for frame, speed, _ in seen}
     births = {frame: rate for frame, _, rate in seen}
-    from torchvision_dddas.targets.pace import speed_of
+    from torchvision_dddas.tracking.speed_prior import speed_of
 
     found = [speed_of(settings.track.speed, *pair) for pair in zip(looks["usual"], looks["known"], strict=True)]
     assert found == pytest.approx([speeds[int(frame)] for frame in looks["frame"]])

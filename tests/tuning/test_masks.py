@@ -3,18 +3,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchvision_dddas.datasets import folder
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.demo import film_into
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.detection.detector import run
+from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.truth import labels_of
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.run import run
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.studies.stages import opened
+from torchvision_dddas.evaluation.datasets import folder
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.truth import labels_of
+from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
 from torchvision_dddas.tuning.masks import Masks, masks_of, together
-from torchvision_dddas.vision import load
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 
 SETTINGS = with_knobs(
     Settings(), {"gates.min_area_px": 30, "morphology.close_px": 7, "registration.keypoints": 200, "small.on": False}
@@ -37,7 +37,7 @@ def examples(clip: Clip) -> list[Example]:
 
 def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example]) -> None:
     """At the settings that the examples were prepared with: what comes after the hulls is then as it was."""
-    final = {s.frame.number: s.mask > 0 for s in run(opened(clip), load("onboard", SETTINGS), SETTINGS)}
+    final = {s.frame.number: s.mask > 0 for s in run(opened(clip), load_engine("onboard", SETTINGS), SETTINGS)}
     assert [example.frame for example in examples] == list(range(1, 10))
     for example in examples:
         mask = masks_of(together([example.content], CPU), {}, 0.0)[0, 0] > 0.5

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchvision_dddas.metrics.segmentation import Pixels, measures
+from torchvision_dddas.evaluation.metrics.segmentation import Pixels, measures
 from torchvision_dddas.tuning.overlap import LOSSES as BY_NAME
 from torchvision_dddas.tuning.overlap import dice_loss, f_loss, focal_loss
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.sources.detections import DetectionTable
-from torchvision_dddas.tuning.owners import owned
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.tuning.matching import owned
 
 ONE, OTHER, FAR = [100.0, 50.0, 20.0, 50.0], [112.0, 50.0, 20.0, 50.0], [300.0, 50.0, 20.0, 50.0]
 

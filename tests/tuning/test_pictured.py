@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from tests.overflight import ORIGIN, Overflight
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.truth import Positions
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.geodesy import lonlat
-from torchvision_dddas.tuning.looks import Look
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.truth import Positions
+from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.tuning.aerial_examples import Look
 from torchvision_dddas.tuning.places import family
 
 

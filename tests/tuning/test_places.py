@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from tests import airborne
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.plane import ground_points
-from torchvision_dddas.targets.registrar import Registrar
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.plane import ground_points
+from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.tuning.aerial_examples import SPREADS, Seen, kept, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.looks import SPREADS, Seen, kept, look_at, of_settings, only_noise
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.tuning.places import UNPLACED, family
-from torchvision_dddas.vision import load_solver
 
 HFOV = float(np.radians(70.0))
 

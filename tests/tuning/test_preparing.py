@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.world import filmed, followed, study
+from tests.evaluation.studies.world import filmed, followed, study
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.tuning.family import FAMILIES, family_of
-from torchvision_dddas.tuning.preparing import prepare
+from torchvision_dddas.tuning.preparation import prepare
 
 
 @pytest.fixture(scope="module")

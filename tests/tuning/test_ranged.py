@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics import truth as truths
-from torchvision_dddas.metrics.metres import inside
-from torchvision_dddas.metrics.truth import Positions
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.targets.ranging import sight
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.metres import inside
+from torchvision_dddas.evaluation.metrics.truth import Positions
+from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.ground_examples import KNOBS, sighted, sightings_of
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.tuning.places import UNPLACED, family
-from torchvision_dddas.tuning.ranged import KNOBS, sighted, sightings_of
 from torchvision_dddas.types import Camera
 
 CAMERA = Camera(

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import PeopleKnobs, Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import PeopleKnobs, Settings, with_knobs
-from torchvision_dddas.targets.persons import body
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.people.boxes import body
 from torchvision_dddas.tuning import recognition
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.parameters import Knobs
 from torchvision_dddas.tuning.recognition import Scored, family, scored
 
 NAMES = [f"people.{name}" for name in recognition.KNOBS]
@@ -119,7 +119,7 @@ def test_a_clip_gives_its_labelled_pictures(tmp_path: Path, monkeypatch: pytest.
         files.append(tmp_path / f"{number}.png")
         cv2.imwrite(str(files[-1]), image)
     truth = Truth("boxes", tmp_path, {}, {1: true, 3: np.zeros((0, 4))})
-    monkeypatch.setattr("torchvision_dddas.recognizing.recognizer_of", lambda knobs: Spots())
+    monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", lambda knobs: Spots())
     clip = Clip("spots", tmp_path, tuple(files), truth=truth, shows=("people",))
     found = family().examples([clip], Settings())
     assert [(one.frame, one.content.people, one.content.right.sum()) for one in found] == [(1, 1, 1), (3, 0, 0)]

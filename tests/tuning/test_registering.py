@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.datasets import folder
-from torchvision_dddas.datasets.record import Clip
-from torchvision_dddas.demo import film_into
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.truth import labels_of
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.studies.stages import opened
-from torchvision_dddas.targets.projective import transfer
+from torchvision_dddas.evaluation.datasets import folder
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.truth import labels_of
+from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.geometry import transfer
+from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.registering import CHECK, RANSAC, Registering
-from torchvision_dddas.vision import load
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.registration import CHECK, RANSAC, Registering
 
 SETTINGS = Settings()
 
@@ -53,7 +53,7 @@ def test_every_labelled_frame_that_has_a_next_one_is_an_example(clip: Clip, exam
 @pytest.mark.parametrize("tolerance_px", [0.7, 2.0, 6.0])
 def test_the_hard_loss_is_the_error_of_the_pipelines_registration(clip, examples, tolerance_px: float) -> None:
     settings = with_knobs(SETTINGS, {RANSAC: tolerance_px})
-    vision = load("onboard", settings)
+    vision = load_engine("onboard", settings)
     views = [vision.prepare(frame.image) for frame in opened(clip)]
     wanted = []
     for pair, example in zip(pairwise(views), examples, strict=True):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.tuning.test_colours import scene
-from torchvision_dddas import demo
-from torchvision_dddas.sources.colours import read_colours
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.simulation import demo
 from torchvision_dddas.tuning import descent
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.world import filmed, study
-from torchvision_dddas.metrics import paired
-from torchvision_dddas.settings import load, with_knobs
-from torchvision_dddas.studies.goals import goal_of, value_of
-from torchvision_dddas.studies.running import run_study
-from torchvision_dddas.studies.spec import read_spec
+from tests.evaluation.studies.world import filmed, study
+from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.evaluation.metrics import paired
+from torchvision_dddas.evaluation.studies.goals import goal_of, value_of
+from torchvision_dddas.evaluation.studies.running import run_study
+from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.tuning import verdict as judging
 from torchvision_dddas.tuning.verdict import Verdict, judge
 
@@ -69,8 +69,8 @@ def test_the_goal_is_judged_by_itself_and_less_may_be_better() -> None:
 
 
 def test_knobs_that_did_not_move_change_nothing(clips) -> None:
-    same = {"difference.threshold": load("fast").difference.threshold}
-    assert with_knobs(load("fast"), same) == load("fast")
+    same = {"difference.threshold": load_config("fast").difference.threshold}
+    assert with_knobs(load_config("fast"), same) == load_config("fast")
     spec = read_spec(clips)
     told = judge(spec, clips.parent, GOAL, same, ("held",), (), 0, clips.parent / "cache")
     assert told.tuned.says == "the same" and told.held is None

@@ -14,10 +14,10 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.geolocating import Locator
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.grounded import GroundedJournal
-    from torchvision_dddas.sinks.journal import Record
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.geo import Locator
+    from torchvision_dddas.io.output.location_output import GroundedJournal
+    from torchvision_dddas.io.output.run_record import Record
     from torchvision_dddas.types import Camera, Colours
 
 Marked = Annotated[
@@ -63,12 +63,12 @@ def aerial(
 
     Writes positions.csv, fixes.csv (how each picture lies on the ground), maps, a report and run.json under --out.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.grounded import SAVED
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output.location_output import SAVED
 
     given = AerialInput(landmarks, telemetry, camera, dem, background)
-    settings, names = load(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), saved(save, SAVED)
     journal = aerial_into(out, table, given, settings, clip, backend.value, names, rate, quiet)
     if not quiet:
         for line in summary(journal, out):
@@ -117,13 +117,13 @@ def aerial_into(
     quiet: bool = False,
 ) -> "GroundedJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.geolocating import check_table, locate
-    from torchvision_dddas.geolocating.table import frames_of, outside
-    from torchvision_dddas.sinks.grounded import GroundedOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
-    from torchvision_dddas.sources import open_source
-    from torchvision_dddas.sources.agreement import within_clip
-    from torchvision_dddas.sources.detections import read_detections
+    from torchvision_dddas.geo import check_table, locate
+    from torchvision_dddas.geo.table_location import frames_of, outside
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.output.location_output import GroundedOutput
+    from torchvision_dddas.io.sources import open_source
+    from torchvision_dddas.io.table_checks import within_clip
 
     check_rate(rate_hz)
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
@@ -182,10 +182,10 @@ def locator_for(
     """
     from dataclasses import replace
 
-    from torchvision_dddas.geolocating import Locator, camera_of, check_span, site_of, unknown_heights, unpictured
-    from torchvision_dddas.sources.landmarks import read_landmarks
-    from torchvision_dddas.sources.telemetry import read_telemetry
-    from torchvision_dddas.vision import load_solver
+    from torchvision_dddas.geo import Locator, camera_of, check_span, site_of, unknown_heights, unpictured
+    from torchvision_dddas.geo.solvers import load_solver
+    from torchvision_dddas.io.landmark_tables import read_landmarks
+    from torchvision_dddas.io.telemetry import read_telemetry
 
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
@@ -203,7 +203,7 @@ def locator_for(
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
     site = site_of(landmarks if colours is None else unpictured(landmarks), telemetry)
     if given.dem is not None:
-        from torchvision_dddas.sources.elevation import read_elevation
+        from torchvision_dddas.io.elevation import read_elevation
 
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
     notes += unknown_heights(site)
@@ -213,7 +213,7 @@ def locator_for(
 
 
 def _camera(given: AerialInput) -> "Camera | None":
-    from torchvision_dddas.sources.cameras import read_camera
+    from torchvision_dddas.io.camera_files import read_camera
 
     return read_camera(given.camera) if given.camera is not None else None
 
@@ -232,8 +232,8 @@ def ground_facts(locator: "Locator", background: Path | None) -> dict[str, Any]:
     """What GroundedOutput.begin wants to know. Raises InputError for a background that cannot be read."""
     from functools import partial
 
-    from torchvision_dddas.sources.elevation import read_ortho
-    from torchvision_dddas.targets import geodesy
+    from torchvision_dddas import geometry
+    from torchvision_dddas.io.elevation import read_ortho
 
     site = locator.site
     start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
@@ -244,13 +244,13 @@ def ground_facts(locator: "Locator", background: Path | None) -> dict[str, Any]:
         "rate_hz": locator.rate_hz,
         "background": None if background is None else read_ortho(background, site.places, site.origin_deg),
         "camera": locator.camera,
-        "degrees": None if site.origin_deg is None else partial(geodesy.lonlat, origin_deg=site.origin_deg),
+        "degrees": None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
     }
 
 
 def summary(journal: "GroundedJournal", folder: Path) -> list[str]:
     """What to tell the user at the end."""
-    from torchvision_dddas.sinks.grounded import GroundedOutput
+    from torchvision_dddas.io.output.location_output import GroundedOutput
 
     made = [name for name in GroundedOutput.files if (folder / name).exists()]
     first = f"{journal.frames} frames, {journal.targets} targets"

@@ -12,7 +12,7 @@ from torchvision_dddas.cli.options import Config, Overrides
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
+    from torchvision_dddas.config import Settings
 
 LEAST_M, MOST_M = 0.1, 10.0
 """Heights of a person, or of what stands in for one."""
@@ -54,10 +54,10 @@ def calibrate(
 
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sources.measurements import has_measurements
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.measurements import has_measurements
 
-    settings = load(config, set_ or [])
+    settings = load_config(config, set_ or [])
     tall = settings.ground.body_height_m if body_height is None else body_height
     if not LEAST_M <= tall <= MOST_M:
         raise InputError(f"--body-height is {tall:g}; wanted metres, {LEAST_M:g} to {MOST_M:g}")
@@ -90,7 +90,7 @@ def calibrate(
 
 
 def _from_measurements(table: Path, body_height_m: float) -> Found:
-    from torchvision_dddas.sources.measurements import read_measurements
+    from torchvision_dddas.io.measurements import read_measurements
 
     distance, height = read_measurements(table)
     return _focal(distance.tolist(), height.tolist(), body_height_m)
@@ -100,7 +100,7 @@ def _from_person(table: Path | None, pixels: list[float], distance_m: float, bod
     if table is not None:
         import numpy as np
 
-        from torchvision_dddas.sources.detections import read_detections
+        from torchvision_dddas.io.detection_tables import read_detections
 
         read = read_detections(table)
         frames, count = np.unique(read.frame, return_counts=True)
@@ -119,7 +119,7 @@ def _from_person(table: Path | None, pixels: list[float], distance_m: float, bod
 def _focal(distance_m: list[float], height_px: list[float], body_height_m: float) -> Found:
     import numpy as np
 
-    from torchvision_dddas.targets.focal import focal_length
+    from torchvision_dddas.geo.focal import focal_length
 
     found = focal_length(np.array(distance_m), np.array(height_px), body_height_m)
     _check("focal_px", found.focal_px, "px")
@@ -138,10 +138,10 @@ def _focal(distance_m: list[float], height_px: list[float], body_height_m: float
 
 
 def _from_people(table: Path, camera: Path | None, body_height_m: float, settings: "Settings") -> Found:
-    from torchvision_dddas.sources.cameras import read_camera
-    from torchvision_dddas.sources.detections import read_detections
-    from torchvision_dddas.targets.ranging import touches_border
-    from torchvision_dddas.targets.stance import stance
+    from torchvision_dddas.geo.camera_calibration import stance
+    from torchvision_dddas.geo.ranging import touches_border
+    from torchvision_dddas.io.camera_files import read_camera
+    from torchvision_dddas.io.detection_tables import read_detections
 
     if camera is None:
         raise InputError(
@@ -170,7 +170,7 @@ def _known(camera: Path | None, size: str | None) -> dict[str, object]:
     """The keys of the camera that is to be completed."""
     known: dict[str, object] = {}
     if camera is not None:
-        from torchvision_dddas.sources.cameras import camera_keys
+        from torchvision_dddas.io.camera_files import camera_keys
 
         known = camera_keys(camera)
     if size is not None:
@@ -200,7 +200,7 @@ def _value(key: str, value: object) -> str:
 
 def _check(key: str, value: float, unit: str) -> None:
     """Raises InputError for what no camera's file may hold."""
-    from torchvision_dddas.sources.cameras import LIMITS
+    from torchvision_dddas.io.camera_files import LIMITS
 
     low, high = LIMITS[key]
     if not low <= value <= high:
@@ -212,14 +212,14 @@ def _check(key: str, value: float, unit: str) -> None:
 
 def _check_out(path: Path, table: Path | None) -> None:
     """Raises InputError where the TOML would replace the table, or a folder is in its place."""
-    from torchvision_dddas.sinks.whole import refuse_folder, refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input
 
     refuse_own_input([] if table is None else [table], [path], "--out")
     refuse_folder(path)
 
 
 def _write(path: Path, text: str) -> None:
-    from torchvision_dddas.sinks.whole import cannot_write, write_whole
+    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from torchvision_dddas.targets.calibration import Sample
+    from torchvision_dddas.geo.colour_calibration import Sample
     from torchvision_dddas.types import Colours
 
 Box = tuple[int, int, int, int]
@@ -49,11 +49,11 @@ def colours(
 
     Writes a TOML for `dddas run --colours`, and beside it a picture of all that the ranges mark: look at it.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks.whole import refuse_folder, refuse_own_input
-    from torchvision_dddas.targets.calibration import hsv_of, ranges_of
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.geo.colour_calibration import hsv_of, ranges_of
+    from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input
 
-    least = load(config, set_ or []).landmarks.least_area_px
+    least = load_config(config, set_ or []).landmarks.least_area_px
     boxes, wanted = [_box(text) for text in at or []], _names(names)
     _check(count, wanted, boxes)
     drawing = out.with_suffix(".png")
@@ -109,7 +109,7 @@ def _check(count: int | None, names: list[str], boxes: list[tuple[str, Box]]) ->
 def _picture(path: Path) -> "np.ndarray":
     import numpy as np
 
-    from torchvision_dddas.sources.images import read_image
+    from torchvision_dddas.io.images import read_image
 
     image = read_image(path)
     if image is None:
@@ -122,7 +122,7 @@ def _picture(path: Path) -> "np.ndarray":
 
 
 def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[list["Sample"]]:
-    from torchvision_dddas.targets.calibration import in_box
+    from torchvision_dddas.geo.colour_calibration import in_box
 
     groups = []
     height, width = hsv.shape[:2]
@@ -140,7 +140,7 @@ def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[
 def _found(
     pictures: list["np.ndarray"], least: int, count: int | None, paths: list[Path], quiet: bool
 ) -> list[list["Sample"]]:
-    from torchvision_dddas.targets.calibration import pooled, standing_out
+    from torchvision_dddas.geo.colour_calibration import pooled, standing_out
 
     samples = []
     with progress("colours", len(pictures), quiet) as tick:
@@ -159,7 +159,7 @@ def _called(names: list[str], groups: Sequence[Sequence["Sample"]]) -> list[str]
     """A name for each colour: the words given that fit best, or the names given in the order of hues."""
     from scipy.optimize import linear_sum_assignment
 
-    from torchvision_dddas.targets.calibration import HUES, hue_apart, named
+    from torchvision_dddas.geo.colour_calibration import HUES, hue_apart, named
 
     hues = [group[0].hue for group in groups]
     if not names:
@@ -171,7 +171,7 @@ def _called(names: list[str], groups: Sequence[Sequence["Sample"]]) -> list[str]
 
 
 def _checked(names: list[str], low: "np.ndarray", high: "np.ndarray") -> "Colours":
-    from torchvision_dddas.sources.colours import overlapping
+    from torchvision_dddas.io.colour_files import overlapping
     from torchvision_dddas.types import Colours
 
     for a, b in overlapping(low, high):
@@ -193,9 +193,9 @@ def _write(
     import cv2
     import numpy as np
 
-    from torchvision_dddas.sinks.colours import colours_picture, colours_toml
-    from torchvision_dddas.sinks.whole import cannot_write, write_whole
-    from torchvision_dddas.targets.calibration import marked
+    from torchvision_dddas.geo.colour_calibration import marked
+    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+    from torchvision_dddas.io.colour_output import colours_picture, colours_toml
 
     sheets = []
     for number, (image, hsv) in enumerate(zip(images, found, strict=True)):

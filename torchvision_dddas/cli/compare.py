@@ -30,9 +30,9 @@ def compare(
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.sinks.journal import finite
-    from torchvision_dddas.studies.comparing import compare as beside
-    from torchvision_dddas.studies.scored import read_scores
+    from torchvision_dddas.evaluation.studies.comparing import compare as beside
+    from torchvision_dddas.evaluation.studies.scored import read_scores
+    from torchvision_dddas.io.output.run_record import finite
 
     found = beside(read_scores(first), read_scores(second))
     if out is not None:
@@ -45,8 +45,8 @@ def compare(
 
 def _write(path: Path, found: dict[str, Any]) -> None:
     """The page. Raises InputError where it cannot be written."""
-    from torchvision_dddas.sinks.comparison_report import comparison_report
-    from torchvision_dddas.sinks.whole import cannot_write, refuse_folder, write_whole
+    from torchvision_dddas.evaluation.comparison_report import comparison_report
+    from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, write_whole
 
     refuse_folder(path)
     try:

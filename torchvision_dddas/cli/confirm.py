@@ -12,9 +12,9 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.confirming import Vehicle
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.confirmed import ConfirmJournal
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.output.confirmation_output import ConfirmJournal
+    from torchvision_dddas.people.confirmation import Vehicle
     from torchvision_dddas.types import Confirmed
 
 
@@ -56,10 +56,10 @@ def confirm(
     Without cameras nothing is known of what the ground vehicles could see: blobs are then human or unseen.
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sources.detections import LAST_FRAME
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.detection_tables import LAST_FRAME
 
-    settings = load(config, set_ or [])
+    settings = load_config(config, set_ or [])
     if not 1 <= interval <= LAST_FRAME:
         raise InputError(f"--interval is {interval}; wanted 1 to {LAST_FRAME} frames")
     journal = confirm_into(out, blobs, people, camera or [], poses or [], settings, interval, identities, rate, quiet)
@@ -81,9 +81,9 @@ def confirm_into(
     quiet: bool = False,
 ) -> "ConfirmJournal":
     """Confirm and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.sinks.confirmed import ConfirmOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
-    from torchvision_dddas.sources.rows import header_of
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.output.confirmation_output import ConfirmOutput
+    from torchvision_dddas.io.table_rows import header_of
 
     check_rate(rate_hz)
     written = [folder / name for name in ConfirmOutput.files]
@@ -142,10 +142,10 @@ def _on_the_ground(
     rate_hz: float | None,
     notes: list[str],
 ) -> _Found:
-    from torchvision_dddas.confirming import confirm_positions
-    from torchvision_dddas.sinks.confirmed import COLUMNS
-    from torchvision_dddas.sources.positions import read_positions
-    from torchvision_dddas.sources.rows import read_rows
+    from torchvision_dddas.io.output.confirmation_output import COLUMNS
+    from torchvision_dddas.io.position_tables import read_positions
+    from torchvision_dddas.io.table_rows import read_rows
+    from torchvision_dddas.people.confirmation import confirm_positions
 
     given = read_positions(blobs)
     vehicles = _vehicles(people, cameras, poses, notes)
@@ -161,9 +161,9 @@ def _vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
     """The tables with their cameras: one each, or all of them to a single table. Raises InputError otherwise."""
-    from torchvision_dddas.confirming import Vehicle
-    from torchvision_dddas.sources.cameras import left_open, read_camera, read_poses
-    from torchvision_dddas.sources.positions import read_positions
+    from torchvision_dddas.io.camera_files import left_open, read_camera, read_poses
+    from torchvision_dddas.io.position_tables import read_positions
+    from torchvision_dddas.people.confirmation import Vehicle
 
     if len(people) > 1 and cameras and len(cameras) != len(people):
         raise InputError(
@@ -193,10 +193,10 @@ def _in_pictures(
 ) -> _Found:
     from dataclasses import replace
 
-    from torchvision_dddas.confirming import confirm_pictures
-    from torchvision_dddas.sinks.confirmed import COLUMNS
-    from torchvision_dddas.sources.detections import read_detections
-    from torchvision_dddas.sources.rows import read_rows
+    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.output.confirmation_output import COLUMNS
+    from torchvision_dddas.io.table_rows import read_rows
+    from torchvision_dddas.people.confirmation import confirm_pictures
 
     given = read_detections(blobs)
     if identities is False:

@@ -12,8 +12,8 @@ from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Qu
 from torchvision_dddas.cli.progress import progress
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.journal import Journal
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.output.run_record import Journal
 
 
 @explained
@@ -41,10 +41,10 @@ def detect(
 
     Writes detections.txt (MOTChallenge), detections.csv, masks/, overlay.mp4 and run.json under --out.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks import saved
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.output import saved
 
-    settings, names = load(config, set_ or []), saved(save)
+    settings, names = load_config(config, set_ or []), saved(save)
     for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
         journal = detect_clip(clip, folder, settings, backend.value, names, telemetry, rate, quiet)
         if not quiet:
@@ -66,19 +66,19 @@ def detect_clip(
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
-    from torchvision_dddas.sinks import Output
-    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.output import Output
 
     refuse_own_input([Path(clip)], [folder / name for name in Output.files], "folder with --out")
     with Output(folder, save) as output:
-        from torchvision_dddas.run import run
-        from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.telemetry import read_telemetry
-        from torchvision_dddas.vision import load
+        from torchvision_dddas.detection.detector import run
+        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.io.sources import open_source
+        from torchvision_dddas.io.telemetry import read_telemetry
 
         source = open_source(clip, rate_hz=rate_hz)
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip) if telemetry else None
-        vision = load(backend, settings)
+        vision = load_engine(backend, settings)
         facts = {
             "input": clip,
             "telemetry": telemetry,

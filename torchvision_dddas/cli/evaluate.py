@@ -172,9 +172,9 @@ def score(
     ignoring: Literal["dropped", "removed"] = "dropped",
 ) -> dict[str, Any]:
     """Evaluate, and write metrics.json into a folder. Raises InputError."""
-    from torchvision_dddas.evaluate import evaluate as compare
-    from torchvision_dddas.sinks.journal import finite
-    from torchvision_dddas.sinks.whole import cannot_write, write_whole
+    from torchvision_dddas.evaluation.evaluate import evaluate as compare
+    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+    from torchvision_dddas.io.output.run_record import finite
 
     report = compare(truth, result, first_frame, interval, ignoring)
     path = out / "metrics.json"

@@ -35,15 +35,15 @@ def export(
     Writes the graphs and manifest.json (inputs, outputs, knobs, SHA-256, versions) under --out, once all agree with
     torch. `step` takes half a minute, the others seconds.
     """
-    from torchvision_dddas import exporting
-    from torchvision_dddas.settings import load
+    from torchvision_dddas import export as exporting
+    from torchvision_dddas.config import load_config
 
     if list_:
         for name, about in exporting.GRAPHS.items():
             typer.echo(f"{name:16s} {about}")
         return
     sizes = [size_of(text) for text in size or ["640x480"]]
-    settings = load(config, set_ or [])
+    settings = load_config(config, set_ or [])
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out} is a file; wanted a folder for the graphs")
     if missing := [name for name in NEEDED if find_spec(name) is None]:
@@ -56,7 +56,7 @@ def export(
                 f"{c.off:.1e} {c.unit} off, {c.limit:g} allowed" for c in next(iter(found.values())).checks
             )
             typer.echo(f"{name}: {', '.join(found)}: compared with torch: {checks}", err=True)
-    from torchvision_dddas.exporting.manifest import write
+    from torchvision_dddas.export.manifest import write
 
     write(out, files)
     if not quiet:

@@ -15,12 +15,12 @@ from torchvision_dddas.cli.mistakes import INTERRUPTED
 from torchvision_dddas.cli.prepared import Prepared, prepared
 
 if TYPE_CHECKING:
+    from torchvision_dddas.config import LiveKnobs, Settings
+    from torchvision_dddas.io.streams import About, Stream
     from torchvision_dddas.live import Health, LiveSource
-    from torchvision_dddas.live.keeping import Keeping
     from torchvision_dddas.live.runner import Feed, Result
-    from torchvision_dddas.live.serving import Serving
-    from torchvision_dddas.settings import LiveKnobs, Settings
-    from torchvision_dddas.sinks.streams import About, Stream
+    from torchvision_dddas.live.server import Serving
+    from torchvision_dddas.live.status import Keeping
 
 _COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
 
@@ -43,15 +43,15 @@ def run_live(
 
     Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
     """
+    from torchvision_dddas.detection.detector import check_length
+    from torchvision_dddas.io.output.live_session import RESULTS, claim
+    from torchvision_dddas.io.stream_capture import without_secrets
     from torchvision_dddas.live import LiveSource
+    from torchvision_dddas.live.routes import served
     from torchvision_dddas.live.runner import Failing, Feed
-    from torchvision_dddas.live.served import served
-    from torchvision_dddas.live.serving import Page, Serving, address_of
-    from torchvision_dddas.live.stopping import Stopping
+    from torchvision_dddas.live.server import Page, Serving, address_of
+    from torchvision_dddas.live.shutdown import Stopping
     from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
-    from torchvision_dddas.run import check_length
-    from torchvision_dddas.sinks.session import RESULTS, claim
-    from torchvision_dddas.sources.stream import without_secrets
 
     address = None if serve is None else address_of(serve)
     health, supervisor, live = _health(), Supervisor(), settings.live
@@ -113,7 +113,7 @@ def _health() -> "Health":
 
 def _about(ready: Prepared) -> "About":
     """What streams need to know; the clock's time follows the source."""
-    from torchvision_dddas.sinks.streams import About
+    from torchvision_dddas.io.streams import About
 
     if ready.watch is None:
         return About(time.time())
@@ -125,7 +125,7 @@ def _opened(
     opened: ExitStack, texts: Sequence[str], said: "About", health: "Health", live: "LiveKnobs", option: str
 ) -> "list[Stream]":
     """Streams that are closed when `opened` is. Raises InputError."""
-    from torchvision_dddas.sinks.streams import open_streams
+    from torchvision_dddas.io.streams import open_streams
 
     streams = open_streams(texts, said, health.event, live.retry_s, live.retry_most_s, option)
     for stream in streams:
@@ -143,9 +143,9 @@ def _kept(
     quiet: bool,
 ) -> "Keeping":
     """What keeps the folder's record, written a first time. Raises InputError where that cannot be."""
-    from torchvision_dddas.live.keeping import Keeping
-    from torchvision_dddas.sinks.session import SessionLog
-    from torchvision_dddas.sinks.whole import cannot_write
+    from torchvision_dddas.io.atomic_files import cannot_write
+    from torchvision_dddas.io.output.live_session import SessionLog
+    from torchvision_dddas.live.status import Keeping
 
     log = SessionLog(folder, facts)
     stack.callback(log.close)
@@ -168,7 +168,7 @@ def _facts(
     people: bool,
 ) -> dict[str, Any]:
     """What run.json says beside how it goes."""
-    from torchvision_dddas.sources.stream import without_secrets
+    from torchvision_dddas.io.stream_capture import without_secrets
 
     located = {} if given is None or ready.watch is None else {**given.facts, **about(ready.watch.locator)}
     return {

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 from torchvision_dddas.cli.prepared import Prepared
 
 if TYPE_CHECKING:
+    from torchvision_dddas.config import Settings
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
-    from torchvision_dddas.settings import Settings
     from torchvision_dddas.types import Adjustment, Frame
 
 
@@ -16,15 +16,15 @@ def path(
     ready: Prepared, source: "LiveSource", people: bool, interval: int, backend: str, health: "Health"
 ) -> "Callable[[Feed], Iterator[Result]]":
     """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
-    from torchvision_dddas.live.shedding import Shedding
-    from torchvision_dddas.settings import with_knobs
-    from torchvision_dddas.surveying import survey
-    from torchvision_dddas.vision import load
+    from torchvision_dddas.config import with_knobs
+    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.live.load_shedding import Shedding
+    from torchvision_dddas.pipeline import survey
 
     settings, recognizer = ready.settings, None
     if people:
-        from torchvision_dddas.recognizing import recognizer_of
-        from torchvision_dddas.spotting import Spotter
+        from torchvision_dddas.people.detector import recognizer_of
+        from torchvision_dddas.people.live_tracker import Spotter
 
         # A look at the whole picture takes as long as many pictures do to come.
         share = min(settings.people.look_share, 0.1)
@@ -36,7 +36,7 @@ def path(
 
     def begin(feed: "Feed") -> "Iterator[Result]":
         # After an error nothing that remembers a frame is trusted.
-        vision = next(visions, None) or load(backend, shedding.settings)
+        vision = next(visions, None) or load_engine(backend, shedding.settings)
         spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
         watch = None if ready.watch is None else ready.watch.anew()
 

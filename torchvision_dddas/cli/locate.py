@@ -13,8 +13,8 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.positions import PositionJournal
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.output.position_output import PositionJournal
 
 locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
 locate.command()(aerial)
@@ -42,9 +42,9 @@ def ground(
     Writes positions.csv, sightings.csv (what each camera alone says), tracks.geojson and tracks.kml where longitudes
     are known, and run.json under --out.
     """
-    from torchvision_dddas.settings import load
+    from torchvision_dddas.config import load_config
 
-    journal = ground_into(out, tables, camera, poses or [], load(config, set_ or []), rate, quiet)
+    journal = ground_into(out, tables, camera, poses or [], load_config(config, set_ or []), rate, quiet)
     if not quiet:
         for line in summary(journal, out):
             typer.echo(line)
@@ -60,12 +60,12 @@ def ground_into(
     quiet: bool = False,
 ) -> "PositionJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.locating import locate as located
-    from torchvision_dddas.locating import survey
-    from torchvision_dddas.sinks.positions import PositionOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
-    from torchvision_dddas.sources.cameras import left_open, read_camera, read_poses
-    from torchvision_dddas.sources.detections import read_detections
+    from torchvision_dddas.geo.ground_locator import locate as located
+    from torchvision_dddas.geo.ground_locator import survey
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.camera_files import left_open, read_camera, read_poses
+    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.output.position_output import PositionOutput
 
     if len(cameras) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")

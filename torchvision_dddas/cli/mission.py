@@ -13,10 +13,10 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.metrics.crowds import CrowdScore
-    from torchvision_dddas.mission import Mission
-    from torchvision_dddas.sinks.journal import Record
-    from torchvision_dddas.sources.simulator import SimulatorSource
+    from torchvision_dddas.control.mission_api import Mission
+    from torchvision_dddas.evaluation.metrics.crowds import CrowdScore
+    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.simulation.source import SimulatorSource
 
 SIMULATED = "sim:"
 """What names of scenarios begin with."""
@@ -42,8 +42,8 @@ def fly(
     overrides: of the settings; scene: of the scenario. Raises InputError for bad input.
     """
     from torchvision_dddas.cli.run import summary
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.flown import SAVED
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.simulation.closed_loop_output import SAVED
 
     if useless := [name for name, given in files.items() if given is not None]:
         raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
@@ -69,18 +69,18 @@ def fly_into(
     quiet: bool = False,
 ) -> "tuple[Record, CrowdScore]":
     """As `fly`, but returns the record of the run and its score, and says nothing at its end."""
-    from torchvision_dddas.sinks.flown import FlownOutput
+    from torchvision_dddas.simulation.closed_loop_output import FlownOutput
 
     with FlownOutput(folder, save) as output:
-        from torchvision_dddas.metrics.crowds import CrowdScorer
-        from torchvision_dddas.mission import Begun, mission_of
-        from torchvision_dddas.settings import load
+        from torchvision_dddas import geometry
+        from torchvision_dddas.config import load_config
+        from torchvision_dddas.control.mission_api import Begun, mission_of
+        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+        from torchvision_dddas.pipeline import survey
         from torchvision_dddas.simulation.scenario import load as load_scenario
         from torchvision_dddas.simulation.scenario import settings_of
-        from torchvision_dddas.sources.simulator import SimulatorSource, named
-        from torchvision_dddas.surveying import survey
-        from torchvision_dddas.targets import geodesy
-        from torchvision_dddas.vision import load as load_vision
+        from torchvision_dddas.simulation.source import SimulatorSource, named
 
         chosen = load_scenario(scenario, scene, seed)
         if chosen.clip.located_by == "nothing":
@@ -90,15 +90,15 @@ def fly_into(
             )
         own = settings_of(chosen)
         own.setdefault("landmarks.common_sigma_m", chosen.gps.common_m)
-        settings = load(config or CONFIG, overrides, own)
+        settings = load_config(config or CONFIG, overrides, own)
         with named(scenario):
             simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = Begun(simulated)
         mission = mission_of(source, settings, backend, chosen.clip.located_by == "landmarks")
-        vision = load_vision(backend, mission.settings)
+        vision = load_engine(backend, mission.settings)
         journal = _begin(output, mission, simulated, vision.name)
-        output.knows(partial(geodesy.lonlat, origin_deg=simulated.origin_deg))
-        scorer = CrowdScorer(partial(geodesy.east_north, origin_deg=simulated.origin_deg))
+        output.knows(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
+        scorer = CrowdScorer(partial(geometry.east_north, origin_deg=simulated.origin_deg))
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
                 done = 0
@@ -126,7 +126,7 @@ def fly_into(
 
 def _noticed(output: Any, mission: "Mission") -> None:
     """Tell what the run itself saw to go wrong."""
-    from torchvision_dddas.sinks.run_log import NOTICED
+    from torchvision_dddas.io.output.run_log import NOTICED
 
     for notice in mission.notices():
         output.event(notice.frame, notice.text, notice.time_s, NOTICED)

@@ -14,9 +14,9 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.people_output import PeopleJournal
-    from torchvision_dddas.vision import Recognizer
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.output.people_output import PeopleJournal
+    from torchvision_dddas.people.scorer import Recognizer
 
 
 @explained
@@ -50,12 +50,12 @@ def people(
 
     Writes detections.txt (MOTChallenge), detections.csv with the feet, overlay.mp4 (.png for a picture) and run.json.
     """
-    from torchvision_dddas import recognizing
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.people_output import SAVED
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output.people_output import SAVED
+    from torchvision_dddas.people import detector as recognizing
 
-    settings, names = load(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), saved(save, SAVED)
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
     recognizer = cache(lambda: recognizing.recognizer_of(settings.people, backend.value))
@@ -80,17 +80,17 @@ def people_into(
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
-    from torchvision_dddas.sinks.people_output import PeopleOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.output.people_output import PeopleOutput
 
     given = [Path(clip), *([] if around is None else [around])]
     refuse_own_input(given, [folder / name for name in PeopleOutput.files], "folder with --out")
     with PeopleOutput(folder, save) as output:
-        from torchvision_dddas.recognizing import recognize
-        from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.agreement import within_clip
-        from torchvision_dddas.sources.detections import read_detections
-        from torchvision_dddas.targets.scan import levels
+        from torchvision_dddas.io.detection_tables import read_detections
+        from torchvision_dddas.io.sources import open_source
+        from torchvision_dddas.io.table_checks import within_clip
+        from torchvision_dddas.people.detector import recognize
+        from torchvision_dddas.people.pyramid import levels
 
         table = read_detections(around) if around is not None else None
         source = open_source(clip, rate_hz=rate_hz, single=True)

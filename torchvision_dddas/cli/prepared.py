@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from torchvision_dddas.cli.aerial import AerialInput, locator_for
 
 if TYPE_CHECKING:
-    from torchvision_dddas.geolocating import Locator, Watch
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sources import Source
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.detection.engine import Vision
+    from torchvision_dddas.geo import Locator, Watch
+    from torchvision_dddas.io.sources import Source
     from torchvision_dddas.types import Telemetry
-    from torchvision_dddas.vision import Vision
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ def prepared(
     clip: str,
 ) -> Prepared:
     """Read what is given beside a clip. given: None where nothing is located. Raises InputError for bad input."""
-    from torchvision_dddas.sources.telemetry import read_telemetry
-    from torchvision_dddas.vision import load
+    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.io.telemetry import read_telemetry
 
     watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
     flight = None
@@ -48,13 +48,13 @@ def prepared(
         notes += more
     elif telemetry is not None:
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
-    return Prepared(settings, load(backend, settings), watch, flight, notes)
+    return Prepared(settings, load_engine(backend, settings), watch, flight, notes)
 
 
 def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: str) -> "tuple[Watch, list[str]]":
-    from torchvision_dddas.geolocating import Watch, check_colours
-    from torchvision_dddas.sources.colours import read_colours
-    from torchvision_dddas.vision import load_colours
+    from torchvision_dddas.geo import Watch, check_colours
+    from torchvision_dddas.geo.solvers import load_colours
+    from torchvision_dddas.io.colour_files import read_colours
 
     colours = read_colours(given.colours) if given.colours is not None else None
     frames = None if source.count is None else (1, source.count)
@@ -70,7 +70,7 @@ def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: 
 
 def _sized(settings: "Settings", locator: "Locator") -> "tuple[Settings, list[str]]":
     """With the camera's own focal length where targets' sizes are told from the altitude, unless another is set."""
-    from torchvision_dddas.settings import Settings, with_knobs
+    from torchvision_dddas.config import Settings, with_knobs
 
     focal = locator.camera.focal_px[0]
     if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:

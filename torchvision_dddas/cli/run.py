@@ -25,8 +25,8 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.journal import Record
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.output.run_record import Record
 
 
 @explained
@@ -87,7 +87,7 @@ def run(
     Writes the tables of `dddas detect`, `dddas track` and `dddas locate aerial`, landmarks.csv (where they were seen),
     overlay.mp4, maps, a report and run.json under --out.
     """
-    from torchvision_dddas.settings import load
+    from torchvision_dddas.config import load_config
 
     if interval < 1:
         raise InputError(f"--interval is {interval}; wanted 1 or more frames")
@@ -105,7 +105,7 @@ def run(
     if landmarks is None and (useless := [name for name, given in others.items() if given is not None]):
         raise InputError(f"{useless[0]} is of no use without --landmarks FILE: nothing would be located")
     given = None if landmarks is None else AerialInput(landmarks, telemetry, camera, dem, background, colours)
-    settings = load(config, set_ or [])
+    settings = load_config(config, set_ or [])
     if live:
         from torchvision_dddas.cli.live import run_live
 
@@ -114,8 +114,8 @@ def run(
                 out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet
             )
         )
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.survey_output import SAVED
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output.pipeline_output import SAVED
 
     names = saved(save, SAVED)
     journal = run_into(out, clip, given, telemetry, interval, settings, backend.value, names, rate, quiet)
@@ -151,15 +151,15 @@ def run_into(
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
-    from torchvision_dddas.sinks.survey_output import FoundOutput, SurveyOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.output.pipeline_output import FoundOutput, SurveyOutput
 
     kind = FoundOutput if given is None else SurveyOutput
     files = given.files if given is not None else [telemetry] if telemetry is not None else []
     refuse_own_input([Path(clip), *files], [folder / name for name in kind.files], "folder with --out")
     with kind(folder, save) as output:
-        from torchvision_dddas.sources import open_source
-        from torchvision_dddas.surveying import survey
+        from torchvision_dddas.io.sources import open_source
+        from torchvision_dddas.pipeline import survey
 
         source = open_source(clip, rate_hz=rate_hz)
         ready = prepared(given, telemetry, settings, source, backend, clip)
@@ -199,7 +199,7 @@ def run_into(
 
 def summary(journal: "Record", folder: Path, located: bool, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
-    from torchvision_dddas.sinks.survey_output import ALL, FOUND
+    from torchvision_dddas.io.output.pipeline_output import ALL, FOUND
 
     files = ALL if located else FOUND
     made = [n for n in files if (folder / n).exists() and (n != "overlay.mp4" or "overlay" in save)]

@@ -11,7 +11,7 @@ def settings() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from torchvision_dddas.settings import all_knobs, config_names
+    from torchvision_dddas.config import all_knobs, config_names
 
     table = Table("knob", "default", "unit", "range", "meaning")
     for knob in all_knobs():

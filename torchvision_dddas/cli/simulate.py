@@ -13,10 +13,10 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
+    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.simulation.recording import Filmed, Heard
     from torchvision_dddas.simulation.scenario import Scenario
     from torchvision_dddas.simulation.simulator import Shot, Simulator
-    from torchvision_dddas.sinks.filmed import Filmed, Heard
-    from torchvision_dddas.sinks.journal import Record
 
 
 @explained
@@ -45,9 +45,9 @@ def simulate(
     Writes frames/, telemetry.csv, landmarks.csv, colours.toml, camera.toml and dem.tif as `dddas run` takes them,
     ground/ as `dddas people` and `dddas locate ground` do, truth/ as `dddas evaluate` does, scenario.toml and run.json.
     """
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.simulation.recording import SAVED
     from torchvision_dddas.simulation.scenario import load, names
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.filmed import SAVED
 
     if scenario is None:
         for name in names():
@@ -75,10 +75,10 @@ def simulate_into(
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
+    from torchvision_dddas import geometry
+    from torchvision_dddas.simulation.recording import FilmedOutput
     from torchvision_dddas.simulation.scenario import as_toml
-    from torchvision_dddas.sinks.filmed import FilmedOutput
-    from torchvision_dddas.sources.simulator import named, simulator_of
-    from torchvision_dddas.targets import geodesy
+    from torchvision_dddas.simulation.source import named, simulator_of
 
     with FilmedOutput(folder, save) as output:
         with named(name):
@@ -95,7 +95,7 @@ def simulate_into(
             simulator.camera,
             simulator.colours,
             as_toml(scenario),
-            lambda metres: geodesy.lonlat(metres, origin),
+            lambda metres: geometry.lonlat(metres, origin),
         )
         with progress(Path(name).stem, count, quiet) as tick:
             for number, filmed in enumerate(_filmed(simulator, "ground" in save), 1):
@@ -112,9 +112,9 @@ def simulate_into(
 
 def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
     """The frames of a run that nobody steers. ground: whether ground vehicles take pictures, all at once."""
-    from torchvision_dddas.settings import Settings, with_knobs
+    from torchvision_dddas.config import Settings, with_knobs
+    from torchvision_dddas.simulation.recording import Filmed
     from torchvision_dddas.simulation.scenario import settings_of
-    from torchvision_dddas.sinks.filmed import Filmed
 
     scenario = simulator.scenario
     apart_s = with_knobs(Settings(), settings_of(scenario)).steering.picture_s
@@ -139,7 +139,7 @@ def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
 
 
 def _heard(shot: "Shot", names: tuple[str, ...]) -> "Iterator[Heard]":
-    from torchvision_dddas.sinks.filmed import Heard
+    from torchvision_dddas.simulation.recording import Heard
 
     for moment in shot.said:
         for report in moment.reports:
@@ -154,7 +154,7 @@ def write_dem(path: Path, simulator: "Simulator") -> list[str]:
     """
     import numpy as np
 
-    from torchvision_dddas.sinks.whole import cannot_write, remove, temporary
+    from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
 
     try:
         import rasterio

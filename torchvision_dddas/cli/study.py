@@ -15,9 +15,9 @@ from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.studies.jobs import Event
-    from torchvision_dddas.studies.record import Results, Spec
-    from torchvision_dddas.studies.running import Plan
+    from torchvision_dddas.evaluation.studies.jobs import Event
+    from torchvision_dddas.evaluation.studies.record import Results, Spec
+    from torchvision_dddas.evaluation.studies.running import Plan
 
 FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", "scores.bin", "report.html", "run.json")
 MOST_NOTES = 12
@@ -27,7 +27,7 @@ def asked(
     file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None
 ) -> "Spec":
     """A study's file, changed by what the command line says. Raises InputError for bad input."""
-    from torchvision_dddas.studies.spec import read_spec
+    from torchvision_dddas.evaluation.studies.spec import read_spec
 
     spec = read_spec(file)
     spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
@@ -55,11 +55,11 @@ def study_into(
     together: int = 1,
 ) -> tuple["Results", dict[str, Any]]:
     """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
-    from torchvision_dddas.sinks.journal import finite
-    from torchvision_dddas.sinks.study_report import report
-    from torchvision_dddas.sinks.whole import cannot_write, write_whole
-    from torchvision_dddas.studies.running import cache_folder, run_study
-    from torchvision_dddas.studies.summary import summary
+    from torchvision_dddas.evaluation.report import report
+    from torchvision_dddas.evaluation.studies.running import cache_folder, run_study
+    from torchvision_dddas.evaluation.studies.summary import summary
+    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+    from torchvision_dddas.io.output.run_record import finite
 
     began, place = time.perf_counter(), cache or cache_folder()
     try:
@@ -91,16 +91,16 @@ def study_into(
 
 
 def _write(folder: Path, name: str, content: Any) -> None:
-    from torchvision_dddas.sinks.journal import finite
-    from torchvision_dddas.sinks.whole import write_whole
+    from torchvision_dddas.io.atomic_files import write_whole
+    from torchvision_dddas.io.output.run_record import finite
 
     write_whole(folder / name, (json.dumps(finite(content), indent=2) + "\n").encode())
 
 
 def _write_tables(folder: Path, measures: dict[str, Any], results: "Results") -> None:
     """The figures as tables, and what `dddas compare` needs."""
-    from torchvision_dddas.studies.scored import ScoredCase, write_scores
-    from torchvision_dddas.studies.tables import write_csv, write_parquet
+    from torchvision_dddas.evaluation.studies.scored import ScoredCase, write_scores
+    from torchvision_dddas.evaluation.studies.tables import write_csv, write_parquet
 
     write_csv(folder / "metrics.csv", measures)
     write_parquet(folder, measures, results)
@@ -110,8 +110,8 @@ def _write_tables(folder: Path, measures: dict[str, Any], results: "Results") ->
 
 def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
     """What run.json says of a study."""
-    from torchvision_dddas.sinks.journal import versions
-    from torchvision_dddas.studies.costs import costs
+    from torchvision_dddas.evaluation.studies.costs import costs
+    from torchvision_dddas.io.output.run_record import versions
 
     spec = results.spec
     return {

@@ -15,8 +15,8 @@ from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.studies.sweep import Trial
-    from torchvision_dddas.studies.swept import Swept
+    from torchvision_dddas.evaluation.studies.sweep import Trial
+    from torchvision_dddas.evaluation.studies.swept import Swept
 
 MOST_SHOWN = 20  # rows of the table
 MOST_PROPOSED = 10_000
@@ -64,18 +64,18 @@ def sweep(
     Results are kept as those of dddas evaluate --dataset: a sweep that is asked for again goes on where it was.
     """
     from torchvision_dddas.cli.study import asked, patterns
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.studies import axes
-    from torchvision_dddas.studies import sweep as sweeping
-    from torchvision_dddas.studies.goals import goal_of
-    from torchvision_dddas.studies.swept import Swept
-    from torchvision_dddas.studies.tried import Tried, parted
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.evaluation.studies import axes
+    from torchvision_dddas.evaluation.studies import sweep as sweeping
+    from torchvision_dddas.evaluation.studies.goals import goal_of
+    from torchvision_dddas.evaluation.studies.swept import Swept
+    from torchvision_dddas.evaluation.studies.tried import Tried, parted
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
     goal, spec = goal_of(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
     spec = replace(spec, tasks=(goal.task,))
-    settings = load(spec.config, spec.overrides)
+    settings = load_config(spec.config, spec.overrides)
     choices, ranges = axes.on_grid(grid or [], settings), axes.in_ranges(range_ or [], settings)
     points = optuna if optuna is not None else sum(1 for _ in axes.points(choices))
     if optuna is not None:
@@ -134,8 +134,8 @@ def show(swept: "Swept") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from torchvision_dddas.studies.sweep import ranked
-    from torchvision_dddas.studies.swept import number
+    from torchvision_dddas.evaluation.studies.sweep import ranked
+    from torchvision_dddas.evaluation.studies.swept import number
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
     knobs = list(dict.fromkeys(knob for trial in swept.trials for knob in trial.knobs))
@@ -163,7 +163,7 @@ def show(swept: "Swept") -> None:
 
 
 def _said(trial: "Trial") -> str:
-    from torchvision_dddas.studies.swept import number
+    from torchvision_dddas.evaluation.studies.swept import number
 
     knobs = ", ".join(f"{knob}={_value(value)}" for knob, value in trial.knobs.items()) or "as it was"
     return f"{knobs}: {trial.cause or number(trial.value)}"

@@ -13,12 +13,12 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.settings import Settings
-    from torchvision_dddas.sinks.track_output import TrackJournal
-    from torchvision_dddas.sources import Source
-    from torchvision_dddas.sources.detections import DetectionTable
+    from torchvision_dddas.config import Settings
+    from torchvision_dddas.detection.engine import Vision
+    from torchvision_dddas.io.detection_tables import DetectionTable
+    from torchvision_dddas.io.output.track_output import TrackJournal
+    from torchvision_dddas.io.sources import Source
     from torchvision_dddas.types import Followed
-    from torchvision_dddas.vision import Vision
 
 
 @explained
@@ -46,11 +46,11 @@ def track(
 
     Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 where there is a clip, and run.json under --out.
     """
-    from torchvision_dddas.settings import load
-    from torchvision_dddas.sinks import saved
-    from torchvision_dddas.sinks.track_output import SAVED
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output.track_output import SAVED
 
-    settings, names = load(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), saved(save, SAVED)
     if clip is None and detections is None:
         raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
     if interval < 1:
@@ -80,24 +80,24 @@ def track_into(
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
-    from torchvision_dddas.sinks.track_output import TrackOutput
-    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.output.track_output import TrackOutput
 
     given = [Path(name) for name in (clip, detections) if name is not None]
     refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
     with TrackOutput(folder, save) as output:
-        from torchvision_dddas.sources import open_source
-        from torchvision_dddas.sources.agreement import agreed, beginning
-        from torchvision_dddas.sources.detections import read_detections
-        from torchvision_dddas.sources.source import looked_at
-        from torchvision_dddas.vision import load
+        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.io.detection_tables import read_detections
+        from torchvision_dddas.io.source import looked_at
+        from torchvision_dddas.io.sources import open_source
+        from torchvision_dddas.io.table_checks import agreed, beginning
 
         table = read_detections(detections) if detections is not None else None
         source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
         notes = agreed(table, interval, source) if table is not None else []
         if table is not None and settings.track.mode == "default":
             notes += beginning(table, settings.track.birth_score)
-        vision = load(backend, settings) if source is not None else None
+        vision = load_engine(backend, settings) if source is not None else None
         facts = {
             "input": clip,
             "detections": detections,
@@ -133,14 +133,14 @@ def _followed(
     settings: "Settings",
     interval: int,
 ) -> "Iterator[Followed]":
-    from torchvision_dddas.following import follow_clip, follow_scenes, follow_table
+    from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 
     if source is None or vision is None:
         assert table is not None
         return follow_table(table, settings, interval)
     if table is not None:
         return follow_clip(source, table, vision, settings, interval)
-    from torchvision_dddas.run import run
+    from torchvision_dddas.detection.detector import run
 
     return follow_scenes(run(source, vision, settings), settings, interval, source.size)
 

@@ -22,7 +22,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.tuning.costing import TimeCost
     from torchvision_dddas.tuning.descent import Descended, Plan, Step
-    from torchvision_dddas.tuning.preparing import Prepared
+    from torchvision_dddas.tuning.preparation import Prepared
     from torchvision_dddas.tuning.verdict import Side, Verdict
 
 CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
@@ -92,7 +92,7 @@ def tune(
     """
     _need_torch()
     from torchvision_dddas.cli.study import asked, patterns
-    from torchvision_dddas.sinks.whole import refuse_own_input
+    from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.tuning.descent import Plan
 
     check_jobs(jobs)
@@ -247,7 +247,7 @@ class _Tuning:
         return found
 
     def _toml(self, ready: "Prepared", found: "Descended", verdict: "Verdict | None") -> None:
-        from torchvision_dddas.studies.sweep import as_toml
+        from torchvision_dddas.evaluation.studies.sweep import as_toml
 
         about = [f"dddas tune: {', '.join(ready.knobs.names)} on {', '.join(ready.tuned)}, step {found.best}."]
         if verdict is not None:
@@ -263,10 +263,10 @@ class _Tuning:
         verdict: "Verdict",
     ) -> dict[str, Any]:
         """What run.json holds, and the page shows."""
-        from torchvision_dddas.modules.tunable import TUNABLE
-        from torchvision_dddas.settings import all_knobs
-        from torchvision_dddas.sinks.journal import versions
+        from torchvision_dddas.config import all_knobs
+        from torchvision_dddas.io.output.run_record import versions
         from torchvision_dddas.tuning.family import loss_of
+        from torchvision_dddas.tuning.parameters import TUNABLE
 
         spec, after = ready.spec, _values(ready)
         meaning = {knob.name: knob.meaning for knob in all_knobs()}
@@ -304,8 +304,8 @@ class _Tuning:
         }
 
     def _report(self, record: dict[str, Any]) -> None:
-        from torchvision_dddas.sinks.journal import finite
-        from torchvision_dddas.sinks.tuning_report import tuning_report
+        from torchvision_dddas.io.output.run_record import finite
+        from torchvision_dddas.tuning.report import tuning_report
 
         self._write(REPORT, tuning_report(finite(record)))
 
@@ -314,7 +314,7 @@ class _Tuning:
 
     def _write(self, name: str | None, text: str = "") -> None:
         """Write a file; without a name, only see that some can be written. Raises InputError."""
-        from torchvision_dddas.sinks.whole import cannot_write, write_whole
+        from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -353,7 +353,7 @@ def _told(verdict: "Verdict") -> list[str]:
 
 
 def _line(what: str, side: "Side", verdict: "Verdict") -> str:
-    from torchvision_dddas.studies.swept import number
+    from torchvision_dddas.evaluation.studies.swept import number
 
     goal = verdict.goal
     told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {number(side.pooled[0])} -> {number(side.pooled[1])}"
@@ -373,7 +373,7 @@ def _prepared(
     quiet: bool,
 ) -> "Prepared":
     from torchvision_dddas.cli.progress import progress
-    from torchvision_dddas.tuning.preparing import prepare
+    from torchvision_dddas.tuning.preparation import prepare
 
     with progress("examples", None, quiet) as tick:
         ready = prepare(spec, base, names, holdout, clips, measure, loss, tick)
@@ -408,6 +408,6 @@ def _clips(count: int) -> str:
 
 
 def _json(content: Any) -> str:
-    from torchvision_dddas.sinks.journal import finite
+    from torchvision_dddas.io.output.run_record import finite
 
     return json.dumps(finite(content), indent=2) + "\n"

@@ -2,6 +2,6 @@
 
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Event, Health, Snapshot
-from torchvision_dddas.live.shedding import Shedding
+from torchvision_dddas.live.load_shedding import Shedding
 
 __all__ = ["Event", "Health", "LiveSource", "Shedding", "Snapshot"]

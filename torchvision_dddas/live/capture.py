@@ -3,15 +3,15 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from torchvision_dddas.config import LiveKnobs
+from torchvision_dddas.io.sources import Problem, open_source
+from torchvision_dddas.io.stream_capture import OpenedStream, Stream, target_of, without_secrets
+from torchvision_dddas.live.capture_log import Diary
 from torchvision_dddas.live.clock import Clock
-from torchvision_dddas.live.diary import Diary
+from torchvision_dddas.live.frame_queue import Inbox
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.inbox import Inbox
-from torchvision_dddas.live.playing import Player
-from torchvision_dddas.live.receiving import OPENING, Receiver
-from torchvision_dddas.settings import LiveKnobs
-from torchvision_dddas.sources import Problem, open_source
-from torchvision_dddas.sources.stream import OpenedStream, Stream, target_of, without_secrets
+from torchvision_dddas.live.playback import Player
+from torchvision_dddas.live.receiver import OPENING, Receiver
 from torchvision_dddas.types import Frame
 
 # How long a thread is waited for that was told to end.

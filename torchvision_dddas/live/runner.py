@@ -8,10 +8,10 @@ from math import isfinite
 from typing import Protocol
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry import at
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
-from torchvision_dddas.sources.telemetry import at
-from torchvision_dddas.surveying import Clip
+from torchvision_dddas.pipeline import Clip
 from torchvision_dddas.types import Followed, Frame, Surveyed, Telemetry
 
 _IN_VAIN = 25

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from torchvision_dddas import geometry
 from torchvision_dddas.simulation.aircraft import Aircraft, Telemetry, rotation
 from torchvision_dddas.simulation.cars import CAR_HALF_M, Cars
 from torchvision_dddas.simulation.crowds import Crowds
@@ -18,7 +19,6 @@ from torchvision_dddas.simulation.obstacles import Obstacles, Things
 from torchvision_dddas.simulation.receiver import Receivers
 from torchvision_dddas.simulation.scenario import Scenario
 from torchvision_dddas.simulation.team import UGV_HALF_M, Team, plates
-from torchvision_dddas.targets import geodesy
 from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
 
 _TICK_S = 0.1
@@ -109,10 +109,10 @@ class Agents:
         """(2,) local metres of longitude and latitude."""
         if place_deg is None:
             return None
-        return geodesy.east_north(np.asarray(place_deg, float)[None], self._scenario.world.origin_deg)[0]
+        return geometry.east_north(np.asarray(place_deg, float)[None], self._scenario.world.origin_deg)[0]
 
     def _lonlat(self, place_m: np.ndarray) -> np.ndarray:
-        return geodesy.lonlat(place_m, self._scenario.world.origin_deg)
+        return geometry.lonlat(place_m, self._scenario.world.origin_deg)
 
     def _frame(self) -> None:
         start, seconds = self.time_s, 1 / self._rate / self._ticks

@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import PaperKnobs, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.modules.affinities import Windows, unlikeliness, wrong_links
-from torchvision_dddas.settings import PaperKnobs, Settings
-from torchvision_dddas.studies.record import Task
-from torchvision_dddas.targets.dispersion import dissimilarity, joined_at, speaking
-from torchvision_dddas.targets.gating import alternatives
-from torchvision_dddas.targets.paper import Look, affinity
-from torchvision_dddas.tuning.boxed import boxed
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.tracking.dispersion import dissimilarity, joined_at, speaking
+from torchvision_dddas.tracking.gating import alternatives
+from torchvision_dddas.tracking.source_tracker import Look, affinity
+from torchvision_dddas.tuning.clip_boxes import boxed
 from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.tuning.soft_affinities import Windows, unlikeliness, wrong_links
 
 WINDOWS = 10
 """Windows of an example."""
@@ -180,7 +180,7 @@ def window_of(
 
 def _looks(clip: Clip, table: TrackTable, interval: int) -> Iterator[tuple[int, np.ndarray, Look]]:
     """Number, identities and look of each frame from the first to the last with boxes."""
-    from torchvision_dddas.vision.histograms import rgb_histograms
+    from torchvision_dddas.tracking.histograms import rgb_histograms
 
     for number, identity, box_px, image in boxed(clip, table, interval):
         counted = None if image is None else rgb_histograms(image, box_px)

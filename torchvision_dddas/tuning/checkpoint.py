@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
+from torchvision_dddas.config import changes
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import Knobs
-from torchvision_dddas.settings import changes
-from torchvision_dddas.sinks.whole import cannot_write, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 from torchvision_dddas.tuning.family import Family, loss_of
+from torchvision_dddas.tuning.parameters import Knobs
 
 FORMAT = 3
 

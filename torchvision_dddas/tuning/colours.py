@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.colours import SoftColours, about, confusion
-from torchvision_dddas.sources.colours import overlapping
+from torchvision_dddas.io.colour_files import overlapping
+from torchvision_dddas.tuning.soft_colours import SoftColours, about, confusion
 from torchvision_dddas.types import Colours
 
 SOFTNESS = (20.0, 2.0)
@@ -61,7 +61,7 @@ def fit_colours(
 
 
 def _hard(ranges: tuple[Tensor, Tensor], bgr: Tensor, worn: Tensor) -> float:
-    from torchvision_dddas.ops.hsv import from_bgr, within
+    from torchvision_dddas.functional.hsv import from_bgr, within
 
     low, high = (end.to(bgr) for end in ranges)
     return float(confusion(within(from_bgr(bgr), low, high), worn).sum())

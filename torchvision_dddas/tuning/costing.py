@@ -10,13 +10,13 @@ from statistics import median, stdev
 import torch
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import TUNABLE
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.sinks.whole import cannot_write, write_whole
-from torchvision_dddas.studies.record import Found, Task
-from torchvision_dddas.studies.stages import find, upstream
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Found, Task
+from torchvision_dddas.evaluation.studies.stages import find, upstream
+from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+from torchvision_dddas.tuning.parameters import TUNABLE
 
 FACTORS = (0.5, 2.0)
 """A knob is measured at its value, and at these parts and multiples of it, within its range."""

@@ -14,12 +14,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.tunable import TUNABLE, Knobs
-from torchvision_dddas.settings import Settings
 from torchvision_dddas.tuning import checkpoint
-from torchvision_dddas.tuning.blame import blamed
 from torchvision_dddas.tuning.family import Example, Family
+from torchvision_dddas.tuning.nonfinite import blamed
+from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
 from torchvision_dddas.tuning.split import batch_of, parted, shares
 
 FADED = 0.1

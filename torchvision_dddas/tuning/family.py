@@ -12,10 +12,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings
-from torchvision_dddas.studies.record import Task
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Task
 
 Tick = Callable[[], object]
 

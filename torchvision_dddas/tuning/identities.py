@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, TrackKnobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics.matching import TrackTable
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.modules.links import Looks, unlikeliness
-from torchvision_dddas.settings import Settings, TrackKnobs
-from torchvision_dddas.sources.detections import DetectionTable, read_detections
-from torchvision_dddas.studies.record import Task
-from torchvision_dddas.targets.kalman import carried_boxes
-from torchvision_dddas.targets.likeness import blended, likeness, visible_share
-from torchvision_dddas.targets.links import births_of, near_border
-from torchvision_dddas.targets.pace import Pace
-from torchvision_dddas.tuning.boxed import boxed
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.io.detection_tables import DetectionTable, read_detections
+from torchvision_dddas.tracking.appearance_score import blended, likeness, visible_share
+from torchvision_dddas.tracking.kalman import carried_boxes
+from torchvision_dddas.tracking.scores import births_of, near_border
+from torchvision_dddas.tracking.speed_prior import Pace
+from torchvision_dddas.tuning.clip_boxes import boxed
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.owners import Owned, owned
+from torchvision_dddas.tuning.matching import Owned, owned
+from torchvision_dddas.tuning.soft_scores import Looks, unlikeliness
 
 LOOKS = 25
 """Looks of a stretch: with the memory of 125 frames all that counts at an interval of 5."""
@@ -196,7 +196,7 @@ def _looks(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Itera
 
 
 def _size(clip: Clip, boxes: Owned) -> tuple[float, float]:
-    from torchvision_dddas.studies.stages import opened
+    from torchvision_dddas.evaluation.studies.stages import opened
 
     if clip.pictures:
         width, height = opened(clip).size
@@ -213,11 +213,11 @@ def _shown(
     clip: Clip, table: TrackTable, settings: Settings, interval: int
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]]:
     """Number, identities, boxes, camera's motion and histograms of each look from the first to the last with boxes."""
-    from torchvision_dddas.vision import load
-    from torchvision_dddas.vision.appearance import strips
-    from torchvision_dddas.vision.camera import Camera
+    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.tracking.appearance import strips
+    from torchvision_dddas.tracking.camera_motion import Camera
 
-    camera, looks_matter = Camera(load("onboard", settings)), settings.track.appearance != "never"
+    camera, looks_matter = Camera(load_engine("onboard", settings)), settings.track.appearance != "never"
     for number, identity, box_px, image in boxed(clip, table, interval):
         if image is None:
             yield number, identity, box_px, None, None

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import torch
 
-from torchvision_dddas.modules.motion import Core, Regions
-from torchvision_dddas.targets.blobs import filled_hull
+from torchvision_dddas.detection.blobs import filled_hull
+from torchvision_dddas.nn.motion_segmenter import Core, Regions
 
 # What is further from any region than this makes no part of it when the core grows a little, px.
 _FAR_PX = 40.0

@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.motion import Differences, SoftMotion, Values
-from torchvision_dddas.ops.relax.passing import through
-from torchvision_dddas.settings import Settings, with_knobs
-from torchvision_dddas.studies.record import Task
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.functional.soft.straight_through import through
+from torchvision_dddas.nn.motion_segmenter import Differences, SoftMotion, Values
+from torchvision_dddas.tuning.clip_masks import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.labelling import regions_of
-from torchvision_dddas.tuning.masked import check_masks, labels_at
 from torchvision_dddas.tuning.overlap import LOSSES, f_loss
-from torchvision_dddas.tuning.recorded import Recorded, differences_of, recorded
+from torchvision_dddas.tuning.recorded_clips import Recorded, differences_of, recorded
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 

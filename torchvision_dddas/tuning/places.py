@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.modules.places import Linear, laid, stepped, surprise
-from torchvision_dddas.settings import Settings
-from torchvision_dddas.studies.record import Task
-from torchvision_dddas.targets.pose import EXACT_M
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.geo.pose_estimation import EXACT_M
+from torchvision_dddas.tuning.aerial_examples import Laid, Look, Seen, joined, of_settings
+from torchvision_dddas.tuning.aerial_examples import laid as hard_laid
+from torchvision_dddas.tuning.clip_examples import looks_of
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.looks import Laid, Look, Seen, joined, of_settings
-from torchvision_dddas.tuning.looks import laid as hard_laid
-from torchvision_dddas.tuning.pictured import looks_of
-from torchvision_dddas.tuning.ranged import person_lost, sightings_of
+from torchvision_dddas.tuning.ground_examples import person_lost, sightings_of
+from torchvision_dddas.tuning.soft_places import Linear, laid, stepped, surprise
 
 UNPLACED = 25.0
 """Nats that a picture costs which no pose of the camera explains, or whose rays miss the ground: no slope, no NaN."""

@@ -14,19 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.datasets.record import Clip
+from torchvision_dddas.config import PeopleKnobs, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.metrics import uncounted
-from torchvision_dddas.metrics.detection import areas, iou
-from torchvision_dddas.metrics.ranking import SAME, judged
-from torchvision_dddas.metrics.truth import Truth
-from torchvision_dddas.modules.people import bodies, doubt, soft_f
-from torchvision_dddas.settings import PeopleKnobs, Settings
-from torchvision_dddas.studies.record import Task
-from torchvision_dddas.targets import scan
-from torchvision_dddas.targets.persons import people_of
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics import uncounted
+from torchvision_dddas.evaluation.metrics.detection import areas, iou
+from torchvision_dddas.evaluation.metrics.ranking import SAME, judged
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people.boxes import people_of
+from torchvision_dddas.people.scorer import Recognizer
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.vision import Recognizer
+from torchvision_dddas.tuning.soft_people import bodies, doubt, soft_f
 
 MOST = 80
 """Pictures of a clip that are learned from, evenly over it: to score one takes about a second, and all clips' windows
@@ -67,7 +67,7 @@ class Recognition:
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The pictures whose people are labelled, each scored once. See `family.Family`."""
-        from torchvision_dddas.recognizing import recognizer_of
+        from torchvision_dddas.people.detector import recognizer_of
 
         knobs = settings.people
         if knobs.suppression != "nms":
@@ -124,8 +124,8 @@ def scored(
 
 
 def _pictures(clip: Clip, knobs: PeopleKnobs, recognizer: Recognizer) -> Iterator[Example]:
-    from torchvision_dddas.recognizing import checked
-    from torchvision_dddas.studies.stages import opened
+    from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.people.detector import checked
 
     truth = clip.truth
     if truth is None or truth.kind != "boxes" or not truth.boxes:

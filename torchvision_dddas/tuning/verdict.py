@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.studies.comparing import LEVEL, compare
-from torchvision_dddas.studies.goals import Goal, value_of
-from torchvision_dddas.studies.jobs import Event
-from torchvision_dddas.studies.record import Case, Spec
-from torchvision_dddas.studies.running import Plan, run_study
-from torchvision_dddas.studies.scored import ScoredCase, ScoredStudy
-from torchvision_dddas.studies.sweep import written
+from torchvision_dddas.evaluation.studies.comparing import LEVEL, compare
+from torchvision_dddas.evaluation.studies.goals import Goal, value_of
+from torchvision_dddas.evaluation.studies.jobs import Event
+from torchvision_dddas.evaluation.studies.record import Case, Spec
+from torchvision_dddas.evaluation.studies.running import Plan, run_study
+from torchvision_dddas.evaluation.studies.scored import ScoredCase, ScoredStudy
+from torchvision_dddas.evaluation.studies.sweep import written
 
 BEFORE, AFTER = "before", "after"
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from torchvision_dddas.config import Settings, is_file, with_knobs
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import Settings, is_file, with_knobs
 from torchvision_dddas.simulation.scenario.knobs import Place, Scenario
 
 FEWEST = 4

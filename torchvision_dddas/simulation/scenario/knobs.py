@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from torchvision_dddas.settings import Group, knob
+from torchvision_dddas.config import Group, knob
 
 Place = tuple[float, float]
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from torchvision_dddas.config import config_folder, is_file, parse_override, read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.settings import config_folder, is_file, parse_override, read_toml
 from torchvision_dddas.simulation.scenario.checks import check
 from torchvision_dddas.simulation.scenario.knobs import Scenario, WorldKnobs
 from torchvision_dddas.simulation.scenario.wording import example, explained, nearest_knob

@@ -5,7 +5,7 @@ from typing import Any, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from torchvision_dddas.settings import Group, nearest, will_not_do
+from torchvision_dddas.config import Group, nearest, will_not_do
 from torchvision_dddas.simulation.scenario.knobs import Place, Scenario
 
 

@@ -1,0 +1,387 @@
+"""The feedback rules, by hand."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
+from torchvision_dddas.control.rules import (
+    SAMPLING,
+    LandmarkUse,
+    Load,
+    Regime,
+    adjusted,
+    best_spread,
+    bounded,
+    chosen,
+    every_least,
+    every_wanted,
+    interval_from_flow,
+    interval_from_telemetry,
+    regime_at,
+    rungs,
+    sampled,
+    shed,
+    spread_m2,
+    steered,
+)
+from torchvision_dddas.types import Adjustment, Marks
+
+KNOBS = IntervalKnobs(minimum_frames=1, maximum_frames=12)
+BASE = with_knobs(
+    Settings(),
+    {
+        "gates.min_area_px": 300,
+        "gates.focal_px": 1000.0,
+        "gates.expected_size_m": 2.0,
+        "gates.expected_share": 0.1,
+        "small.min_area_px": 12,
+        "small.max_box_px": 1600,
+        "small.on": True,
+    },
+)
+
+
+@pytest.mark.parametrize(
+    ("altitude", "speed", "rate", "interval"),
+    [(20, 5, 10, 1), (40, 5, 10, 2), (20, 2.5, 10, 2), (20, 5, 30, 3), (60, 10, 20, 3)],
+)
+def test_the_interval_is_one_at_the_reference_and_proportional_to_altitude_rate_and_one_over_speed(
+    altitude, speed, rate, interval
+):
+    assert interval_from_telemetry(altitude, speed, rate, KNOBS) == pytest.approx(interval)
+
+
+def test_hovering_gives_a_finite_interval_and_the_longest_after_bounds():
+    wanted = interval_from_telemetry(100, 0.0, 10, KNOBS)
+    assert math.isfinite(wanted)
+    assert bounded(wanted, KNOBS) == KNOBS.maximum_frames
+
+
+def test_without_telemetry_the_interval_is_inverse_to_the_background_flow_and_independent_of_the_size():
+    once = interval_from_flow([12.8], 640, KNOBS)
+    assert once == pytest.approx(KNOBS.reference_flow / 0.02)
+    assert interval_from_flow([6.4], 640, KNOBS) == pytest.approx(2 * once)
+    assert interval_from_flow([25.6], 1280, KNOBS) == pytest.approx(once)
+
+
+def test_one_wild_step_does_not_move_the_interval():
+    assert interval_from_flow([5, 5, 5, 5, 300], 640, KNOBS) == interval_from_flow([5], 640, KNOBS)
+
+
+def test_a_still_camera_gives_the_longest_interval():
+    assert bounded(interval_from_flow([0.0], 640, KNOBS), KNOBS) == KNOBS.maximum_frames
+
+
+@pytest.mark.parametrize(("wanted", "interval"), [(0.0, 1), (1.4, 1), (3.6, 4), (500, 12), (1e30, 12)])
+def test_the_interval_is_rounded_and_bounded(wanted, interval):
+    assert bounded(wanted, KNOBS) == interval
+
+
+def test_a_change_is_recorded_with_its_cause_and_no_change_is_not():
+    new, (record,) = adjusted(7, 3, 6.1, "altitude 90 m", KNOBS)
+    assert new == 6
+    assert (record.frame, record.knob, record.old, record.new, record.cause) == (
+        *(7, "interval.frames", 3, 6),
+        "altitude 90 m",
+    )
+    assert adjusted(7, 3, 3.2, "", KNOBS) == (3, ())
+
+
+def test_noise_around_the_middle_between_two_intervals_does_not_make_it_flutter():
+    now, changes = 3, 0
+    for k in range(40):
+        now, records = adjusted(k, now, 3.5 + 0.2 * (-1) ** k, "", KNOBS)
+        changes += len(records)
+    assert changes == 0
+
+
+def test_the_expected_size_sets_the_smallest_area_between_its_bounds():
+    """2 m at 1000 px focal length are 2000 / altitude px; a tenth of its square at 50 m is 160 px."""
+    assert regime_at(50.0, 10, BASE).settings.gates.min_area_px == 160
+    assert regime_at(10.0, 10, BASE).settings.gates.min_area_px == 300
+    assert regime_at(500.0, 10, BASE).settings.gates.min_area_px == 12
+
+
+def test_the_small_path_is_on_while_targets_are_expected_to_fit_its_boxes():
+    assert regime_at(50.5, 10, BASE).settings.small.on
+    assert not regime_at(49.5, 10, BASE).settings.small.on
+    off = with_knobs(BASE, {"small.on": False})
+    assert not regime_at(200.0, 10, off).settings.small.on
+
+
+def test_nothing_else_of_the_settings_changes_with_the_altitude():
+    there = regime_at(90.0, 10, BASE).settings
+    back = {"gates.min_area_px": BASE.gates.min_area_px, "small.on": BASE.small.on}
+    assert with_knobs(there, back) == BASE
+
+
+def test_the_regime_moves_only_when_the_altitude_has_changed_by_a_fifth():
+    regime, first = steered(1, Regime(BASE), 100.0, 10, BASE)
+    assert {record.knob for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
+    assert all("altitude 100.0 m" in record.cause for record in first)
+    assert steered(2, regime, 119.0, 10, BASE) == (regime, ())
+    higher, records = steered(3, regime, 121.0, 10, BASE)
+    assert higher.altitude_m == 121.0
+    bound = next(r for r in records if r.knob == "gates.max_size_px")
+    assert bound.new == pytest.approx(bound.old * 100 / 121)
+    assert "was 100.0 m" in bound.cause
+
+
+def test_where_telemetry_ends_the_bounds_in_metres_end_and_that_is_recorded():
+    regime, _ = steered(1, Regime(BASE), 100.0, 10, BASE)
+    after, records = steered(9, regime, None, 10, BASE)
+    assert after == Regime(BASE)
+    assert {r.cause for r in records} == {"no telemetry for this frame"}
+    assert steered(10, after, None, 10, BASE) == (after, ())
+
+
+# Of how many frames one is looked at.
+
+EVERY = SteeringKnobs(sampling_share=0.5, maximum_every=6)
+
+
+def test_of_so_many_frames_one_is_looked_at_as_a_share_of_the_interval_says():
+    assert every_wanted(8.0, 10, np.array([0.1]), np.array([2.0]), EVERY) == (4.0, "")
+
+
+def test_while_nothing_is_found_a_walker_who_comes_into_the_picture_is():
+    """1 m at 1.4 m/s and 10 Hz: half of it in 3.6 frames."""
+    none = np.zeros(0)
+    assert every_wanted(8.0, 10, none, none, EVERY) == (3.0, "; nothing is found yet")
+    assert every_wanted(8.0, 10, np.array([np.nan]), np.array([2.0]), EVERY)[0] == 3.0
+    assert every_wanted(4.0, 10, none, none, EVERY) == (2.0, "")
+
+
+def test_between_two_looks_no_target_moves_by_more_than_half_its_size():
+    """4 m at 10 m/s and 10 Hz: 2 m in two frames; and a slow one does not matter."""
+    wanted, why = every_wanted(8.0, 10, np.array([0.5, 10.0]), np.array([2.0, 4.0]), EVERY)
+    assert wanted == 2.0 and why == "; a target of 4.0 m goes at 10.0 m/s"
+    assert every_wanted(8.0, 10, np.array([1e9]), np.array([1.0]), EVERY)[0] == 1.0
+
+
+@pytest.mark.parametrize(("wanted", "every"), [(0.0, 1), (3.2, 3), (1e30, 6)])
+def test_the_sampling_is_rounded_and_bounded_and_its_change_recorded(wanted, every):
+    new, made = sampled(5, 1, wanted, "altitude 50 m", EVERY)
+    assert new == every
+    assert [(a.frame, a.knob, a.old, a.new, a.cause) for a in made] == (
+        [] if every == 1 else [(5, "sampling.every", 1, every, "altitude 50 m")]
+    )
+
+
+def test_noise_about_the_middle_between_two_samplings_does_not_make_it_flutter():
+    now, changes = 2, 0
+    for k in range(40):
+        now, made = sampled(k, now, 2.5 + 0.2 * (-1) ** k, "", EVERY)
+        changes += len(made)
+    assert changes == 0
+
+
+# The 4-or-more rule.
+
+SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
+SOURCE = LandmarkKnobs(rule="source", poor_speed_m_s=2.0)
+
+
+def marks_at(places, seen=None):
+    image = np.array(places, float) * 20
+    image[[k for k in range(len(places)) if seen is not None and k not in seen]] = np.nan
+    n = len(places)
+    return Marks(np.arange(n), image, np.array(places, float), np.ones(n), np.ones(n), np.zeros(n))
+
+
+def test_every_landmark_in_view_is_used_by_default_and_no_other():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkKnobs())
+    assert (rows.tolist(), use.landmark, record) == ([0, 1, 2, 4, 5], (0, 1, 2, 4, 5), ())
+
+
+def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
+    assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
+    rows, use, (more,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
+    assert len(rows) == 6 and use.poor
+    assert (more.frame, more.knob, more.old, more.new) == (2, "landmarks.used", 4, 6)
+    assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
+    _, use, (fewer,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
+    assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
+
+
+def test_four_fast_landmarks_alone_change_nothing():
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 3}), np.full(6, 9.0), SOURCE)
+    assert (rows.tolist(), use.poor, record) == ([0, 1, 2, 3], False, ())
+
+
+def test_a_speed_around_the_threshold_does_not_make_the_number_flutter():
+    use, changes = LandmarkUse(), 0
+    for frame, speed in enumerate([1.9, 2.1, 1.9, 2.1, 1.8, 2.05] * 5, 1):
+        _, use, record = chosen(frame, use, marks_at(SIX), np.full(6, speed), SOURCE)
+        changes += len(record)
+    assert changes == 1
+
+
+def test_an_unknown_speed_leaves_the_number_as_it_is():
+    for poor, count in ((True, 6), (False, 4)):
+        rows, use, record = chosen(1, LandmarkUse((0, 1, 2, 3), poor), marks_at(SIX), np.full(6, np.nan), SOURCE)
+        assert (len(rows), use.poor, record) == (count, poor, ())
+
+
+def test_the_four_in_use_stay_until_others_are_clearly_better_spread():
+    places = SIX.copy()
+    places[4] = (10.4, 10.4)  # a little better than the corner beside it
+    held = LandmarkUse((0, 1, 2, 3))
+    assert spread_m2(places[[0, 1, 3, 4]]) >= spread_m2(places[:4])
+    assert chosen(1, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 2, 3]
+    places[2] = (5.0, 0.1)  # and now that one lies on a line with two others
+    assert chosen(2, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 3, 4]
+
+
+def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmarks_in_one_place():
+    assert spread_m2(np.array([[0, 0], [4, 0], [0, 2], [4, 3.0]])) == pytest.approx(4.0)
+    assert best_spread(SIX, 4).tolist() == [0, 1, 2, 3]
+    crowd = np.concatenate([np.full((20, 2), 5.0), SIX[:4]])
+    assert best_spread(crowd, 4).tolist() == [20, 21, 22, 23]
+    assert best_spread(np.full((9, 2), 5.0), 4).tolist() == sorted(set(best_spread(np.full((9, 2), 5.0), 4).tolist()))
+
+
+def test_landmarks_all_on_one_line_are_taken_as_far_apart_as_they_are():
+    row = np.array([[k, 2.0 * k] for k in range(6)])
+    assert {0, 5} <= set(best_spread(row, 4).tolist())
+
+
+def test_gaps_are_closed_in_metres_where_that_is_asked_for_and_never_wider_than_in_pixels():
+    base = with_knobs(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
+    closes = [regime_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
+    assert closes == [base.morphology.close_px, 17, 4]
+    plain = regime_at(200.0, 10.0, Settings())
+    assert plain.settings.morphology.close_px == Settings().morphology.close_px
+
+
+def test_from_look_to_look_a_walker_moves_far_enough_to_show():
+    knobs = Settings().steering
+    frames = every_least(554 / 200, 10.0, knobs)
+    assert frames / 10 * 1.4 * 554 / 200 == pytest.approx(knobs.least_move_px)
+
+
+# -- a run that must keep up with a camera -----------------------------------------------------------------------------
+
+LIVE = with_knobs(
+    Settings(),
+    {
+        "registration.keypoints": 400,
+        "live.least_keypoints": 100,
+        "live.maximum_every": 4,
+        "live.load": 0.8,
+        "live.calm_s": 5.0,
+        "live.deadline_ms": 1000,
+        "people.search": "regions",
+    },
+)
+APART_S = 0.04
+
+
+def driven(cost_ms, looks, now=None, start_s=0.0, settings=LIVE, people=False):
+    """The rule at every look from start_s on, where a look at everything takes cost_ms and half the keypoints 80 %."""
+    moved: list[Adjustment] = []
+    now, time_s = now or Load(), start_s
+    for k in range(looks):
+        rung = rungs(settings, people)[now.rung]
+        cheaper = 0.8 ** np.log2(settings.registration.keypoints / rung["registration.keypoints"])
+        now, some = shed(k + 1, now, cost_ms / 1000 * cheaper, APART_S, time_s, settings, people)
+        moved += some
+        time_s += rung[SAMPLING] * APART_S
+    return now, moved, time_s
+
+
+def test_keypoints_are_halved_to_the_least_then_the_search_narrows_then_pictures_are_left_out():
+    ladder = rungs(LIVE, people=True)
+    assert [rung["registration.keypoints"] for rung in ladder[:3]] == [400, 200, 100]
+    assert [rung["people.look_share"] for rung in ladder[2:6]] == [1, 0.5, 0.25, 0.125]
+    assert [rung[SAMPLING] for rung in ladder[5:]] == [1, 2, 3, 4]
+    assert {rung[SAMPLING] for rung in ladder[:5]} == {1}
+    for before, after in itertools.pairwise(ladder):
+        assert all(before[name] >= after[name] for name in ("registration.keypoints", "people.look_share"))
+        assert sum(before[name] != after[name] for name in before) == 1
+
+
+def test_who_keeps_up_looks_at_everything():
+    now, moved, _ = driven(31, 200)
+    assert now.rung == 0
+    assert not moved
+
+
+def test_too_long_a_look_is_shed_until_it_fits_and_no_further():
+    now, moved, _ = driven(36, 200)
+    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 400, 200)]
+    assert "36 ms" in moved[0].cause
+    assert "90%" in moved[0].cause
+    assert now.rung == 1
+
+
+def test_what_takes_far_too_long_is_shed_at_once_and_fits():
+    now, moved = shed(1, Load(), 0.1, APART_S, 0.0, LIVE)
+    rung = rungs(LIVE)[now.rung]
+    assert (rung["registration.keypoints"], rung[SAMPLING]) == (100, 4)
+    assert {a.knob for a in moved} == {"registration.keypoints", SAMPLING}
+
+
+def test_the_least_is_the_least_however_busy():
+    now, _, _ = driven(5000, 50)
+    assert now.rung == len(rungs(LIVE)) - 1
+    assert shed(60, now, 9.0, APART_S, 60.0, LIVE) == (now, ())
+
+
+def test_pictures_that_miss_their_deadline_are_made_cheaper_but_none_is_left_out_for_it():
+    late = with_knobs(LIVE, {"live.deadline_ms": 20})
+    now = Load()
+    for k in range(20):
+        now, _ = shed(k + 1, now, 0.025, APART_S, k * APART_S, late)
+    assert rungs(late)[now.rung] == {"registration.keypoints": 100, SAMPLING: 1}
+
+
+def test_more_is_looked_at_again_after_calm_s_with_time_to_spare_and_not_before():
+    busy, _, end_s = driven(36, 20)
+    early, moved, _ = driven(15, 124, busy, end_s)
+    assert early.rung == busy.rung
+    assert not moved
+    calm, moved, _ = driven(15, 130, busy, end_s)
+    assert calm.rung == 0
+    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 200, 400)]
+
+
+def test_a_moment_without_time_to_spare_starts_the_wait_anew():
+    now = Load(rung=1)
+    for k in range(200):
+        cost_s = 0.031 if k % 100 == 99 else 0.010
+        now, moved = shed(k, now, cost_s, APART_S, k * APART_S, LIVE)
+        assert not moved
+
+
+def test_what_fits_just_so_is_not_tried_again():
+    _, moved, _ = driven(36, 1000)
+    assert len(moved) == 1
+
+
+def test_each_try_that_did_not_last_makes_the_next_one_wait_twice_as_long():
+    """Half the keypoints take a third here: more than the rule expects of them, so that it falls for it."""
+    now, tries = Load(), []
+    for k in range(3000):
+        cost_s = 0.036 if now.rung == 0 else 0.012
+        now, moved = shed(k + 1, now, cost_s, APART_S, k * APART_S, LIVE)
+        tries += [k * APART_S for a in moved if a.new > a.old]
+    waits = np.diff(tries)
+    assert np.all(waits[:3] > 1.9 * np.array([5.0, *waits[:2]]))
+
+
+def test_pictures_left_out_come_back_as_many_as_there_is_time_for():
+    few = Load(rung=len(rungs(LIVE)) - 1)
+    now, moved, _ = driven(25, 140, few)
+    assert rungs(LIVE)[now.rung][SAMPLING] == 1
+    assert [(a.knob, a.old, a.new) for a in moved] == [(SAMPLING, 4, 1)]
+
+
+@pytest.mark.parametrize(("apart_s", "on"), [(0.0, True), (APART_S, False)])
+def test_nothing_is_shed_where_pictures_wait_or_it_is_turned_off(apart_s, on):
+    settings = with_knobs(LIVE, {"live.shed": on})
+    assert shed(1, Load(), 10.0, apart_s, 0.0, settings) == (Load(), ())

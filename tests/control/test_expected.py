@@ -1,0 +1,62 @@
+"""Where in a picture from the ground people of located targets are looked for."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.control.expected_regions import expected_regions
+from torchvision_dddas.types import Camera
+
+CAMERA = Camera("", (640, 480), (600.0, 600.0), (319.5, 239.5), height_m=1.3, position_sigma_m=0.1)
+HEADING = math.radians(60)
+
+
+def regions(camera, *targets):
+    """Of targets (ahead, right, radius) in metres, before a camera at (5, -3)."""
+    ahead, aside = np.array([math.sin(HEADING), math.cos(HEADING)]), np.array([math.cos(HEADING), -math.sin(HEADING)])
+    stands = np.array([5.0, -3.0])
+    place = np.array([stands + a * ahead + r * aside for a, r, _ in targets]).reshape(-1, 2)
+    spread = np.tile(0.04 * np.eye(2), (len(targets), 1, 1))
+    radius = np.array([radius for *_, radius in targets])
+    return expected_regions(place, spread, radius, camera, stands, HEADING, GroundKnobs())
+
+
+def box_of(camera, ahead, right, tall):
+    """The box of a body on level ground."""
+    u, scale = camera.centre_px[0] + camera.focal_px[0] * right / ahead, camera.focal_px[1] / ahead
+    horizon = camera.centre_px[1] - camera.focal_px[1] * math.tan(camera.pitch_rad)
+    feet = horizon + scale * camera.height_m
+    return u - 0.17 * scale * tall, feet - scale * tall, 0.34 * scale * tall, scale * tall
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.03])
+@pytest.mark.parametrize(("ahead", "right", "radius"), [(12, 0, 2.0), (8, -3, 1.0), (15, 4, 3.0), (5, 1, 2.5)])
+def test_everybody_of_a_target_is_within_its_region_and_of_an_expected_height(ahead, right, radius, pitch):
+    camera = replace(CAMERA, pitch_rad=pitch)
+    ((left, top, width, height),), ((least, largest),) = regions(camera, (ahead, right, radius))
+    for turn in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        for tall in (1.6, 1.9):
+            x, y, w, h = box_of(camera, ahead + radius * math.cos(turn), right + radius * math.sin(turn), tall)
+            assert left <= x and x + w <= left + width and top <= y and y + h <= top + height
+            assert least <= h <= largest
+
+
+def test_a_small_target_afar_takes_a_small_part_of_the_picture():
+    ((_, _, width, height),), ((least, largest),) = regions(CAMERA, (14, 0, 0.5))
+    assert width < 0.35 * 640 and height < 0.5 * 480 and largest < 1.6 * least
+
+
+def test_a_target_outside_the_view_has_no_region():
+    assert not len(regions(CAMERA, (-10, 0, 2.0), (8, 12, 1.0))[0])
+
+
+def test_what_is_where_the_camera_stands_has_no_region():
+    assert not len(regions(CAMERA, (0.5, 0.3, 1.0))[0])
+
+
+def test_each_target_in_view_has_its_own_region():
+    region, heights = regions(CAMERA, (10, -3, 0.5), (16, 3, 0.5), (-10, 0, 1.0))
+    assert len(region) == len(heights) == 2 and region[0, 0] < region[1, 0] and heights[0, 1] > heights[1, 1]

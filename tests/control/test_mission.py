@@ -1,0 +1,163 @@
+"""The loop about the whole path, in a world of a few seconds: what is found goes out, what is reported comes in."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from tests.simulation.small import small
+from torchvision_dddas import geometry
+from torchvision_dddas.config import load_config
+from torchvision_dddas.control.mission_api import Begun, Mission, mission_of
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.pipeline import survey
+from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.types import Command, Surveyed
+
+FROZEN = {"what": "frozen", "time_s": 2.0, "seconds": 0.5}
+DROPPED = {"what": "dropped", "time_s": 3.2, "seconds": 0.3}
+LOST = {"what": "ugv_lost", "time_s": 0.5, "seconds": 9.0, "vehicle": 2}
+
+
+@dataclass
+class Flight:
+    """What came of a run."""
+
+    source: SimulatorSource
+    mission: Mission
+    surveyed: list[Surveyed] = field(default_factory=list)
+    steered: list[Command] = field(default_factory=list)
+    noticed: list[tuple[int, str]] = field(default_factory=list)
+    places: dict[int, np.ndarray] = field(default_factory=dict)  # true ones of the ground vehicles, by frame
+
+
+OFTEN = ("steering.picture_s=0.5", "steering.sampling=false")
+
+
+def world(seconds=6.0, **tables):
+    """Five pictures a second of a crowd and four ground vehicles with cameras that can tell people."""
+    clip = {"seconds": seconds, "rate_hz": 5.0, **tables.pop("clip", {})}
+    team = {"width_px": 320, "height_px": 240, **tables.pop("team", {})}
+    return small(clip=clip, team=team, uav={"altitude_m": 25.0}, **tables)
+
+
+def fly(overrides=(), seconds=6.0, **tables) -> Flight:
+    """Fly a small scenario in the closed loop."""
+    scenario = world(seconds, **tables)
+    simulated = SimulatorSource(scenario)
+    steered, steer = [], simulated.steer
+
+    def told(command):
+        steered.append(command)
+        steer(command)
+
+    simulated.steer = told  # type: ignore[method-assign]
+    settings = load_config("patrol", [*overrides])
+    source = Begun(simulated)
+    mission = mission_of(source, settings, "onboard", scenario.clip.located_by == "landmarks")
+    flown = Flight(simulated, mission, steered=steered)
+    vision = load_engine("onboard", mission.settings)
+    for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
+        flown.surveyed.append(surveyed)
+        flown.noticed += [(notice.frame, notice.text) for notice in mission.notices()]
+        for truth in simulated.truths():
+            flown.places[truth.frame] = truth.bodies.place_m[truth.bodies.kind == "ugv"]
+    return flown
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return fly(OFTEN, fault=(FROZEN, DROPPED, LOST))
+
+
+def test_every_frame_is_surveyed_and_laid_on_the_ground(flown):
+    assert [s.followed.number for s in flown.surveyed] == list(range(1, 31))
+    assert all(s.grounded is not None and s.grounded.fix.by for s in flown.surveyed)
+
+
+def test_what_is_found_reaches_the_source_as_commands(flown):
+    commands = [s.command for s in flown.surveyed]
+    # One comes before there is anything to be found: how often to look.
+    assert all(one is other for one, other in zip(flown.steered[1:], commands, strict=True))
+    last = commands[-1]
+    assert last is not None
+    assert last.look_at is not None
+    assert {order.vehicle for order in last.orders} <= {"ugv1", "ugv2", "ugv3", "ugv4"}
+    # Degrees near the world's origin, not metres.
+    assert np.abs(np.asarray(last.look_at) - flown.source.origin_deg).max() < 0.001
+
+
+def test_commands_move_the_ground_vehicles(flown):
+    alone = SimulatorSource(world(fault=(FROZEN, DROPPED, LOST)))
+    planned: dict[int, np.ndarray] = {}
+    for _ in alone:
+        planned |= {truth.frame: truth.bodies.place_m[truth.bodies.kind == "ugv"] for truth in alone.truths()}
+    assert np.abs(planned[2] - flown.places[2]).max() < 1e-9
+    assert np.abs(planned[30] - flown.places[30]).max() > 0.3
+
+
+def test_reports_are_taken_as_they_come(flown):
+    landmarks = flown.mission.watch.locator.site.landmarks
+    told = landmarks.frame[~landmarks.planned]
+    assert told.max() == 30
+    assert not landmarks.geographic
+    telemetry = flown.mission.watch.locator.site.telemetry
+    assert telemetry is not None
+    assert telemetry.time_s[-1] == pytest.approx(5.8)
+
+
+def test_targets_are_judged_by_what_ground_vehicles_saw(flown):
+    judged = [s.confirmed for s in flown.surveyed]
+    assert all(c is not None for c in judged)
+    assert any(by for c in judged if c is not None for by in c.seen_by)
+
+
+def test_places_are_those_of_the_world(flown):
+    """The crowd walks eastward about the middle: what is found of it is near."""
+    places = np.concatenate([s.grounded.positions.east_north_m for s in flown.surveyed if s.grounded is not None])
+    assert len(places) > 20
+    origin = flown.mission.watch.locator.site.origin_deg
+    assert origin is not None
+    here = geometry.east_north(geometry.lonlat(places, origin), flown.source.origin_deg)
+    away = np.linalg.norm(here - (-1.0, 0.0), axis=1)
+    assert np.median(away) < 3.0
+
+
+def test_what_goes_wrong_is_noticed(flown):
+    said = {frame: text for frame, text in flown.noticed if "camera" in text}
+    # Frames 11 to 13 show frame 10 again; reports of the lost vehicle end at frame 3.
+    assert "frozen" in said[11]
+    assert said[14] == "the camera sees again: 3 pictures repeated the one before"
+    (silent,) = [text for _, text in flown.noticed if "ugv2" in text]
+    assert silent.startswith("ugv2 reports no place for 2.")
+
+
+def test_dropped_frames_are_scenes_without_targets(flown):
+    lost = [s.followed for s in flown.surveyed if "could not be read" in s.followed.cause]
+    assert [f.number for f in lost] == [17, 18]
+
+
+def test_frames_left_out_on_purpose_leave_no_empty_scenes():
+    flown = fly(("steering.sampling=true", "steering.sampling_share=2.0"), 3.0, clip={"rate_hz": 10.0})
+    numbers = [s.followed.number for s in flown.surveyed]
+    assert numbers[0] == 1
+    assert max(np.diff(numbers)) > 1
+    assert len(numbers) < 25
+    assert not [s.followed.cause for s in flown.surveyed if "could not be read" in s.followed.cause]
+    assert numbers == sorted(flown.places)
+
+
+def test_the_same_seed_gives_the_same_run(flown):
+    again = fly(OFTEN, fault=(FROZEN, DROPPED, LOST))
+    for one, other in zip(flown.surveyed, again.surveyed, strict=True):
+        assert one.grounded is not None
+        assert other.grounded is not None
+        np.testing.assert_array_equal(one.grounded.positions.east_north_m, other.grounded.positions.east_north_m)
+        assert one.grounded.adjustments == other.grounded.adjustments
+    assert flown.noticed == again.noticed
+
+
+def test_without_ground_vehicles_telemetry_lays_the_pictures_on_the_ground():
+    flown = fly((), 1.0, team={"ugvs": 0}, clip={"located_by": "telemetry"})
+    assert {s.grounded.fix.by for s in flown.surveyed if s.grounded is not None} == {"telemetry"}
+    assert flown.mission.watch.locator.site.origin_deg == flown.source.origin_deg

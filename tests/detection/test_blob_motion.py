@@ -1,0 +1,104 @@
+"""Motion of blobs from dense flow."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.detection.blob_motion import DenseFlow, blob_motion, robust_affine
+from torchvision_dddas.detection.blobs import Blob
+
+SHAPE = (120, 160)
+BOX = (50, 40, 40, 30)
+
+
+def texture(seed: int, shape=SHAPE) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), noise, 0, 255, cv2.NORM_MINMAX)
+
+
+def scene(shift: tuple[int, int]) -> np.ndarray:
+    """A textured box over a textured ground, the box shifted."""
+    picture = texture(0)
+    x, y, width, height = BOX
+    picture[y + shift[1] : y + shift[1] + height, x + shift[0] : x + shift[0] + width] = texture(1)[:height, :width]
+    return picture
+
+
+def blob(box=BOX) -> Blob:
+    full = np.ones((box[3], box[2]), bool)
+    return Blob(box, full, full, 200.0)
+
+
+def flows(before: tuple[float, float], after: tuple[float, float], ground=(0.0, 0.0)) -> list[np.ndarray]:
+    """Half-resolution flow fields, one motion inside BOX and another outside."""
+    x, y, width, height = (v // 2 for v in BOX)
+    fields = []
+    for inside in (before, after):
+        field = np.full((SHAPE[0] // 2, SHAPE[1] // 2, 2), ground, np.float32)
+        field[y : y + height, x : x + width] = inside
+        fields.append(field)
+    return fields
+
+
+@pytest.mark.parametrize("velocity", [(2, 0), (-1, 2), (3, -3)])
+def test_a_textured_box_is_found_to_move_as_it_was_moved(velocity):
+    u, v = velocity
+    measured = DenseFlow()(scene((0, 0)), [scene((-2 * u, -2 * v)), scene((2 * u, 2 * v))])
+    motion = blob_motion(blob(), measured, (-2, 2))
+    np.testing.assert_allclose(motion.velocity_px, velocity, atol=0.3)
+    assert motion.steady > 0.7
+
+
+def test_a_box_that_stands_is_not_steady():
+    measured = DenseFlow()(scene((0, 0)), [scene((0, 0)), scene((0, 0))])
+    motion = blob_motion(blob(), measured, (-2, 2))
+    np.testing.assert_allclose(motion.velocity_px, (0, 0), atol=0.1)
+    assert motion.steady == 0
+
+
+def test_displacements_are_shared_out_over_the_frames_between():
+    motion = blob_motion(blob(), flows((3, 1), (6, 2)), (1, 2))
+    np.testing.assert_allclose(motion.velocity_px, (3, 1), atol=1e-5)
+    assert motion.steady == 1
+
+
+def test_what_moves_like_its_surroundings_is_not_steady():
+    assert blob_motion(blob(), flows((-6, 0), (6, 0), ground=(0, 0)), (-2, 2)).steady == 1
+    fields = [np.full((60, 80, 2), (sign * 6, 0), np.float32) for sign in (-1, 1)]
+    assert blob_motion(blob(), fields, (-2, 2)).steady == 0
+
+
+def test_what_moves_to_and_fro_is_not_steady():
+    assert blob_motion(blob(), flows((6, 0), (6, 0)), (-2, 2)).steady == 0
+
+
+def test_the_affine_motion_of_a_blob_that_grows_is_recovered():
+    v, u = np.mgrid[:60, :80].astype(np.float32) * 2 + 0.5
+    growing = np.dstack([0.1 * (u - 70) + 3, 0.1 * (v - 55)])
+    motion = blob_motion(blob(), [growing, growing], (1, 1))
+    centre_u, centre_v, scale = motion.frame
+    at = lambda p: motion.affine[0].T @ [1, (p[0] - centre_u) / scale, (p[1] - centre_v) / scale]  # noqa: E731
+    np.testing.assert_allclose(at((85, 65)), (4.5, 1.0), atol=0.4)
+
+
+def test_outliers_do_not_pull_the_affine_fit():
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-0.5, 0.5, (2, 400))
+    flow = np.c_[2 + u, -1 + v] + rng.normal(0, 0.05, (400, 2))
+    flow[:120] = (-8, 5)
+    np.testing.assert_allclose(robust_affine(u, v, flow)[0], (2, -1), atol=0.2)
+
+
+@pytest.mark.parametrize("box", [(0, 0, 9, 7), (151, 113, 9, 7), (0, 0, 160, 120), (77, 50, 1, 1)])
+def test_blobs_at_the_border_or_of_one_pixel_give_finite_or_unknown_motion(box):
+    motion = blob_motion(blob(box), flows((1, 0), (1, 0)), (1, 1))
+    assert 0 <= motion.steady <= 1
+    assert np.isfinite(motion.velocity_px).all() or np.isnan(motion.velocity_px).all()
+
+
+@pytest.mark.parametrize("shape", [(8, 9), (67, 101), (31, 33)])
+def test_flow_of_odd_and_tiny_pictures_has_half_their_size(shape):
+    grey = texture(2, shape)
+    (field,) = DenseFlow()(grey, [grey])
+    assert field.shape == (shape[0] // 2, shape[1] // 2, 2)
+    assert np.abs(field).max() < 0.1

@@ -1,0 +1,108 @@
+"""Labelling, gates, hulls."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import MorphologyKnobs
+from torchvision_dddas.detection.blobs import filled_hull, find_blobs, weak_blobs
+
+SIZE = (101, 67)
+
+
+def found(core, evidence=None, threshold=10, area=1, peak=0, hull=False):
+    return find_blobs(core, core if evidence is None else evidence, threshold, area, peak, hull)
+
+
+def test_each_connected_region_is_a_blob_with_its_box_and_area(painted):
+    blobs = sorted(found(painted(SIZE, (3, 4, 10, 6), (50, 30, 7, 20))), key=lambda b: b.box)
+    assert [b.box for b in blobs] == [(3, 4, 10, 6), (50, 30, 7, 20)]
+    assert [b.area_px for b in blobs] == [60, 140]
+    np.testing.assert_array_equal(blobs[0].centre_px, [7.5, 6.5])
+
+
+def test_regions_that_touch_by_a_corner_are_one(painted):
+    assert len(found(painted(SIZE, (10, 10, 5, 5), (15, 15, 5, 5)))) == 1
+
+
+def test_a_blank_picture_has_no_blobs_and_a_full_one_has_one(painted):
+    assert found(painted(SIZE)) == []
+    (blob,) = found(painted(SIZE, (0, 0, *SIZE)), hull=True)
+    assert blob.box == (0, 0, *SIZE) and blob.mask.all()
+
+
+@pytest.mark.parametrize(("least", "count"), [(24, 2), (25, 2), (26, 1), (37, 0)])
+def test_a_region_below_the_area_gate_is_none(least, count, painted):
+    assert len(found(painted(SIZE, (0, 0, 5, 5), (20, 20, 6, 6)), area=least)) == count
+
+
+def test_a_region_whose_evidence_never_peaks_is_none(painted):
+    core = painted(SIZE, (0, 0, 5, 5), (20, 20, 6, 6))
+    evidence = np.full(core.shape, 50, np.uint8)
+    evidence[22, 22] = 120
+    (blob,) = found(core, evidence, peak=120)
+    assert blob.box == (20, 20, 6, 6) and blob.peak == 120
+    assert found(core, evidence, peak=121) == []
+
+
+def test_only_evidence_above_the_threshold_is_certain(painted):
+    core = painted(SIZE, (20, 20, 6, 6))
+    evidence = np.full(core.shape, 50, np.uint8)
+    evidence[22, 23:25] = 51
+    (blob,) = found(core, evidence, threshold=50)
+    assert np.argwhere(blob.core).tolist() == [[2, 3], [2, 4]]
+
+
+def test_the_window_cuts_the_blob_out_of_the_picture(painted):
+    core = painted(SIZE, (20, 21, 6, 7))
+    (blob,) = found(core)
+    assert (core[blob.window] > 0).all() and core[blob.window].size == 42
+
+
+def test_a_hull_fills_the_notch_of_an_l_and_only_that(painted):
+    core = painted(SIZE, (10, 10, 20, 5), (10, 10, 5, 20))
+    (blob,) = found(core, hull=True)
+    assert blob.mask[6, 6] and not blob.mask[18, 18]
+    assert blob.mask[core[blob.window] > 0].all()
+
+
+def test_the_hull_of_a_convex_region_is_itself():
+    disc = cv2.circle(np.zeros((41, 41), np.uint8), (20, 20), 18, 1, -1) > 0
+    assert filled_hull(disc)[disc].all() and (filled_hull(disc) != disc).mean() < 0.03
+    assert not filled_hull(np.zeros((5, 7), bool)).any()
+
+
+def test_a_region_inside_another_ones_hull_is_swallowed(painted):
+    core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (46, 10, 4, 40), (25, 25, 6, 6))
+    assert [b.box for b in found(core, hull=True)] == [(10, 10, 40, 40)]
+    assert len(found(core, hull=False)) == 2
+
+
+def test_a_region_in_another_ones_box_but_outside_its_hull_is_kept(painted):
+    core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (40, 40, 8, 8))
+    assert sorted(b.box for b in found(core, hull=True)) == [(10, 10, 40, 40), (40, 40, 8, 8)]
+
+
+def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted):
+    wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
+    strong = found(painted(SIZE, (5, 6, 10, 10)))
+    (weak,) = weak_blobs(wide, strong, 10, MorphologyKnobs(erode_px=1, close_px=1), 1, 0)
+    assert weak.weak and weak.box == (50, 30, 20, 20)
+    assert not strong[0].weak
+
+
+def test_without_wide_evidence_there_are_no_weak_blobs(painted):
+    assert weak_blobs(painted(SIZE), [], 10, MorphologyKnobs(), 1, 0) == []
+
+
+@pytest.mark.parametrize("hull", [False, True])
+def test_blobs_of_maps_at_half_the_size_are_those_of_the_maps_made_whole(hull):
+    half = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (40, 60)).astype(np.uint8), (0, 0), 2)
+    core = cv2.threshold(half, 132, 255, cv2.THRESH_BINARY)[1]
+    whole, evidence = (picture.repeat(2, axis=0).repeat(2, axis=1) for picture in (core, half))
+    wanted, blobs = found(whole, evidence, 135, 60, 137, hull), find_blobs(core, half, 135, 60, 137, hull, scale=2)
+    assert len(blobs) == len(wanted) >= 3
+    for blob, other in zip(blobs, wanted, strict=True):
+        assert blob.box == other.box and blob.peak == other.peak
+        np.testing.assert_array_equal(blob.mask, other.mask)
+        np.testing.assert_array_equal(blob.core, other.core)

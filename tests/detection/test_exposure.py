@@ -1,0 +1,115 @@
+"""A gain that jumps is told from a camera that moves, and does not move the registration."""
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas import config as knobs
+from torchvision_dddas.detection.engine import View, Window, load_engine
+from torchvision_dddas.detection.exposure import exposure, in_one_light, to_light_of
+from torchvision_dddas.geometry import corner_error
+from torchvision_dddas.simulation.scene import render
+
+SIZE = (320, 240)
+GAIN = [1.0, 1.15, 0.85, 0.85, 1.0, 1.15]
+
+
+def lit(grey: np.ndarray, gain: float, offset: float = 0.0) -> np.ndarray:
+    return np.clip(np.round(grey * gain + offset), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def greys() -> list[np.ndarray]:
+    onboard = load_engine("onboard", knobs.load_config())
+    return [onboard.prepare(image).grey for image in render(3, 6, SIZE).images]
+
+
+def view(grey: np.ndarray) -> View:
+    return View(grey, grey)
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset"), [(1.15, 0.0), (0.85, 0.0), (1.35, 0.0), (0.74, 0.0), (1.0, 12.0), (0.9, 15)]
+)
+def test_the_later_frame_comes_back_to_the_earlier_ones_light_though_the_camera_moved(greys, gain, offset) -> None:
+    same, moved = greys[0].astype(int), greys[1]
+    earlier, later = in_one_light(view(greys[0]), view(lit(moved, gain, offset)))
+    # One of the two was brought to the other, the darker one.
+    changed = later if gain * 128 + offset < 128 else earlier
+    wanted = moved if gain * 128 + offset < 128 else lit(same, gain, offset)
+    unclipped = (wanted > 5) & (wanted < 250)
+    assert np.median(np.abs(changed.astype(int) - wanted)[unclipped]) <= 2
+
+
+def test_frames_of_one_light_are_left_as_they_are_however_the_camera_moves(greys) -> None:
+    for a, b in [*pairwise(greys), (greys[0], greys[5])]:
+        earlier, later = in_one_light(view(a), view(b))
+        assert earlier is a and later is b
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_pan_over_an_enlarged_picture_is_no_change_of_light(scale) -> None:
+    coarse = np.random.default_rng(5).integers(0, 256, (360 // scale, 480 // scale)).astype(np.uint8)
+    ground = cv2.resize(coarse, (480, 360), interpolation=cv2.INTER_CUBIC)
+    views = [view(ground[k : k + 240, k : k + 320]) for k in range(8)]
+    assert {to_light_of(views[0], other) for other in views} == {(1.0, 0.0)}
+
+
+def test_levels_that_change_otherwise_than_by_a_gain_and_an_offset_are_content() -> None:
+    wanted = np.linspace(40, 200, 33)
+    assert exposure(wanted, wanted / 1.1 - 3) == pytest.approx((1.1, 3.3))
+    assert exposure(wanted, wanted + 8 * np.sin(np.linspace(0, 12, 33))) == (1.0, 0.0)
+    # A bright thing that came in moves the upper levels only.
+    assert exposure(wanted, wanted + 30 * (wanted > 160)) == (1.0, 0.0)
+    gain, offset = exposure(wanted, wanted / 1.1 + 30 * (wanted > 160))
+    assert gain * 100 / 1.1 + offset == pytest.approx(100, abs=2)
+
+
+def test_what_white_has_cut_off_is_cut_off_in_both(greys) -> None:
+    bright = np.clip(greys[0].astype(int) + 90, 0, 255).astype(np.uint8)
+    lighter = lit(bright, 1.15)
+    assert (lighter == 255).mean() > 0.02
+    earlier, later = in_one_light(view(bright), view(lighter))
+    assert later is lighter
+    assert (earlier[lighter == 255] >= 250).mean() > 0.95
+
+
+def test_too_few_levels_tell_nothing() -> None:
+    dark, white = np.zeros(33), np.full(33, 255.0)
+    assert exposure(dark, white) == (1.0, 0.0)
+    flat = np.full(33, 100.0)
+    gain, offset = exposure(flat, flat + 20)
+    assert gain == 1.0 and offset == pytest.approx(-20)
+
+
+@pytest.mark.parametrize("config", [None, "fast"])
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_a_jumping_gain_does_not_move_the_registration(backend, config) -> None:
+    if backend == "torch":
+        pytest.importorskip("torch")
+    steps = []
+    for gain in (None, GAIN):
+        engine = load_engine(backend, knobs.load_config(config))
+        views = [engine.prepare(image) for image in render(3, 6, SIZE, gain).images]
+        # One pair a call, as in a stream: what is carried from step to step must bear the jump too.
+        steps.append([engine.register([pair])[0] for pair in pairwise(views)])
+    for as_it_is, jumping in zip(*steps, strict=True):
+        assert jumping.reliable
+        assert corner_error(as_it_is.later_from_earlier, jumping.later_from_earlier, SIZE) < 0.2
+
+
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_what_both_neighbours_cut_off_at_white_does_not_move(backend) -> None:
+    if backend == "torch":
+        pytest.importorskip("torch")
+    pattern = np.random.default_rng(0).integers(40, 200, (240, 320)).astype(np.float32)
+    still = cv2.GaussianBlur(pattern, (0, 0), 3) - 90 + np.linspace(0, 150, 320)
+    still[80:160, 100:220] = np.linspace(205, 250, 120)
+    engine = load_engine(backend, knobs.load_config())
+    views = [engine.prepare(lit(still, gain)) for gain in (1.2, 1.0, 1.2)]
+    assert (views[0].grey == 255).mean() > 0.05
+    asked = Window(views[1], (views[0], views[2]), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),))
+    (found,) = engine.foreground([asked])
+    assert not found.core.any()

@@ -1,0 +1,196 @@
+"""The onboard back end's short cuts against the plain way of doing the same."""
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection import opencv_foreground as onboard_pixels
+from torchvision_dddas.detection import opencv_registration as onboard_registration
+from torchvision_dddas.detection.keypoint_grid import cell_side
+from torchvision_dddas.detection.mask_cleaning import closed
+from torchvision_dddas.detection.opencv_engine import OnboardVision
+from torchvision_dddas.geometry import corner_error, transfer
+from torchvision_dddas.simulation.camera import flight
+from torchvision_dddas.simulation.scene import render
+
+SIZE = (320, 240)
+
+
+@pytest.fixture(scope="module")
+def images() -> list[np.ndarray]:
+    return render(seed=1, frames=14, size=SIZE).images
+
+
+@pytest.fixture(scope="module")
+def truth() -> list[np.ndarray]:
+    """later_from_earlier of successive frames, on the ground."""
+    ground = [view.image_from_ground for view in flight(1, 14, SIZE)]
+    return [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
+
+
+def homography(perspective: float) -> np.ndarray:
+    return np.array([[1.002, 0.004, 3.3], [-0.003, 0.998, -2.6], [perspective, -perspective, 1.0]])
+
+
+def textured(size: tuple[int, int] = SIZE, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0])).astype(np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+
+
+# -- pixels ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("perspective", [0.0, 1e-7, 1e-6, 1e-5, 3e-5, 1e-3])
+def test_a_warp_by_tiles_is_the_perspective_warp_but_for_rounding(perspective: float) -> None:
+    picture, matrix = textured(), homography(perspective)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    whole = cv2.warpPerspective(picture, matrix, SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    off = np.abs(onboard_pixels.warp(picture, matrix).astype(int) - whole)
+    assert off.max() <= 2 and off.mean() < 0.1
+
+
+def test_a_warp_beyond_the_horizon_is_left_to_opencv() -> None:
+    matrix = np.array([[1, 0, 0], [0, 1, 0], [-0.01, 0, 1.0]])  # the horizon is the column 100
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    whole = cv2.warpPerspective(textured(), matrix, SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    assert np.array_equal(onboard_pixels.warp(textured(), matrix), whole)
+
+
+@pytest.mark.parametrize("border", [0, 4, 9])
+@pytest.mark.parametrize("perspective", [0.0, 1e-5, 5e-4])
+def test_the_view_as_a_polygon_is_the_view_of_every_pixel_but_for_its_border(perspective: float, border: int) -> None:
+    matrix = homography(perspective) @ np.array([[0.9, 0.2, 20], [-0.2, 0.9, 40], [0, 0, 1.0]])
+    width, height = SIZE
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    place = transfer(matrix, np.c_[u.ravel(), v.ravel()]).reshape(height, width, 2)
+    low, high = np.array([border, border]), np.array([width - 1 - border, height - 1 - border])
+    each = np.asarray(((place >= low) & (place <= high)).all(axis=2)).astype(np.uint8)
+    ours = onboard_pixels.inside(matrix, SIZE, border) > 0
+    cross = np.ones((3, 3), np.uint8)
+    assert not ((cv2.erode(each, cross) > 0) & ~ours).any()
+    assert not (ours & (cv2.dilate(each, cross) == 0)).any()
+
+
+@pytest.mark.parametrize("size", [(320, 240), (33, 64), (40, 65), (50, 129), (3, 3)])
+def test_gradients_and_corners_in_strips_are_those_of_the_whole(size: tuple[int, int]) -> None:
+    grey = textured(size)
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.5) for order in ((1, 0), (0, 1)))
+    whole = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
+    assert np.array_equal(onboard_pixels.texture_of(grey), whole)
+    for block in (3, 5, 7):
+        corners = cv2.cornerMinEigenVal(grey, block, ksize=3)
+        np.testing.assert_allclose(onboard_registration._corners(grey, block), corners, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("side", [1, 3, 4, 15, 25])
+@pytest.mark.parametrize("seed", range(6))
+def test_closing_only_where_something_is_is_closing_everywhere(seed: int, side: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.zeros(tuple(rng.integers(17, 400, 2)), np.uint8)
+    for _ in range(rng.integers(0, 8)):
+        row, column = rng.integers(0, mask.shape[0]), rng.integers(0, mask.shape[1])
+        mask[row : row + rng.integers(1, 25), column : column + rng.integers(1, 25)] = 255
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    assert np.array_equal(closed(mask, side), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.15, -4.0), (0.85, 6.0), (1.0, 25.0)])
+def test_exposure_is_taken_back_although_something_moved(gain: float, offset: float) -> None:
+    reference = cv2.convertScaleAbs(textured(), alpha=0.7, beta=20)
+    other = cv2.convertScaleAbs(reference.astype(np.float32), alpha=gain, beta=offset)
+    other[60:120, 80:180] = 250
+    seen = np.full(reference.shape, 255, np.uint8)
+    off = np.abs(onboard_pixels.exposed(reference, other, seen).astype(int) - reference)
+    off[60:120, 80:180] = 0
+    assert off.max() <= 1
+
+
+def test_exposure_heeds_only_what_both_see() -> None:
+    reference, seen = textured(), np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    other = cv2.convertScaleAbs(reference, alpha=0.8)
+    seen[:, :200] = 255
+    other[:, 200:] = 0
+    off = np.abs(onboard_pixels.exposed(reference, other, seen).astype(int) - reference)
+    assert off[:, :200].max() <= 2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_median_over_a_mask_is_numpys_where_it_exceeds_the_least(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.integers(0, rng.integers(8, 80), (40, 51)).astype(np.uint8)
+    mask = np.where(rng.random(values.shape) < 0.6, 255, 0).astype(np.uint8)
+    assert onboard_pixels.median_above(values, mask, 16) == max(16, float(np.median(values[mask > 0])))
+
+
+# -- registration ----------------------------------------------------------------------------------------------------
+
+
+def test_keypoints_are_the_best_pixel_of_every_cell(images: list[np.ndarray]) -> None:
+    knobs, grey = load_config().registration, cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY)
+    corner, cell = cv2.cornerMinEigenVal(grey, knobs.block_px, ksize=3), 16
+    wanted = set()
+    for top in range(0, 240, cell):
+        for left in range(0, 320, cell):
+            part = corner[top : top + cell, left : left + cell]
+            row, column = np.unravel_index(part.argmax(), part.shape)
+            if part.max() > knobs.quality * corner.max():
+                wanted.add((left + int(column), top + int(row)))
+    found = onboard_registration.keypoints(grey, knobs)
+    assert cell_side(320, 240, knobs) == cell
+    assert {(int(u), int(v)) for u, v in found} == wanted
+
+
+@pytest.mark.parametrize("config", [None, "fast"])
+def test_registrations_follow_the_ground(images: list[np.ndarray], truth: list[np.ndarray], config: str | None) -> None:
+    vision = OnboardVision(load_config(config))
+    views = [vision.prepare(image) for image in images]
+    steps = vision.register(list(pairwise(views)))
+    assert all(step.reliable for step in steps)
+    off = [corner_error(step.later_from_earlier, true, SIZE) for step, true in zip(steps, truth, strict=True)]
+    assert np.median(off) < 0.5 and max(off) < 1.5
+
+
+def test_carried_keypoints_are_detected_anew_every_so_many_frames(
+    images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detect, detections = onboard_registration.keypoints, []
+
+    def counted(grey: np.ndarray, *rest: object, **named: object) -> np.ndarray:
+        detections.append(grey)
+        return detect(grey, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(onboard_registration, "keypoints", counted)
+    vision = OnboardVision(load_config("fast"))
+    views = [vision.prepare(image) for image in images]
+    for at, pair in enumerate(pairwise(views)):
+        vision.register([pair])
+        if at == 4:
+            assert len(detections) == 1
+    assert len(detections) == 3  # at steps 0, 5 and 10 of 13
+
+
+def test_what_is_carried_goes_on_and_leaves_nothing_behind(images: list[np.ndarray]) -> None:
+    vision = OnboardVision(load_config("fast"))
+    views = [vision.prepare(image) for image in images[:5]]
+    for pair in pairwise(views):
+        vision.register([pair])
+    assert ["carried" in view.kept for view in views] == [False] * 4 + [True]
+
+
+def test_a_jump_that_no_prediction_foresees_is_found_by_the_deep_search(images: list[np.ndarray]) -> None:
+    vision = OnboardVision(load_config("fast"))
+    big = textured((480, 360), 5)
+    views = [vision.prepare(big[40:280, 40 + x : 360 + x].copy()) for x in (0, 1, 2, 3, 33)]
+    steps = [vision.register([pair])[0] for pair in pairwise(views)]
+    assert steps[-1].reliable
+    assert corner_error(steps[-1].later_from_earlier, np.array([[1, 0, -30], [0, 1, 0], [0, 0, 1.0]]), SIZE) < 0.1
+
+
+def test_a_cut_carries_nothing_on(images: list[np.ndarray]) -> None:
+    vision = OnboardVision(load_config("fast"))
+    views = [vision.prepare(image) for image in (images[0], images[1], textured(seed=9))]
+    steps = [vision.register([pair])[0] for pair in pairwise(views)]
+    assert steps[0].reliable and not steps[1].reliable and "carried" not in views[2].kept

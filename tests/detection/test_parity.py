@@ -1,0 +1,145 @@
+"""The engine changes, the result does not: both back ends on the same windows of a made scene."""
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from torchvision_dddas import config as knobs
+from torchvision_dddas.detection.engine import View, Vision, Window, load_engine
+from torchvision_dddas.geometry import chain, corner_error
+from torchvision_dddas.simulation.camera import flight
+from torchvision_dddas.simulation.scene import RATE_HZ, render
+
+SIZES = [(320, 240), (251, 187)]
+FRAMES = 7
+GAIN = [1.0, 1.0, 1.15, 1.0, 0.85, 1.0, 1.0]
+CONFIGS = [[], ["difference.kind=to_reference", "difference.blur_px=7", "difference.threshold=20.0"]]
+CONFIGS += [["difference.kind=between_later", "difference.threshold=20.0", "registration.model=affine"]]
+IDS = ["normalized", "to_reference", "between_later-affine"]
+
+
+@pytest.fixture(scope="module", params=SIZES, ids=["even", "odd"])
+def images(request) -> list[np.ndarray]:
+    return film(request.param, False)
+
+
+@cache
+def film(size: tuple[int, int], light_jumps: bool) -> list[np.ndarray]:
+    return render(1, FRAMES, size, GAIN if light_jumps else None).images
+
+
+@pytest.fixture(params=CONFIGS, ids=IDS)
+def engines(request) -> tuple[Vision, Vision]:
+    settings = knobs.load_config(None, request.param)
+    return load_engine("onboard", settings), load_engine("torch", settings)
+
+
+def seen_by(engine: Vision, images: list[np.ndarray]) -> tuple[list[View], list[np.ndarray]]:
+    """Views and the registrations of successive frames, all of them trusted."""
+    views = [engine.prepare(image) for image in images]
+    steps = engine.register(list(pairwise(views)))
+    assert all(step.reliable for step in steps), [step.cause for step in steps]
+    return views, [step.later_from_earlier for step in steps]
+
+
+def window(views: list[View], steps: list[np.ndarray], at: int, pairs: list[tuple[int, int]], far: bool) -> Window:
+    """The window at frame `at` whose pairs are given as frames; with `far`, the last pair is the wide and small one."""
+    used = sorted({frame for pair in pairs for frame in pair})
+    matrices = []
+    for other in used:
+        forward = chain(steps[min(at, other) : max(at, other)])
+        matrices.append(forward if other > at else np.linalg.inv(forward))
+    places = tuple((used.index(a), used.index(b)) for a, b in pairs)
+    last = places[-1] if far else None
+    neighbours = tuple(views[i] for i in used)
+    near = places[:-1] if far else places
+    return Window(views[at], neighbours, np.array(matrices), tuple(i - at for i in used), near, last, last)
+
+
+WINDOWS = {
+    "in the middle": (3, [(2, 4), (1, 5), (0, 6)], True),
+    "the clip's start": (0, [(1, 2), (2, 4)], False),
+    "the clip's end": (6, [(5, 4), (4, 2), (3, 1)], True),
+}
+
+
+def test_registrations_agree_to_half_a_pixel(engines, images) -> None:
+    (_, onboard), (_, batched) = (seen_by(engine, images) for engine in engines)
+    size = images[0].shape[1], images[0].shape[0]
+    assert max(corner_error(a, b, size) for a, b in zip(onboard, batched, strict=True)) <= 0.5
+
+
+@pytest.mark.parametrize("case", WINDOWS)
+def test_what_moves_agrees_each_engine_on_its_own_registrations(engines, images, case) -> None:
+    at, pairs, far = WINDOWS[case]
+    onboard, batched = (engine.foreground([window(*seen_by(engine, images), at, pairs, far)])[0] for engine in engines)
+    a, b = onboard.core > 0, batched.core > 0
+    assert a.any() and (a & b).sum() / (a | b).sum() >= 0.95
+    for name in ("evidence", "wide", "texture"):
+        apart = np.abs(getattr(onboard, name).astype(int) - getattr(batched, name))
+        assert getattr(batched, name).dtype == np.uint8
+        assert np.percentile(apart, 99) <= 6, name
+    assert batched.offsets == onboard.offsets
+    for ours, theirs in zip(batched.warped, onboard.warped, strict=True):
+        assert np.percentile(np.abs(ours.astype(int) - theirs), 99) <= 3
+
+
+@pytest.mark.parametrize("size", SIZES, ids=["even", "odd"])
+def test_on_the_same_registrations_only_ties_of_rounding_differ_even_where_the_light_jumps(engines, size) -> None:
+    views_of = {engine.name: [engine.prepare(image) for image in film(size, True)] for engine in engines}
+    ground = [view.image_from_ground for view in flight(1, FRAMES, size, RATE_HZ)]
+    steps = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
+    pairs = [(2, 4), (1, 5), (0, 6)]
+    onboard, batched = (
+        engine.foreground([window(views_of[engine.name], steps, 3, pairs, True)])[0] for engine in engines
+    )
+    np.testing.assert_array_equal(batched.texture, onboard.texture)
+    for name in ("evidence", "wide", "core", "small"):
+        apart = np.abs(getattr(onboard, name).astype(int) - getattr(batched, name))
+        assert (apart > 2).mean() < 0.002, name
+    assert onboard.core.any() and onboard.small is not None and onboard.small.any()
+
+
+def test_plain_differences_show_the_same_in_both_engines_whether_or_not_the_light_jumps() -> None:
+    size, settings = SIZES[0], knobs.load_config("fast")
+    ground = [view.image_from_ground for view in flight(1, FRAMES, size, RATE_HZ)]
+    steps = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
+    found = {}
+    for name in ("onboard", "torch"):
+        for jumps in (False, True):
+            engine = load_engine(name, settings)
+            views = [engine.prepare(image) for image in film(size, jumps)]
+            (found[name, jumps],) = engine.foreground([window(views, steps, 3, [(2, 4)], False)])
+    steady = found["onboard", False]
+    assert steady.core.any()
+    for name in ("onboard", "torch"):
+        jumped = found[name, True]
+        core, wanted = jumped.core > 0, steady.core > 0
+        assert (core & wanted).sum() / (core | wanted).sum() > 0.9
+        assert (np.abs(jumped.evidence.astype(int) - steady.evidence) > 6).mean() < 0.02
+    apart = np.abs(found["torch", True].evidence.astype(int) - found["onboard", True].evidence)
+    assert (apart > 2).mean() < 0.002
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (9, 11), (1, 1)])
+def test_blank_frames_are_flagged_by_both_and_break_neither(engines, shape) -> None:
+    causes = set()
+    for engine in engines:
+        views = [engine.prepare(np.full((*shape, 3), 90, np.uint8)) for _ in range(3)]
+        steps = engine.register(list(pairwise(views)))
+        assert not any(step.reliable for step in steps)
+        causes |= {step.cause for step in steps}
+        found = engine.foreground([window(views, [np.eye(3)] * 2, 1, [(0, 2)], False)])[0]
+        assert not found.core.any() and found.core.shape == shape
+    assert len(causes) == 1
+
+
+def test_a_cut_is_flagged_by_both(engines, images) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, images[0].shape).astype(np.uint8)
+    for engine in engines:
+        (step,) = engine.register([(engine.prepare(images[0]), engine.prepare(noise))])
+        assert not step.reliable and step.cause

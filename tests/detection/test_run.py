@@ -1,0 +1,401 @@
+"""The whole loop on small films: what comes out, when, and what happens where the film is bad."""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.detection.detector import Loop, run, scenes
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection.windows import delay, reach
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.simulation.scene import render
+from torchvision_dddas.types import Frame, Scene, Telemetry
+
+SIZE = (240, 180)
+CONFIGS = (None, "source", "fast")
+RATE_HZ = 10.0
+
+
+def frames_of(images: Sequence[np.ndarray]) -> list[Frame]:
+    return [Frame(i + 1, i / RATE_HZ, image) for i, image in enumerate(images)]
+
+
+def detect(frames: Sequence[Frame], settings: Settings, batch: int = 1) -> list[Scene]:
+    loop = Loop(load_engine("onboard", settings), settings, RATE_HZ, batch=batch)
+    return [scene for frame in frames for scene in loop.feed(frame)] + list(loop.end())
+
+
+class Film:
+    """A source of frames at hand."""
+
+    rate_hz = RATE_HZ
+
+    def __init__(self, images: Sequence[np.ndarray], count: int | None = None, last: int = 0) -> None:
+        self.frames, self.count, self.last = frames_of(images), count, last
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+def same(a: Scene, b: Scene) -> bool:
+    return (
+        np.array_equal(a.mask, b.mask)
+        and np.array_equal(a.detections.box_px, b.detections.box_px)
+        and np.array_equal(a.detections.speed_px, b.detections.speed_px, equal_nan=True)
+        and (a.interval_frames, a.reliable, a.cause) == (b.interval_frames, b.reliable, b.cause)
+    )
+
+
+def f_measure(found: Sequence[Scene], truth: Sequence[np.ndarray]) -> float:
+    precision, recall = pixels(found, truth)
+    return 2 * precision * recall / max(precision + recall, 1e-9)
+
+
+def pixels(found: Sequence[Scene], truth: Sequence[np.ndarray]) -> tuple[float, float]:
+    """(precision, recall) over all frames."""
+    hit = sum(((s.mask > 0) & (t > 0)).sum() for s, t in zip(found, truth, strict=True))
+    return hit / max(sum((s.mask > 0).sum() for s in found), 1), hit / sum((t > 0).sum() for t in truth)
+
+
+@pytest.fixture(scope="module")
+def film():
+    return render(seed=0, frames=16, size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def noise() -> np.ndarray:
+    """A big texture to pan over."""
+    coarse = np.random.default_rng(5).integers(0, 256, (90, 120, 3)).astype(np.uint8)
+    return cv2.resize(coarse, (480, 360), interpolation=cv2.INTER_CUBIC)
+
+
+def pan(ground: np.ndarray, frames: int, size=SIZE, car: float | None = None) -> list[np.ndarray]:
+    """A camera that pans by 2 px a frame over a picture; a painted car drives at `car` px a frame over the ground."""
+    paint = cv2.resize(np.random.default_rng(9).integers(0, 2, (4, 7, 3)).astype(np.uint8) * 200 + 30, (72, 36))
+    images = []
+    for k in range(frames):
+        picture = ground.copy()
+        if car is not None:
+            x = round(20 + car * k)
+            picture[80 : 80 + 36, x : x + 72] = paint
+        images.append(np.ascontiguousarray(picture[10 : 10 + size[1], 10 + 2 * k : 10 + 2 * k + size[0]]))
+    return images
+
+
+# -- what comes out --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(config, film):
+    found = detect(frames_of(film.images), load_config(config))
+    assert [s.frame.number for s in found] == list(range(1, 17))
+    for scene in found:
+        assert scene.mask.shape == (SIZE[1], SIZE[0]) and scene.mask.dtype == np.uint16
+        assert scene.mask.max() <= len(scene.detections)
+        for i, (x, y, width, height) in enumerate(scene.detections.box_px):
+            rows, columns = np.nonzero(scene.mask == i + 1)
+            assert x <= columns.min() and columns.max() < x + width
+            assert y <= rows.min() and rows.max() < y + height
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_car_that_drives_under_a_panning_camera_is_found_with_its_heading_and_speed(config, noise):
+    settings = load_config(config)
+    found = detect(frames_of(pan(noise, 14, car=5.0)), settings)
+    hits, headings, speeds = 0, [], []
+    for k, scene in enumerate(found):
+        assert scene.reliable
+        centre = 20 + 5 * k - 10 - 2 * k + 36, 88
+        for (x, y, width, height), heading, speed in zip(
+            scene.detections.box_px, scene.detections.heading_rad, scene.detections.speed_px, strict=True
+        ):
+            if x <= centre[0] <= x + width and y <= centre[1] <= y + height:
+                hits += 1
+                headings.append(heading)
+                speeds.append(speed)
+                break
+    assert hits >= 11
+    if not settings.history.on:  # then the quick chain tells none, rather than a guess
+        assert np.isnan(headings).all() and np.isnan(speeds).all()
+        return
+    assert abs(np.degrees(np.nanmedian(headings))) < 20
+    assert np.nanmedian(speeds) == pytest.approx(5.0, rel=0.4)
+
+
+def test_a_pan_over_ground_where_nothing_moves_finds_nothing(noise):
+    found = detect(frames_of(pan(noise, 10)), load_config())
+    assert sum(len(s.detections) for s in found) == 0
+    assert all(s.reliable for s in found)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_the_result_does_not_depend_on_the_batch_size(config, film):
+    settings = load_config(config)
+    one = detect(frames_of(film.images), settings)
+    for batch in (3, 8, 50):
+        assert all(same(a, b) for a, b in zip(one, detect(frames_of(film.images), settings, batch), strict=True))
+
+
+def test_a_run_can_be_repeated(film):
+    settings = load_config()
+    first, second = (detect(frames_of(film.images), settings) for _ in range(2))
+    assert all(same(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
+    """A live stream gets the result of a file: the scene of t is the same whatever follows t + 2 intervals."""
+    settings = load_config(config)
+    whole = detect(frames_of(film.images), settings)
+    for kept in (8, 11):
+        blank = [np.zeros_like(film.images[0])] * (len(film.images) - kept)
+        other = detect(frames_of([*film.images[:kept], *blank]), settings)
+        for t, (a, b) in enumerate(zip(whole, other, strict=True)):
+            if t + 2 * max(a.interval_frames, b.interval_frames) < kept:
+                assert same(a, b), f"frame {t + 1} of {kept} kept"
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_scene_comes_out_two_intervals_after_its_frame_at_the_latest(config, film):
+    settings = load_config(config)
+    loop = Loop(load_engine("onboard", settings), settings, RATE_HZ, batch=1)
+    out: list[Scene] = []
+    for t, frame in enumerate(frames_of(film.images)):
+        out += loop.feed(frame)
+        interval = max([loop.interval, *(slot.interval for slot in loop.slots)])
+        assert len(out) >= t + 1 - 2 * interval, f"after frame {t + 1}"
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("size", [(101, 67), (160, 33), (37, 121)])
+def test_odd_and_narrow_sizes_work(config, size, film):
+    images = [np.ascontiguousarray(image[: size[1], : size[0]]) for image in film.images[:6]]
+    found = detect(frames_of(images), load_config(config))
+    assert [s.mask.shape for s in found] == [(size[1], size[0])] * 6
+
+
+def test_grey_frames_give_masks_like_colour_ones(noise):
+    colour = pan(noise, 10, car=5.0)
+    grey = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in colour]
+    truth = [scene.mask for scene in detect(frames_of(colour), load_config())]
+    assert min(pixels(detect(frames_of(grey), load_config()), truth)) > 0.85
+
+
+# -- light, cuts, bad frames -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gain", [0.85, 1.15])
+def test_an_exposure_that_jumps_costs_at_most_a_twentieth_of_f(gain, film):
+    settings = with_knobs(load_config(), {"gates.min_area_px": 40})  # the people of so small a film
+    calm = f_measure(detect(frames_of(film.images), settings), film.masks)
+    gains = [gain if k % 4 >= 2 else 1.0 for k in range(16)]
+    jumpy = [
+        np.clip(g * image.astype(float), 0, 255).astype(np.uint8) for g, image in zip(gains, film.images, strict=True)
+    ]
+    found = detect(frames_of(jumpy), settings)
+    assert all(s.reliable for s in found)
+    assert calm > 0.5
+    assert f_measure(found, film.masks) > calm - 0.05
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_cut_gives_no_full_mask_and_is_not_looked_across(config, noise):
+    one, two = pan(noise, 8, car=5.0), pan(255 - noise[::-1, ::-1], 8, car=5.0)
+    settings = load_config(config)
+    found = detect(frames_of(one + two), settings)
+    assert max((s.mask > 0).mean() for s in found) < 0.25
+    # The first frame after it is flagged, and nothing else.
+    assert [s.frame.number for s in found if not s.reliable] == [9]
+    assert found[8].cause and not found[8].mask.any() and len(found[8].detections) == 0
+    # Each side is as if it were alone.
+    alone = detect(frames_of(one), settings)
+    assert all(np.array_equal(a.mask, b.mask) for a, b in zip(found[:8], alone, strict=True))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_blank_frames_in_the_middle_are_unreliable_and_empty(config, level, noise):
+    images = pan(noise, 15, car=5.0)
+    for k in (6, 7):
+        images[k] = np.full_like(images[k], level)
+    found = detect(frames_of(images), load_config(config))
+    for k in (6, 7):
+        assert not found[k].reliable and found[k].cause
+        assert not found[k].mask.any() and len(found[k].detections) == 0
+    assert all(s.reliable for s in found[:5] + found[9:])
+    assert max((s.mask > 0).mean() for s in found) < 0.25
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_clip_of_blank_frames_is_unreliable_from_end_to_end(config):
+    found = detect(frames_of([np.zeros((67, 101, 3), np.uint8)] * 5), load_config(config))
+    assert [s.reliable for s in found] == [False] * 5
+    assert not any(s.mask.any() for s in found)
+    assert all(s.cause == "the picture is blank" for s in found)
+
+
+def test_frames_of_pure_noise_are_unreliable():
+    rng = np.random.default_rng(0)
+    found = detect(frames_of([rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(6)]), load_config())
+    assert not any(s.reliable for s in found) and not any(s.mask.any() for s in found)
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film):
+    frames = [frame for frame in frames_of(film.images) if frame.number not in (1, 6, 7)]
+    found = detect(frames, load_config(config))
+    assert [s.frame.number for s in found] == list(range(1, 17))
+    for number in (1, 6, 7):
+        scene = found[number - 1]
+        assert (scene.reliable, scene.cause) == (False, "the frame could not be read")
+        assert not scene.mask.any() and len(scene.detections) == 0
+
+
+def test_last_frames_that_cannot_be_read_get_their_empty_scenes_too(film):
+    settings = load_config("fast")
+    told = list(run(Film(film.images[:10], last=12), load_engine("onboard", settings), settings))
+    assert [s.frame.number for s in told] == list(range(1, 13))
+    assert [s.reliable for s in told[-3:]] == [True, False, False]
+    assert not told[-1].mask.any() and len(told[-1].detections) == 0
+
+
+# -- clips too short, telemetry --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("count", "says"), [(0, "no frame"), (1, "1 frame "), (2, "2 frames")])
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_clip_shorter_than_a_window_is_refused_with_the_number_that_is_missing(count, says, config, film):
+    with pytest.raises(InputError, match=f"{says}.* {3 - count} missing"):
+        detect(frames_of(film.images[:count]), load_config(config))
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_three_frames_are_enough_and_all_three_are_judged(config, noise):
+    found = detect(frames_of(pan(noise, 3, car=5.0)), load_config(config))
+    assert [s.reliable for s in found] == [True] * 3
+
+
+def flight(time_s, altitude_m=60.0, speed_m_s=5.0) -> Telemetry:
+    time = np.asarray(time_s, float)
+    return Telemetry(time, np.broadcast_to(altitude_m, time.shape), np.broadcast_to(speed_m_s, time.shape))
+
+
+@pytest.mark.parametrize("count", [16, None])
+@pytest.mark.parametrize(("from_s", "to_s"), [(50.0, 60.0), (-60.0, -50.0)])
+def test_telemetry_of_another_time_is_refused_naming_both_spans(count, from_s, to_s, film):
+    settings = load_config("fast")
+    told = run(Film(film.images, count), load_engine("onboard", settings), settings, flight([from_s, to_s]))
+    with pytest.raises(InputError, match=f"{from_s} to {to_s} s, the clip 0.0 to 1.5 s"):
+        list(told)
+
+
+def test_telemetry_of_a_part_of_the_clip_is_taken_for_that_part(film):
+    settings = load_config("fast")
+    vision = load_engine("onboard", settings)
+    told = list(run(Film(film.images, 16), vision, settings, flight([0.9, 1.0])))
+    assert len(told) == 16
+
+
+def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
+    settings = with_knobs(
+        load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
+    )
+    altitude = np.where(np.arange(16) < 8, 60.0, 100.0)
+    told = list(
+        run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
+    )
+    assert [s.interval_frames for s in told] == [3] * 8 + [5] * 8
+    (moved,) = [a for s in told for a in s.adjustments if a.knob == "interval.frames"]
+    assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
+    assert "altitude 100.0 m" in moved.cause
+    gates = [a for s in told for a in s.adjustments if a.knob == "gates.max_size_px"]
+    assert [a.frame for a in gates] == [1, 9]
+
+
+@pytest.mark.parametrize(("altitude_m", "speed_m_s"), [(np.nan, 5.0), (60.0, np.nan), (np.nan, np.nan)])
+def test_where_telemetry_lacks_altitude_or_speed_the_interval_follows_the_flow(altitude_m, speed_m_s, film):
+    settings = with_knobs(load_config("fast"), {"interval.minimum_frames": 3, "interval.maximum_frames": 9})
+    vision = load_engine("onboard", settings)
+    time_s = np.arange(16) / 10
+    silent = Telemetry(time_s, np.full(16, altitude_m), np.full(16, speed_m_s))
+    told = list(run(Film(film.images), vision, settings, silent))
+    alone = list(run(Film(film.images), vision, settings))
+    assert [s.interval_frames for s in told] == [s.interval_frames for s in alone]
+    causes = {a.cause for s in told for a in s.adjustments if a.knob == "interval.frames"}
+    assert all("background flow" in cause for cause in causes)
+    assert any(a.knob.startswith("gates.") for s in told for a in s.adjustments) == np.isfinite(altitude_m)
+
+
+def test_telemetry_that_falls_silent_in_flight_gives_the_steering_back_to_the_flow(film):
+    settings = with_knobs(
+        load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
+    )
+    altitude = np.where(np.arange(16) < 8, 100.0, np.nan)
+    told = list(
+        run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
+    )
+    first = next(a for s in told for a in s.adjustments if a.knob == "interval.frames")
+    assert "altitude 100.0 m" in first.cause
+    after = [a.cause for s in told[8:] for a in s.adjustments]
+    assert after and not any("altitude" in cause or "nan" in cause for cause in after)
+
+
+def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left_out(noise):
+    images = pan(noise, 12, car=5.0)
+    base = {"gates.focal_px": 1000.0, "gates.min_size_m": 0.2, "gates.max_size_m": 25.0, "gates.max_speed_m_s": 60.0}
+
+    def count(**knobs: float) -> int:
+        settings = with_knobs(load_config("fast"), base | {f"gates.{k}": v for k, v in knobs.items()})
+        vision = load_engine("onboard", settings)
+        told = run(Film(images), vision, settings, flight([0, 1.1], altitude_m=100.0))
+        return sum(len(s.detections) for s in told)
+
+    seen = count()
+    assert seen >= 8
+    assert count(max_size_m=5.0) < 0.4 * seen  # the car is 72 px: 7.2 m at 100 m
+    assert count(min_size_m=20.0) == 0
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_no_altitude_however_odd_breaks_a_run(config, film):
+    settings = load_config(config)
+    for altitude in (0.0, -5.0, 1e5):
+        told = run(Film(film.images[:5]), load_engine("onboard", settings), settings, flight([0, 1], altitude))
+        assert len(list(told)) == 5
+
+
+def test_scenes_of_frames_at_hand_are_those_of_a_run(film):
+    settings = load_config("fast")
+    vision = load_engine("onboard", settings)
+    at_hand = list(scenes(frames_of(film.images), vision, settings, RATE_HZ))
+    assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), vision, settings), strict=True))
+
+
+@pytest.mark.parametrize("config", [None, "fast"])
+def test_what_no_window_looks_at_again_is_let_go(config, film):
+    """No more colour pictures are held than a window spans, however long the clip; a settled frame's is not."""
+    settings = with_knobs(load_config(config), {"interval.rule": False})
+    loop, there_and_back = Loop(load_engine("onboard", settings), settings, RATE_HZ), [*film.images, *film.images[::-1]]
+    held = []
+    for frame in frames_of(there_and_back * 2):
+        for _ in loop.feed(frame):
+            pass
+        colours = {id(picture) for slot in loop.slots for picture in (slot.frame.image, slot.view.image)}
+        colours -= {id(slot.view.grey) for slot in loop.slots}
+        held.append((len(loop.slots), len(colours)))
+    assert max(held) == max(held[-10:])
+    knobs = settings.difference
+    ahead = reach(settings.interval.frames, settings) + delay(settings.interval.frames, settings)
+    assert max(colours for _, colours in held) <= knobs.wide_frames + ahead + 1
+
+
+def test_a_run_loads_neither_scipy_nor_torch():
+    code = (
+        "import sys, torchvision_dddas.detection.detector; print([m for m in ('scipy', 'torch') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -1,0 +1,54 @@
+"""What can be asked to be best: names of measures, told wrong before anything is computed."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.evaluation.studies.scored_clips import masked, targeted, tracked
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.studies.goals import OF_TASK, check_possible, goal_of, groups_of
+from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures, names
+
+
+@pytest.mark.parametrize(
+    ("make", "task"), [(masked, "motion"), (targeted, "motion"), (tracked, "tracking"), (tracked, "association")]
+)
+def test_the_names_of_measures_are_those_that_scored_clips_have(tmp_path, make, task) -> None:
+    clip, found = make(tmp_path / "clip", 0)
+    having = measures([score(clip, task, found)])
+    assert set(having) == set(groups_of(clip, task)) <= set(OF_TASK[task])
+    for group, told in having.items():
+        assert set(names(group)) == {name for name in told if not name.startswith("n_") or name in BETTER_LOW}
+
+
+def test_every_task_has_a_group_and_every_group_a_measure() -> None:
+    for task, groups in OF_TASK.items():
+        for group in groups:
+            assert names(group)
+            assert goal_of(f"{task}.{group}.{names(group)[0]}").group == group
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("motion.pixels.iou", "'iou' is no measure of motion.pixels; wanted accuracy, "),
+        ("location.metres.mean", "'mean' is no measure of location.metres; wanted mean_m, "),
+        ("people.ranking.map", "no measure of people.ranking; wanted ap, "),
+        ("tracking.pixels.f", "no group of measures of tracking; wanted tracks, target_track"),
+    ],
+)
+def test_a_measure_that_no_clip_can_have_is_refused_by_its_name(asked, said) -> None:
+    with pytest.raises(InputError, match=said):
+        goal_of(asked)
+
+
+def test_a_measure_that_the_truth_of_these_clips_does_not_allow_is_told(tmp_path) -> None:
+    clip, _ = masked(tmp_path / "clip", 0)
+    check_possible(goal_of("motion.pixels.f"), [clip])
+    with pytest.raises(InputError, match=r"no clip has truth for motion\.target\.hit; .* motion\.pixels"):
+        check_possible(goal_of("motion.target.hit"), [clip])
+    still = replace(clip, still=True)
+    check_possible(goal_of("motion.still.alarmed"), [clip, still])
+    with pytest.raises(InputError, match=r"there is truth for motion\.still$"):
+        check_possible(goal_of("motion.pixels.f"), [still])

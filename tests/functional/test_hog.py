@@ -1,0 +1,242 @@
+"""HOG blocks and scores by hand, and against cv2.HOGDescriptor."""
+
+import math
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.functional import hog
+from torchvision_dddas.functional.hog import Layout
+
+LAYOUTS = {
+    "default": Layout(),
+    "signed": Layout(signed=True, bins=18),
+    "small cells": Layout((32, 64), 4, 8, 4),
+    "eight bins": Layout((32, 64), 4, 8, 4, bins=8),
+    "wide window": Layout((96, 48)),
+    "no gamma": Layout(gamma=False),
+    "one cell a block": Layout(block=8),
+    "three cells a block": Layout((60, 120), 5, 15, 5),
+    "blocks apart": Layout((64, 112), stride=16, bins=7),
+    "blocks every half cell": Layout((48, 96), stride=4),
+}
+
+
+def bordered(picture: np.ndarray) -> torch.Tensor:
+    """uint8 picture -> (1, C, H + 2, W + 2) levels, reflected."""
+    around = cv2.copyMakeBorder(picture, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
+    return torch.from_numpy(np.atleast_3d(around)).permute(2, 0, 1)[None].float()
+
+
+def opencv(layout: Layout, weights: np.ndarray | None = None, bias: float = 0.0) -> cv2.HOGDescriptor:
+    block, stride, cell = ((side, side) for side in (layout.block, layout.stride, layout.cell))
+    made = cv2.HOGDescriptor(
+        layout.window, block, stride, cell, layout.bins, 1, -1, 0, layout.clip, layout.gamma, 64, layout.signed
+    )
+    if weights is not None:
+        made.setSVMDetector(np.append(weights, bias).astype(np.float32))
+    return made
+
+
+def opencv_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias: float) -> np.ndarray:
+    hits = opencv(layout, weights, bias).detect(picture, -1e9, (layout.stride, layout.stride), (0, 0))
+    places, found = (np.asarray(hit) for hit in hits)
+    down, across = (
+        (have - need) // layout.stride + 1 for have, need in zip(picture.shape[:2], layout.window[::-1], strict=True)
+    )
+    wanted = np.full((down, across), np.nan)
+    wanted[places[:, 1] // layout.stride, places[:, 0] // layout.stride] = found.ravel()
+    assert not np.isnan(wanted).any()
+    return wanted
+
+
+def own_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias: float) -> np.ndarray:
+    arranged = hog.arranged(torch.from_numpy(weights), layout)
+    return hog.scores(hog.blocks(bordered(picture), layout), arranged, torch.tensor(bias))[0].numpy()
+
+
+def random_svm(layout: Layout, seed: int = 0) -> tuple[np.ndarray, float]:
+    """An SVM whose scores have a standard deviation of about one and lie around zero."""
+    weights = np.random.default_rng(seed).normal(size=layout.features).astype(np.float32)
+    return weights / np.float32(math.sqrt(layout.blocks[0] * layout.blocks[1])), -0.05
+
+
+@pytest.fixture(scope="module")
+def colour(texture) -> np.ndarray:
+    return np.dstack([texture(seed, 150, 172) for seed in range(3)])
+
+
+def test_a_vertical_edge_by_hand():
+    layout = Layout((2, 2), cell=2, block=2, stride=2, clip=1.0, gamma=False)
+    edge = torch.tensor([0.0, 0, 100, 100]).expand(1, 1, 4, 4)
+    # The gradient is 100 at all four pixels, at 0 degrees: halfway between the last bin's centre and the first's. A
+    # pixel counts by a Gaussian of sigma 0.5 around the second one, and by 0.75: it is a quarter cell off the centre.
+    pooled = 50 * (0.75 * (math.exp(-2) + 1)) ** 2
+    share = pooled / (math.sqrt(2) * pooled + 0.9)
+    wanted = torch.zeros(9)
+    wanted[0] = wanted[8] = share / (math.sqrt(2) * share + 1e-3)
+    torch.testing.assert_close(hog.blocks(edge, layout).flatten(), wanted, atol=1e-5, rtol=0)
+
+
+def test_a_horizontal_edge_by_hand_and_clipped():
+    layout = Layout((2, 2), cell=2, block=2, stride=2, gamma=False)
+    edge = torch.tensor([0.0, 0, 100, 100]).view(1, 1, 4, 1).expand(1, 1, 4, 4)
+    wanted = torch.zeros(9)
+    wanted[4] = 0.2 / 0.201  # 90 degrees is the centre of the fifth bin
+    torch.testing.assert_close(hog.blocks(edge, layout).flatten(), wanted, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_every_windows_score_is_opencvs(colour, layout, channels):
+    picture = colour if channels == 3 else colour[..., 0].copy()
+    svm = random_svm(layout)
+    wanted, found = opencv_scores(picture, layout, *svm), own_scores(picture, layout, *svm)
+    assert found.shape == wanted.shape
+    np.testing.assert_allclose(found, wanted, atol=3e-5, rtol=0)
+    assert ((found > 0) == (wanted > 0)).all()
+    assert wanted.std() > 0.1
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    cell=st.integers(2, 8),
+    cells=st.integers(1, 3),
+    every=st.integers(1, 10),
+    blocks=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    bins=st.integers(4, 20),
+    signed=st.booleans(),
+    gamma=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins, signed, gamma, seed):
+    block = cell * cells
+    window = block + (blocks[0] - 1) * every, block + (blocks[1] - 1) * every
+    # OpenCV goes through four columns at a time, and in those left over another channel wins among equal ones.
+    assume(window[0] % 4 == 0)
+    layout = Layout(window, cell, block, every, bins, signed, gamma=gamma)
+    picture = np.random.default_rng(seed).integers(0, 256, (window[1], window[0], 3), np.uint8)
+    wanted = np.asarray(opencv(layout).compute(picture))
+    across, down = layout.blocks
+    found = hog.blocks(bordered(picture), layout)[0].view(bins, cells, cells, down, across).permute(4, 3, 2, 1, 0)
+    np.testing.assert_allclose(found.flatten().numpy(), wanted.ravel(), atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("clip", [0.05, 0.4])
+def test_another_clip_is_opencvs(texture, clip):
+    """OpenCV keeps the clip of the first descriptor of a process for all that follow: hence a process of its own."""
+    picture = texture(0, 128, 64)
+    script = f"""
+import sys, cv2, numpy as np
+picture = np.frombuffer(sys.stdin.buffer.read(), np.uint8).reshape(128, 64)
+made = cv2.HOGDescriptor((64, 128), (16, 16), (8, 8), (8, 8), 9, 1, -1, 0, {clip})
+sys.stdout.buffer.write(made.compute(picture).tobytes())
+"""
+    done = subprocess.run([sys.executable, "-c", script], input=picture.tobytes(), capture_output=True, check=True)
+    wanted = np.frombuffer(done.stdout, np.float32)
+
+    def descriptor(layout: Layout) -> np.ndarray:
+        return hog.blocks(bordered(picture), layout)[0].view(9, 2, 2, 15, 7).permute(4, 3, 2, 1, 0).flatten().numpy()
+
+    np.testing.assert_allclose(descriptor(Layout(clip=clip, gamma=False)), wanted, atol=1e-5, rtol=0)
+    assert np.abs(descriptor(Layout(gamma=False)) - wanted).max() > 0.05
+
+
+def test_of_channels_that_differ_equally_opencvs_wins():
+    # Few levels: channels often differ by as much, in other directions.
+    picture = (np.random.default_rng(0).integers(0, 3, (144, 80, 3)) * 100).astype(np.uint8)
+    svm = random_svm(Layout())
+    np.testing.assert_allclose(
+        own_scores(picture, Layout(), *svm), opencv_scores(picture, Layout(), *svm), atol=1e-5, rtol=0
+    )
+    reversed_channels = np.ascontiguousarray(picture[..., ::-1])
+    assert np.abs(own_scores(reversed_channels, Layout(), *svm) - own_scores(picture, Layout(), *svm)).max() > 1e-3
+
+
+def test_a_score_is_the_descriptor_times_the_weights_plus_the_bias(texture):
+    picture = texture(4, 128, 64)
+    weights, bias = random_svm(Layout())
+    wanted = np.ravel(opencv(Layout()).compute(picture)) @ weights + bias
+    found = own_scores(picture, Layout(), weights, bias)
+    assert found.shape == (1, 1)
+    assert found.item() == pytest.approx(wanted, abs=1e-5)
+
+
+def test_a_batch_is_the_same_as_each_picture_alone(texture):
+    layout = LAYOUTS["small cells"]
+    pictures = torch.cat([bordered(texture(seed, 70, 81)) for seed in range(3)])
+    weights, bias = random_svm(layout)
+    arranged = hog.arranged(torch.from_numpy(weights), layout)
+    together = hog.scores(hog.blocks(pictures, layout), arranged, torch.tensor(bias))
+    for row, picture in enumerate(pictures):
+        alone = hog.scores(hog.blocks(picture[None], layout), arranged, torch.tensor(bias))
+        torch.testing.assert_close(together[row], alone[0], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_gradients_are_those_of_finite_differences(channels, signed):
+    layout = Layout((16, 24), 4, 8, 4, signed=signed)
+    generator = torch.Generator().manual_seed(0)
+    levels = torch.rand(1, channels, 28, 22, generator=generator, dtype=torch.float64) * 250 + 2
+    weights = hog.arranged(torch.randn(layout.features, generator=generator, dtype=torch.float64), layout)
+    bias = torch.zeros((), dtype=torch.float64)
+    inputs = [given.clone().requires_grad_() for given in (levels, weights, bias)]
+    assert torch.autograd.gradcheck(
+        lambda levels, weights, bias: hog.scores(hog.blocks(levels, layout), weights, bias), inputs, fast_mode=True
+    )
+
+
+@pytest.mark.parametrize("gamma", [False, True])
+@pytest.mark.parametrize("shape", ["black", "white", "edge", "diagonal"])
+def test_gradients_stay_finite_where_the_picture_is_flat_black_or_straight(shape, gamma):
+    layout = Layout((16, 24), 4, 8, 4, gamma=gamma)
+    column, row = torch.arange(22.0), torch.arange(28.0)[:, None]
+    levels = {"black": 0 * (row + column), "white": 255 + 0 * (row + column)}
+    levels |= {"edge": 255 * (column + 0 * row > 10), "diagonal": row + column}
+    picture = levels[shape].float().expand(1, 3, 28, 22).clone().requires_grad_()
+    weights = torch.randn(layout.features, generator=torch.Generator().manual_seed(0))
+    scored = hog.scores(hog.blocks(picture, layout), hog.arranged(weights, layout), torch.tensor(0.0))
+    (slope,) = torch.autograd.grad(scored.sum(), picture)
+    assert slope.isfinite().all()
+    assert bool((slope != 0).any()) == (shape in ("edge", "diagonal"))
+
+
+@pytest.mark.parametrize("level", [0, 7, 255])
+def test_a_flat_picture_scores_the_bias(level):
+    found = own_scores(np.full((130, 70, 3), level, np.uint8), Layout(), random_svm(Layout())[0], -0.25)
+    np.testing.assert_allclose(found, -0.25, atol=1e-6)
+
+
+def test_unsigned_bins_do_not_tell_a_negative_from_its_picture_signed_ones_do(texture):
+    picture = texture(5, 128, 64)
+    for signed in (False, True):
+        layout = Layout(gamma=False, signed=signed)
+        one, other = (hog.blocks(bordered(levels), layout) for levels in (picture, 255 - picture))
+        # A gradient across or down lies on the turn's end, where the sign of zero decides the bin.
+        assert bool(((one - other).abs().mean() < 1e-3).item()) != signed
+
+
+def test_a_picture_smaller_than_the_window_has_no_score(texture):
+    assert own_scores(texture(6, 127, 200), Layout(), *random_svm(Layout())).size == 0
+    assert own_scores(texture(6, 200, 63), Layout(), *random_svm(Layout())).size == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cell": 6}, "block of 16 px is no multiple of a cell of 6 px"),
+        ({"window": (60, 128)}, "do not fill a window width of 60 px"),
+        ({"window": (64, 8)}, "do not fill a window height of 8 px; wanted 16"),
+    ],
+)
+def test_a_layout_that_does_not_fit_is_refused_with_what_would(given, message):
+    with pytest.raises(InputError, match=message):
+        Layout(**given)

@@ -1,0 +1,281 @@
+"""The flow from landmarks, telemetry and boxes to places: on slopes, with the rule of the source, from colours."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.overflight import COLOURS_TOML, Overflight, pictures
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import Locator, Watch, camera_of, check_table, locate, site_of
+from torchvision_dddas.geo.aerial_locator import Targets, points_of, sigma_of
+from torchvision_dddas.geo.pose_estimation import bare_prior
+from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.io.detection_tables import read_detections
+from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.types import Camera, Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
+
+
+def hill(east_north):
+    """A slope with a knoll in the middle, between the landmarks."""
+    east, north = np.asarray(east_north, float).T
+    return 0.1 * east + 0.05 * north + 4 * np.exp(-(east**2 + north**2) / 12**2)
+
+
+def raster(ground, base=1300.0, reach=260.0, step=1.0):
+    """The ground as an elevation about its own origin."""
+    k = np.arange(-reach, reach + step, step)
+    east, north = np.meshgrid(k, k)
+    heights = ground(np.column_stack([east.ravel(), north.ravel()])).reshape(east.shape)
+    return Elevation(heights, (-reach, -reach), step, base)
+
+
+@pytest.fixture
+def prepared(tmp_path):
+    """A locator and a table for a flight in local metres."""
+
+    def prepare(flight, elevation=None, telemetry=True, pictured=True, **knobs):
+        texts = {"l.csv": flight.landmarks_csv(pictured=pictured), "tel.csv": flight.telemetry_csv()}
+        texts |= {"c.toml": flight.camera_toml(), "t.txt": flight.tracks_txt()}
+        for name, text in texts.items():
+            (tmp_path / name).write_text(text)
+        settings = with_knobs(Settings(), knobs)
+        flown = read_telemetry(tmp_path / "tel.csv") if telemetry else None
+        site = replace(site_of(read_landmarks(tmp_path / "l.csv"), flown), elevation=elevation)
+        camera, known, _ = camera_of(read_camera(tmp_path / "c.toml"), None, flown, settings)
+        locator = Locator(site, camera, settings, load_solver("onboard"), flight.rate_hz, known)
+        return locator, read_detections(tmp_path / "t.txt")
+
+    return prepare
+
+
+def errors(flight, found):
+    """(N,) metres from the truth, of all frames."""
+    return np.concatenate(
+        [
+            np.linalg.norm(g.positions.east_north_m - flight.targets(g.frame)[g.positions.target - 1], axis=1)
+            for g in found
+        ]
+    )
+
+
+def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(prepared):
+    flight = Overflight(pitch_deg=45, ground=hill, geographic=False, gps_m=0.1, pixel=0.5)
+    locator, table = prepared(flight)
+    level = errors(flight, locate(table, locator))
+    locator, table = prepared(flight, raster(hill))
+    known = errors(flight, locate(table, locator))
+    assert np.median(level) > 1.0
+    assert np.median(known) < 0.3
+
+
+def test_a_level_raster_changes_nothing(prepared):
+    flight = Overflight(pitch_deg=60, geographic=False)
+    locator, table = prepared(flight)
+    bare = [g.positions.east_north_m for g in locate(table, locator)]
+    locator, table = prepared(flight, raster(lambda places: np.zeros(len(places))))
+    for g, before in zip(locate(table, locator), bare, strict=True):
+        np.testing.assert_allclose(g.positions.east_north_m, before, atol=1e-6)
+
+
+def test_the_vehicle_is_above_the_ground_below_it_not_above_the_origins(prepared):
+    flight = Overflight(pitch_deg=45, ground=hill, geographic=False)
+    locator, _ = prepared(flight, raster(hill))
+    at = locator.flight(0.0)
+    assert at is not None
+    assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
+
+
+def test_heights_above_sea_will_do_where_the_ground_is_known(prepared):
+    flight = Overflight(ground=hill, geographic=False)
+    locator, _ = prepared(flight, raster(hill, base=1300.0))
+    flown = locator.site.telemetry
+    assert flown is not None
+    height = np.array([flight.vehicle(frame)[2] for frame in flight.numbers()]) + 1300.0
+    unknown = np.full(len(flown), np.nan)
+    locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=unknown, above_sea_m=height))
+    at = locator.flight(0.0)
+    assert at is not None
+    assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
+
+
+def test_an_altitude_below_the_ground_counts_as_unknown(prepared):
+    locator, _ = prepared(Overflight(geographic=False))
+    flown = locator.site.telemetry
+    assert flown is not None
+    sunk = np.where(flown.time_s < 0.35, -2.0, flown.altitude_m)
+    locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=sunk))
+    before, after = locator.flight(0.0), locator.flight(0.8)
+    assert isinstance(before, Flight)
+    assert isinstance(after, Flight)
+    assert np.isnan(before.altitude_m)
+    assert after.altitude_m == pytest.approx(50.0)
+
+
+def test_a_landmark_where_the_raster_has_no_height_is_not_used(prepared):
+    flight = Overflight(ground=hill, geographic=False)
+    holed = raster(hill)
+    row, column = (int(v) for v in np.rint(flight.marks(1)[2][::-1] + 260))
+    holed.up_m[row - 5 : row + 6, column - 5 : column + 6] = np.nan
+    locator, table = prepared(flight, holed)
+    first = next(iter(locate(table, locator)))
+    assert first.marks.landmark.tolist() == [0, 1, 3]
+
+
+def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
+    flight = Overflight(landmarks=6, geographic=False)
+    locator, table = prepared(flight, **{"landmarks.rule": "source"})
+    calm = list(locate(table, locator))
+    assert {len(g.marks) for g in calm} == {4}
+    locator, table = prepared(flight, **{"landmarks.rule": "source", "landmarks.poor_speed_m_s": 0.3})
+    busy = list(locate(table, locator))
+    assert len(busy[-1].marks) == 6
+    (moved,) = [a for g in busy for a in g.adjustments]
+    assert (moved.knob, moved.new) == ("landmarks.used", 6)
+
+
+def test_frames_between_with_landmarks_are_located_too(prepared):
+    flight = Overflight(geographic=False)
+    locator, table = prepared(flight)
+    sparse = table.frame % 3 == 1
+    table = replace(
+        table,
+        frame=table.frame[sparse],
+        box_px=table.box_px[sparse],
+        score=table.score[sparse],
+        line=table.line[sparse],
+        identity=None if table.identity is None else table.identity[sparse],
+    )
+    found = list(locate(table, locator))
+    assert [g.frame for g in found] == list(range(1, 11))
+    assert [len(g.positions) for g in found] == [4, 0, 0] * 3 + [4]
+
+
+def test_landmarks_that_are_absent_for_a_while_leave_gaps_without_positions(prepared):
+    flight = Overflight(geographic=False)
+    locator, table = prepared(flight, telemetry=False)
+    marks = locator.marks
+    locator.marks = lambda frame: marks(frame) if frame != 5 else replace(marks(5), image_px=np.full((4, 2), np.nan))
+    found = {g.frame: g for g in locate(table, locator)}
+    assert len(found[5].positions) == 0
+    assert found[5].fix.cause
+    assert all(len(found[frame].positions) == 4 for frame in (4, 6))
+
+
+def test_a_found_box_is_known_less_well_the_larger_it_is():
+    boxes = np.array([[0, 0, 10, 10], [0, 0, 40, 40.0]])
+    targets = Targets(boxes, np.array([1, 2]), np.ones(2, bool), np.ones(2))
+    knobs = Settings().aerial
+    assert sigma_of(targets, knobs) == pytest.approx([1, 1])
+    assert sigma_of(replace(targets, bodies=True), knobs) == pytest.approx(np.hypot(1, [1.3, 5.2]))
+
+
+def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
+    feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
+    targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
+    knobs = Settings().aerial
+    points, lift = points_of(targets, knobs, posed=True)
+    assert points.tolist() == [[5, 9], [5, 10]]
+    assert lift.tolist() == [0, 0]
+    bodies = replace(targets, feet_px=None, bodies=True)
+    assert points_of(bodies, knobs, posed=True)[1].tolist() == [0.85, 0.85]
+    # A homography alone cannot tell what lies above the ground.
+    assert points_of(bodies, knobs, posed=False)[1].tolist() == [0, 0]
+
+
+def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess():
+    flown = Telemetry(np.zeros(3), np.full(3, 50.0), np.zeros(3), hfov_rad=np.radians([60.0, 60.0, 61.0]))
+    camera, known, notes = camera_of(None, (1000, 600), flown, Settings())
+    assert known
+    assert not notes
+    assert camera.focal_px[0] == pytest.approx(500 / np.tan(np.radians(30)))
+    camera, known, (note,) = camera_of(None, (1000, 600), None, Settings())
+    assert not known
+    assert "70 degrees were taken" in note
+    assert camera.centre_px == (499.5, 299.5)
+
+
+def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), height_m=50.0)
+    _, known, (note,) = camera_of(camera, None, None, Settings())
+    assert known
+    assert "give --telemetry" in note
+
+
+def test_paper_mode_says_that_it_leaves_a_bent_lens_aside():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
+    _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "paper"}))
+    assert "takes the lens of camera mine for straight" in note
+    assert camera_of(camera, None, None, Settings())[2] == []
+
+
+def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():
+    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), focal_sigma=0.002)
+    for knobs, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
+        settings = with_knobs(Settings(), knobs)
+        found, known, _ = camera_of(camera, None, None, settings)
+        prior = bare_prior(found, settings.aerial, known)
+        assert prior.information[6, 6] == pytest.approx(sigma**-2)
+
+
+def test_places_over_the_date_line_are_near_each_other(prepared):
+    flight = Overflight()
+    locator, _ = prepared(flight)
+    marks = read_landmarks(locator.site.landmarks.path)
+    place = marks.place + np.array([-69.0500, 0.0])
+    place[:, 0] = (place[:, 0] + 180) % 360 - 180
+    moved = site_of(replace(marks, place=place), None)
+    assert np.abs(moved.landmarks.place).max() < 100
+
+
+def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path):
+    flight = Overflight(frames=3, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
+    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
+    colours = read_colours(tmp_path / "colours.toml")
+    locator, _ = prepared(flight, pictured=False)
+    watch = Watch(locator, colours, load_colours("onboard"))
+    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
+        found = watch.step(scene(frame, picture, flight.shown(frame, flight.marks(frame))[:1]))
+        assert found.sighted_by[0] == "motion" or found.sighted_by[0] == "colour"
+        np.testing.assert_allclose(found.look.marks.image_px, flight.shown(frame, flight.marks(frame)), atol=1.0)
+        # The landmark's blob is gone from the targets, and the mask counts on.
+        assert len(found.scene.detections) == 1
+        assert found.scene.mask.max() == 1
+
+
+def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_tells(prepared, tmp_path):
+    flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
+    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
+    locator, _ = prepared(flight, pictured=False)
+    watch = Watch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
+    still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
+        truth = flight.shown(frame, flight.marks(frame))
+        beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
+        found = watch.step(replace(scene(frame, picture, beside), step=still))
+        np.testing.assert_allclose(found.look.marks.image_px[0], truth[0], atol=1.0)
+    assert found.sighted_by[0] == "colour"
+
+
+def scene(frame, picture, landmark_px):
+    """With a blob at a landmark and one elsewhere."""
+    height, width = picture.shape[:2]
+    mask = np.zeros((height, width), np.uint16)
+    boxes = [[*np.rint(landmark_px[0] - 13), 27, 27], [300, 30, 20, 20]]
+    for value, (x, y, w, h) in enumerate(np.array(boxes, int), 1):
+        mask[y : y + h, x : x + w] = value
+    unknown = np.full(2, np.nan)
+    found = Detections(np.array(boxes, float), np.ones(2), np.array([729.0, 400]), unknown, unknown)
+    return Scene(Frame(frame, (frame - 1) / 10, picture), mask, found, 1)
+
+
+def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prepared):
+    locator, table = prepared(Overflight(landmarks=3, geographic=False), telemetry=False)
+    with pytest.raises(InputError, match="frame 1 has 3, none more: 1 missing"):
+        check_table(table, locator)
+    helped, table = prepared(Overflight(landmarks=3, geographic=False))
+    check_table(table, helped)

@@ -1,0 +1,147 @@
+"""The test of landmarks against telemetry: swaps and outliers found and repaired, right data left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.airborne import CAMERA, GPS_M, look
+from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.geo.landmark_faults import judge
+from torchvision_dddas.geo.plane import ground_points
+from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
+from torchvision_dddas.types import Camera, Fix, Marks
+
+KNOBS = AerialKnobs()
+NAMES = ("red", "green", "blue", "white", "black", "pink")
+SEEDS = range(25)
+
+
+def judged(seen, marks, telemetry=True):
+    bare = expected_of(bare_prior(CAMERA, KNOBS), marks.sigma_m)
+    prior = prior_of(seen.flight, CAMERA, KNOBS)
+    assert prior is not None
+    expected = expected_of(prior, marks.sigma_m) if telemetry else bare
+    names = NAMES[: len(marks)]
+    return judge(marks, CAMERA, expected, KNOBS.gate_probability, names, bare if telemetry else None)
+
+
+def with_pixels_of(marks, order):
+    return replace(marks, image_px=marks.image_px[order])
+
+
+def moved_away(marks, row, by_m):
+    return replace(marks, east_north_m=marks.east_north_m + np.eye(len(marks))[:, row : row + 1] * by_m)
+
+
+def same_pose(a, b):
+    return np.allclose(a.solution.pose.place_m, b.solution.pose.place_m, atol=1e-2)
+
+
+def test_right_landmarks_are_left_alone():
+    verdicts = [judged(seen, seen.marks) for seen in map(look, range(60))]
+    assert sum(bool(one.changes or one.cause) for one in verdicts) <= 1
+    assert verdicts[0].state == ("used",) * 4
+
+
+@pytest.mark.parametrize("altitude_m", [50.0, 200.0])
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
+def test_two_swapped_identities_are_found_and_swapped_back(pair, altitude_m):
+    order = np.arange(4)
+    order[list(pair)] = pair[::-1]
+    for seed in SEEDS:
+        seen = look(seed, altitude_m=altitude_m)
+        right, repaired = judged(seen, seen.marks), judged(seen, with_pixels_of(seen.marks, order))
+        assert repaired.order.tolist() == order.tolist() and same_pose(right, repaired)
+    assert repaired.changes[0].startswith(f"identities of {NAMES[pair[0]]} and {NAMES[pair[1]]} swapped back (chi-sq")
+    assert [repaired.state[row] for row in pair] == ["reassigned", "reassigned"]
+
+
+def test_identities_that_went_round_are_put_back():
+    for seed in SEEDS:
+        seen = look(seed, n=6)
+        repaired = judged(seen, with_pixels_of(seen.marks, np.roll(np.arange(6), 1)))
+        assert repaired.order.tolist() == np.roll(np.arange(6), -1).tolist()
+        assert same_pose(judged(seen, seen.marks), repaired)
+    assert repaired.changes[0].startswith("identities reassigned")
+
+
+@pytest.mark.parametrize("n", [4, 6])
+def test_a_place_far_off_is_left_out_and_said_so(n):
+    for seed in SEEDS:
+        seen = look(seed, n=n)
+        verdict = judged(seen, moved_away(seen.marks, 2, [15.0, -12.0]))
+        assert verdict.state == tuple("excluded" if row == 2 else "used" for row in range(n))
+    assert verdict.changes[0].startswith("blue left out: not where it is expected (chi-square")
+
+
+def test_a_pixel_far_off_is_left_out():
+    seen = look(1, n=5)
+    wrong = replace(seen.marks, image_px=seen.marks.image_px + np.eye(5)[:, :1] * 400)
+    assert judged(seen, wrong).used.tolist() == [False, True, True, True, True]
+
+
+def test_without_telemetry_six_landmarks_tell_which_is_off():
+    seen = look(2, n=6)
+    verdict = judged(seen, moved_away(seen.marks, 4, [60.0, 40.0]), telemetry=False)
+    assert verdict.used.tolist() == [True, True, True, True, False, True]
+
+
+def test_landmarks_that_agree_overrule_a_telemetry_that_does_not():
+    seen = look(3, n=6, sigma_m=0.05)
+    astray = replace(seen, flight=replace(seen.flight, place=(500.0, -400.0), altitude_m=20.0))
+    verdict = judged(astray, seen.marks)
+    assert verdict.alone and verdict.passed and verdict.used.all()
+    assert np.allclose(verdict.solution.pose.place_m, seen.pose.place_m, atol=0.5)
+    assert "telemetry left out: the 6 landmarks agree with one another, not with it" in verdict.changes[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_row_of_landmarks_does_not_overrule_the_telemetry(seed):
+    """It agrees with poses of all kinds: by it alone places were off by tens of metres."""
+    row = np.column_stack([np.linspace(-25, 25, 5), np.zeros(5)])
+    seen = look(seed, places=row, sigma_m=0.5, tilt_deg=20.0)
+    astray = replace(seen, flight=replace(seen.flight, place=(80.0, 0.0)))
+    verdict = judged(astray, seen.marks)
+    assert not verdict.alone and not verdict.passed
+    fix = Fix(1, "pose", verdict.solution.pose, verdict.solution.covariance[:7, :7])
+    ground, covariance = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+    off = ground - seen.targets
+    assert (np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 4**2).all()
+
+
+def test_landmarks_that_show_at_one_pixel_do_not_overrule_the_telemetry():
+    seen = look(3, n=5)
+    one = replace(seen.marks, image_px=np.tile(seen.marks.image_px[:1], (5, 1)))
+    assert not judged(seen, one).alone
+
+
+def test_where_nothing_explains_it_the_errors_grow_as_seen():
+    rng = np.random.default_rng(0)
+    seen = look(4)
+    nonsense = replace(seen.marks, image_px=rng.uniform([0, 0], CAMERA.size_px, (4, 2)))
+    verdict = judged(seen, nonsense)
+    assert not verdict.passed and "no change explains it" in verdict.cause
+    grown = np.sqrt(np.diag(verdict.solution.covariance)[3:5])
+    assert (grown > 3 * GPS_M).all()
+
+
+def test_repairs_do_not_depend_on_the_order_of_the_landmarks():
+    seen, order = look(5, n=6), np.array([3, 1, 5, 0, 4, 2])
+    swapped = with_pixels_of(seen.marks, np.array([0, 4, 2, 3, 1, 5]))
+    other = replace(swapped, **{k: getattr(swapped, k)[order] for k in vars(swapped)})
+    first, second = judged(seen, swapped), judged(seen, other)
+    assert same_pose(first, second)
+    assert [first.state[row] for row in order] == list(second.state)
+
+
+@pytest.mark.parametrize("turn", [1, 3, 5])
+def test_without_telemetry_four_of_six_landmarks_whose_names_are_all_wrong_are_not_believed(turn):
+    places = np.array([[10.3, -5.1], [9.5, 11.7], [1.9, 13.4], [-12.9, 5.4], [-9.5, -6.8], [4.7, -12.2]])
+    pixels = np.array([[1179, 500], [966, 221], [850, 284], [636, 619], [843, 790], [1173, 703.0]])
+    camera = Camera("above", (1920, 1080), (1371.0, 1371.0), (959.5, 539.5))
+    marks = Marks(np.arange(6), np.roll(pixels, turn, axis=0), places, np.full(6, GPS_M), np.ones(6), np.zeros(6))
+    expected = expected_of(bare_prior(camera, KNOBS), marks.sigma_m)
+    verdict = judge(marks, camera, expected, KNOBS.gate_probability, NAMES)
+    assert not verdict.passed
+    assert "no change explains it" in verdict.cause

@@ -1,0 +1,144 @@
+"""The likeliest pose: exact on exact data, honest about its errors, at home with telemetry that says little."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.airborne import CAMERA, GPS_M, look, ring
+from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.geo.initial_pose import find_pose
+from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
+from torchvision_dddas.types import Flight
+
+KNOBS = AerialKnobs()
+NAN = float("nan")
+SAYS_NOT: dict[str, dict[str, Any]] = {
+    "nothing": {},
+    "heading": {"heading_rad": NAN},
+    "place": {"place": (NAN, NAN)},
+    "altitude": {"altitude_m": NAN},
+    "heading or place": {"heading_rad": NAN, "place": (NAN, NAN)},
+    "place or altitude": {"place": (NAN, NAN), "altitude_m": NAN},
+}
+
+
+def told(flight, ground_up_m=0.0):
+    prior = prior_of(flight, CAMERA, KNOBS, ground_up_m)
+    assert prior is not None
+    return prior
+
+
+def solved(seen, flight, used=None, camera=CAMERA):
+    prior = prior_of(flight, camera, KNOBS) or bare_prior(camera, KNOBS)
+    return find_pose(seen.marks, camera, expected_of(prior, seen.marks.sigma_m), used)
+
+
+def same(found, pose):
+    assert np.allclose(found.pose.place_m, pose.place_m, atol=0.02)
+    assert np.allclose(found.pose.axes, pose.axes, atol=1e-3)
+    assert np.isclose(found.pose.focal, pose.focal, atol=1e-3)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
+@pytest.mark.parametrize("says_not", SAYS_NOT)
+def test_exact_data_give_the_exact_pose_whatever_the_telemetry_leaves_out(says_not, tilt_deg):
+    seen = look(1, n=5, tilt_deg=tilt_deg, errors=0)
+    same(solved(seen, replace(seen.flight, **SAYS_NOT[says_not])), seen.pose)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 45.0])
+@pytest.mark.parametrize("altitude_m", [50.0, 200.0])
+def test_exact_data_give_the_exact_pose_without_telemetry(tilt_deg, altitude_m):
+    seen = look(2, altitude_m=altitude_m, tilt_deg=tilt_deg, errors=0, sigma_m=0.02)
+    found = solved(seen, None)
+    same(found, seen.pose)
+    assert found.freedom == 2
+
+
+def test_a_bent_lens_is_allowed_for():
+    bent = replace(CAMERA, k1=-0.15, k2=0.03)
+    seen = look(3, errors=0, camera=bent)
+    same(solved(seen, seen.flight, camera=bent), seen.pose)
+    assert np.abs(solved(seen, seen.flight).pose.place_m - seen.pose.place_m).max() > 0.1
+
+
+def test_landmarks_above_the_ground_are_taken_where_they_are():
+    seen = look(4, errors=0, tilt_deg=45.0)
+    above = replace(seen.marks, up_m=np.full(4, 2.0))
+    assert np.isclose(
+        solved(replace(seen, marks=above), None).pose.place_m[2], solved(seen, None).pose.place_m[2] + 2, atol=0.01
+    )
+
+
+@pytest.mark.parametrize("case", [{"tilt_deg": 45.0}, {"sigma_m": 0.0}, {"n": 6}, {"places": ring(4) * [1, 0.01]}])
+def test_the_true_pose_lies_where_the_covariance_says(case):
+    """Mahalanobis distances of 7 are chi-square of 7: mean 7, and a mean over 60 has a deviation of 0.5."""
+    distance = []
+    for seed in range(60):
+        seen = look(seed, **case)
+        found = solved(seen, seen.flight)
+        turn = seen.pose.axes @ found.pose.axes.T
+        off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+        off = np.concatenate(
+            [off, seen.pose.place_m - found.pose.place_m, [np.log(seen.pose.focal / found.pose.focal)]]
+        )
+        distance.append(off @ np.linalg.solve(found.covariance[:7, :7], off))
+    assert 5.2 < np.mean(distance) < 8.8
+
+
+def test_the_sum_of_squares_is_chi_square_of_its_freedom():
+    costs = [(found := solved(seen, seen.flight)).cost / found.freedom for seen in map(look, range(60))]
+    assert 0.8 < np.mean(costs) < 1.2
+
+
+def test_a_landmark_weighs_as_much_as_it_is_known():
+    seen = look(5, n=6, errors=0)
+    wrong = seen.marks.east_north_m + np.where(np.arange(6)[:, None] < 2, 0.0, [1.0, 1.0])
+    sigma = np.where(np.arange(6) < 2, 0.02, GPS_M)
+    marks = replace(seen.marks, east_north_m=wrong, sigma_m=sigma)
+    apart = np.linalg.norm(solved(replace(seen, marks=marks), seen.flight).places[:2] - ring(6)[:2], axis=1)
+    assert apart.max() < 0.02
+
+
+def test_landmarks_left_out_tell_nothing():
+    seen = look(6, n=5)
+    off = replace(seen.marks, image_px=seen.marks.image_px + np.eye(5)[:, :1] * 300)
+    used = np.arange(5) > 0
+    first, second = (solved(replace(seen, marks=marks), seen.flight, used) for marks in (seen.marks, off))
+    assert np.allclose(first.pose.place_m, second.pose.place_m) and first.freedom == second.freedom == 8
+
+
+def test_with_no_landmark_the_pose_is_that_of_the_telemetry():
+    seen = look(7, places=np.zeros((0, 2)))
+    found = solved(seen, seen.flight)
+    assert np.allclose(found.pose.place_m[:2], seen.flight.place)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.allclose(sigma[:5], [np.radians(1), np.radians(1), np.radians(5), 1.43, 1.43])
+    assert np.allclose(sigma[5:], [0.02 * seen.flight.altitude_m, 0.01])
+
+
+def test_landmarks_that_no_camera_up_there_can_see_have_no_pose():
+    seen = look(8, n=3)
+    up = replace(seen.flight, pitch_rad=-1.5)
+    assert solved(seen, up) is None
+
+
+def test_telemetry_that_says_nothing_of_the_pose_is_no_prior():
+    assert prior_of(None, CAMERA, KNOBS) is None
+    assert prior_of(Flight(NAN, speed_m_s=5.0), CAMERA, KNOBS) is None
+
+
+def test_a_tilt_that_is_only_guessed_tells_little():
+    sigma = [1 / np.sqrt(told(Flight(50.0, pitch_rad=p)).information[0, 0]) for p in (1.0, NAN)]
+    assert np.allclose(np.degrees(sigma), [1.0, 15.0])
+
+
+def test_a_field_of_view_in_the_telemetry_counts_as_the_focal_length():
+    wide = told(Flight(50.0, hfov_rad=np.radians(90))).pose.focal
+    assert np.isclose(wide * CAMERA.focal_px[0], 960)
+
+
+def test_altitudes_are_measured_from_the_ground_below():
+    assert told(Flight(50.0), ground_up_m=7.0).pose.place_m[2] == 57.0

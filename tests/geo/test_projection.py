@@ -1,0 +1,127 @@
+"""The camera in the air: its axes, where it shows a point, and the ray back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.airborne import CAMERA
+from torchvision_dddas.geo.pose_estimation import moved
+from torchvision_dddas.geo.projection import (
+    axes_of,
+    bent,
+    lifted,
+    project,
+    project_with_slopes,
+    rays,
+    slopes_of_lift,
+    unbent,
+)
+from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
+from torchvision_dddas.types import CameraPose
+
+BENT = replace(CAMERA, k1=-0.2, k2=0.05, focal_px=(1400.0, 1380.0))
+POINTS = np.array([[5.0, 8.0, 0.0], [-7.0, 3.0, 1.5], [1.0, -6.0, 0.0], [12.0, 9.0, -2.0]])
+ABOVE = CameraPose(np.array([2.0, -3.0, 50.0]), axes_of(0.7, 1.3, 0.1), 1.02)
+
+
+def test_a_level_camera_that_looks_north_has_east_on_its_right_and_the_ground_below():
+    assert np.allclose(axes_of(0, 0, 0), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T)
+
+
+def test_straight_down_the_heading_is_that_of_the_upper_edge():
+    pose = CameraPose(np.array([0.0, 0.0, 50.0]), axes_of(np.pi / 2, np.pi / 2, 0))
+    east = project(np.array([[10.0, 0.0, 0.0]]), pose, CAMERA)[0]
+    assert np.allclose(east, [CAMERA.centre_px[0], CAMERA.centre_px[1] - 10 / 50 * CAMERA.focal_px[1]])
+
+
+def test_roll_clockwise_turns_what_is_above_to_the_left():
+    pose = CameraPose(np.zeros(3), axes_of(0, 0, np.radians(10)))
+    above = project(np.array([[0.0, 10.0, 1.0]]), pose, CAMERA)[0]
+    assert above[0] < CAMERA.centre_px[0] and above[1] < CAMERA.centre_px[1]
+
+
+@given(st.floats(0, 6.2), st.floats(-1.5, 1.5), st.floats(-3, 3))
+def test_angles_come_back_from_axes(heading, pitch, roll):
+    axes = axes_of(heading, pitch, roll)
+    assert np.allclose(axes_of(*CameraPose(np.zeros(3), axes).angles_rad), axes, atol=1e-8)
+
+
+def test_straight_down_all_that_turns_is_the_heading():
+    heading, pitch, roll = CameraPose(np.zeros(3), axes_of(1.0, np.pi / 2, 0.25)).angles_rad
+    assert roll == 0 and np.isclose(pitch, np.pi / 2)
+    assert np.allclose(axes_of(heading, pitch, roll), axes_of(1.0, np.pi / 2, 0.25))
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BENT])
+def test_the_ray_through_where_a_point_is_shown_meets_the_point(camera):
+    way = rays(project(POINTS, ABOVE, camera), ABOVE, camera)
+    apart = POINTS - ABOVE.place_m
+    assert np.allclose(np.cross(way, apart), 0, atol=1e-6)
+    assert ((way * apart).sum(axis=1) > 0).all()
+
+
+def test_a_point_behind_the_camera_is_shown_nowhere():
+    pixels = project(np.array([[0.0, 0.0, 60.0], [0.0, 0.0, 0.0]]), ABOVE, CAMERA)
+    assert np.isnan(pixels[0]).all() and np.isfinite(pixels[1]).all()
+
+
+def test_a_point_beyond_the_bend_of_the_lens_is_shown_nowhere():
+    wide = np.array([[30.0, 0.0, 0.0], [150.0, 0.0, 0.0], [400.0, 0.0, 0.0]])
+    assert np.isfinite(project(wide, ABOVE, CAMERA)).all()
+    assert np.isfinite(project(wide, ABOVE, BENT)).all()
+    folding = replace(CAMERA, k1=-0.3, k2=0.02)
+    assert np.isfinite(project(wide, ABOVE, folding))[:, 0].tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BENT])
+def test_slopes_of_the_projection_are_its_differences(camera):
+    _, by_pose, by_point = project_with_slopes(POINTS, ABOVE, camera)
+    for axis, step in enumerate(1e-6 * np.eye(7)):
+        there, back = (project(POINTS, moved(ABOVE, sign * step), camera) for sign in (1, -1))
+        assert np.allclose((there - back) / 2e-6, by_pose[:, :, axis], rtol=1e-5, atol=1e-4)
+    for axis, step in enumerate(1e-6 * np.eye(3)):
+        there, back = (project(POINTS + sign * step, ABOVE, camera) for sign in (1, -1))
+        assert np.allclose((there - back) / 2e-6, by_point[:, :, axis], rtol=1e-5, atol=1e-4)
+
+
+def test_slopes_of_the_lift_are_its_differences():
+    pixels = np.array([[200.0, 100.0], [1500.0, 900.0]])
+    _, by_pixel, by_focal = slopes_of_lift(pixels, 1.0, BENT)
+    for axis, step in enumerate(1e-3 * np.eye(2)):
+        apart = lifted(pixels + step, 1.0, BENT) - lifted(pixels - step, 1.0, BENT)
+        assert np.allclose(apart / 2e-3, by_pixel[:, :, axis], rtol=1e-4, atol=1e-9)
+    apart = lifted(pixels, np.exp(1e-5), BENT) - lifted(pixels, np.exp(-1e-5), BENT)
+    assert np.allclose(apart / 2e-5, by_focal, rtol=1e-4)
+
+
+@given(st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3))
+def test_a_turn_comes_back_from_its_rotation(vector):
+    assert np.allclose(turn_of(turned(np.array(vector))), vector, atol=1e-7)
+
+
+def test_half_a_turn_has_its_length():
+    assert np.isclose(np.linalg.norm(turn_of(np.diag([1.0, -1.0, -1.0]))), np.pi)
+
+
+def test_the_slope_of_a_turn_is_its_differences():
+    vector = np.array([0.4, -0.2, 0.9])
+    for axis, step in enumerate(1e-6 * np.eye(3)):
+        there, back = (turn_of(turned(sign * step) @ turned(vector)) for sign in (1, -1))
+        assert np.allclose((there - back) / 2e-6, slope_of_turn(vector)[:, axis], atol=1e-7)
+
+
+def test_what_turns_about_up_undone_leaves_a_tilt():
+    rotation = turned(np.array([0.3, -0.1, 0.0])) @ turned(np.array([0.0, 0.0, 2.5]))
+    assert np.allclose(about_up(rotation), turned(np.array([0.0, 0.0, 2.5])))
+
+
+def test_a_straight_lens_shows_points_at_unbent_pixels_and_bent_ones_are_the_lens_again():
+    seen = project(POINTS, ABOVE, BENT)
+    straight = project(POINTS, replace(ABOVE, focal=1.0), replace(BENT, k1=0.0, k2=0.0))
+    found = unbent(project(POINTS, replace(ABOVE, focal=1.0), BENT), BENT)
+    assert np.allclose(found, straight, atol=1e-6)
+    assert np.allclose(bent(unbent(seen, BENT), BENT), seen, atol=1e-6)
+    assert np.abs(unbent(seen, BENT) - seen).max() > 1

@@ -1,0 +1,214 @@
+"""Ranging from one look: exact on exact boxes, honest about its errors, careful with what a box does not show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.upright import boxes, camera, poses
+from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.ranging import sight, touches_border
+
+PEOPLE = np.array([[0.0, 8.0], [2.5, 12.0], [-3.0, 20.0], [1.0, 30.0]])
+WHOLE = np.zeros(4, bool)
+
+
+def seen(box_px, cam, cut=None, place=(0.0, 0.0), **knobs):
+    cut = np.zeros(len(box_px), bool) if cut is None else cut
+    where = poses(cam, len(box_px), place)
+    return sight(box_px, cut, cam, where, where.place, GroundKnobs(**{"body_height_m": 1.75, **knobs}))
+
+
+@pytest.mark.parametrize("use", ["height", "feet", "both"])
+@pytest.mark.parametrize(
+    "turned",
+    [
+        {},
+        {"pitch_rad": 0.2, "height_m": 3.0},
+        {"pitch_rad": -0.05},
+        {"pitch_rad": 0.1, "heading_rad": 2.0},
+        {"focal_px": (1000.0, 1020.0), "centre_px": (600.0, 500.0)},
+    ],
+)
+def test_exact_boxes_give_exact_places(use, turned):
+    cam = camera(**turned)
+    cos, sin = np.cos(cam.heading_rad), np.sin(cam.heading_rad)
+    turn = np.array([[cos, sin], [-sin, cos]])
+    people, place = PEOPLE @ turn.T + (40, -7), (40.0, -7.0)
+    found = seen(boxes(people, 1.75, cam, place), cam, place=place, use=use)
+    assert np.allclose(found.east_north_m, people, atol=1e-6)
+    assert found.by.tolist() == [use] * 4
+    assert np.allclose(found.distance_m, np.linalg.norm(PEOPLE, axis=1))
+    way = np.stack([np.sin(found.bearing_rad), np.cos(found.bearing_rad)], axis=1)
+    assert np.allclose(found.distance_m[:, None] * way, people - place)
+
+
+def test_the_distortion_of_opencv_is_undone():
+    cam = camera(k1=-0.2, k2=0.08, pitch_rad=0.1)
+    straight = np.abs(seen(boxes(PEOPLE, 1.75, cam), replace(cam, k1=0, k2=0)).east_north_m - PEOPLE).max()
+    assert straight > 0.1
+    assert np.allclose(seen(boxes(PEOPLE, 1.75, cam), cam).east_north_m, PEOPLE, atol=5e-3)
+
+
+def test_a_pixel_that_the_lens_cannot_fill_has_no_ray():
+    cam = camera(focal_px=(500.0, 500.0), k1=-0.3)
+    box = np.array([[600.0, 400.0, 40.0, 160.0], [1200.0, 700.0, 60.0, 240.0]])
+    found = seen(box, cam)
+    assert found.by.tolist() == ["both", "bearing"]
+    assert np.isfinite(found.bearing_rad).tolist() == [True, False]
+
+
+def test_a_camera_turned_about_its_axis_is_levelled_by_the_foot_row():
+    cam = camera(roll_rad=0.1, height_m=2.0, pitch_rad=0.15)
+    box = boxes(PEOPLE, 1.75, cam)
+    assert np.allclose(seen(box, cam, use="feet").east_north_m, PEOPLE, atol=1e-6)
+    assert np.abs(seen(box, replace(cam, roll_rad=0.0), use="feet").east_north_m - PEOPLE).max() > 0.2
+
+
+def test_a_level_camera_ranges_by_eq_13_as_depth_and_not_as_the_way_over_the_ground():
+    box = np.array([[939.5 - 0.2 * 200, 380.0, 80.0, 200.0]])
+    found = seen(box, camera(), use="height")
+    depth = 1000 * 1.75 / 200
+    angle = np.arctan((939.5 - 0.5 - 639.5) / 1000)
+    assert found.distance_m[0] == pytest.approx(depth / np.cos(angle))
+    assert found.bearing_rad[0] == pytest.approx(angle)
+
+
+def test_paper_mode_is_eq_13_to_15_as_printed():
+    box = np.array([[939.5 - 0.2 * 200, 380.0, 80.0, 200.0]])
+    found = seen(box, camera(pitch_rad=0.2, heading_rad=1.0), mode="paper")
+    distance, bearing = 1000 * 1.75 / 200, 1.0 + np.arctan(299.5 / 1000)
+    assert found.distance_m[0] == pytest.approx(distance)
+    assert np.allclose(found.east_north_m, [[distance * np.sin(bearing), distance * np.cos(bearing)]])
+    assert np.isnan(found.covariance_m2).all()
+
+
+COLUMNS = {
+    "heading": (2, lambda cam, s: replace(cam, heading_rad=cam.heading_rad + s * cam.heading_sigma_rad)),
+    "pitch": (3, lambda cam, s: replace(cam, pitch_rad=cam.pitch_rad + s * cam.pitch_sigma_rad)),
+    "height": (4, lambda cam, s: replace(cam, height_m=cam.height_m + s * cam.height_sigma_m)),
+    "focal": (5, lambda cam, s: replace(cam, focal_px=tuple(f * (1 + s * cam.focal_sigma) for f in cam.focal_px))),
+}
+
+
+@pytest.mark.parametrize("error", COLUMNS)
+@pytest.mark.parametrize("use", ["height", "feet"])
+def test_the_errors_of_the_camera_are_the_derivatives_of_the_place(error, use):
+    cam = camera(pitch_rad=0.1, height_m=2.0, heading_rad=0.5)
+    box, step = boxes(PEOPLE, 1.75, cam), 1e-4
+    column, moved = COLUMNS[error]
+    there, back = (seen(box, moved(cam, s), use=use).east_north_m for s in (step, -step))
+    assert np.allclose(seen(box, cam, use=use).camera_m[:, :, column], (there - back) / (2 * step), atol=1e-5)
+
+
+def test_the_error_of_the_persons_height_is_the_derivative_of_the_place():
+    cam, step = camera(pitch_rad=0.1), 1e-5
+    box = boxes(PEOPLE, 1.75, cam)
+    there, back = (seen(box, cam, use="height", body_height_m=1.75 + 0.1 * s).east_north_m for s in (step, -step))
+    assert np.allclose(seen(box, cam, use="height").body_m, (there - back) / (2 * step), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("use", "distance", "pitch"), [("both", 6.0, 0.0), ("both", 20.0, 0.15), ("height", 12.0, 0.15), ("feet", 8.0, 0.0)]
+)
+def test_95_percent_ellipses_hold_93_to_97_percent(use, distance, pitch):
+    rng, n = np.random.default_rng(4), 1500
+    cam, knobs = camera(pitch_rad=pitch, heading_rad=0.7), GroundKnobs(use=use)
+    person = distance * np.array([[np.sin(0.9), np.cos(0.9)]])
+    box = np.concatenate(
+        [
+            boxes(
+                person,
+                knobs.body_height_m + rng.normal(0, knobs.body_height_sigma_m),
+                replace(
+                    cam,
+                    heading_rad=0.7 + rng.normal(0, cam.heading_sigma_rad),
+                    pitch_rad=pitch + rng.normal(0, cam.pitch_sigma_rad),
+                    height_m=1.2 + rng.normal(0, cam.height_sigma_m),
+                    focal_px=(1000 * (1 + rng.normal(0, cam.focal_sigma)),) * 2,
+                ),
+                rng.normal(0, cam.position_sigma_m, 2),
+            )
+            for _ in range(n)
+        ]
+    )
+    tall = box[:, 3].copy()
+    feet = box[:, 1] + tall + rng.normal(0, 1, n) * np.hypot(knobs.feet_sigma * tall, 0.5)
+    box[:, 0] += rng.normal(0, 1, n) * np.hypot(knobs.feet_sigma * tall, 0.5)
+    box[:, 3] += rng.normal(0, 1, n) * np.hypot(knobs.height_sigma * tall, 0.5)
+    box[:, 1] = feet - box[:, 3]
+    found = seen(box, cam, use=use)
+    off = found.east_north_m - person
+    inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance_m2), off) < 5.991
+    assert 0.93 < inside.mean() < 0.97
+
+
+def test_both_together_are_never_less_sure_than_either():
+    box = boxes(PEOPLE, 1.75, camera())
+    spread = {use: np.linalg.det(seen(box, camera(), use=use).covariance_m2) for use in ("both", "height", "feet")}
+    assert (spread["both"] <= spread["height"] * (1 + 1e-9)).all()
+    assert (spread["both"] <= spread["feet"] * (1 + 1e-9)).all()
+
+
+def test_feet_at_the_horizon_leave_the_height_alone():
+    box = np.array([[600.0, 300.0, 40.0, 180.0], [600.0, 200.0, 40.0, 180.0]])  # feet on row 479.5 and above
+    assert seen(box, camera()).by.tolist() == ["height", "height"]
+    by_feet = seen(box, camera(), use="feet")
+    assert by_feet.by.tolist() == ["bearing", "bearing"]
+    assert np.isnan(by_feet.east_north_m).all() and np.isfinite(by_feet.bearing_rad).all()
+
+
+def test_the_height_of_a_cut_person_is_not_used():
+    cam = camera()
+    box = boxes(PEOPLE, 1.75, cam)
+    box[:, 1] += 0.3 * box[:, 3]
+    box[:, 3] *= 0.7  # the head is missing
+    found = seen(box, cam, cut=~WHOLE)
+    assert found.by.tolist() == ["feet"] * 4
+    assert np.allclose(found.east_north_m, PEOPLE)
+
+
+def test_a_person_cut_at_the_feet_has_a_bearing_and_no_place():
+    box = np.array([[600.0, 700.0, 150.0, 260.0]])  # the lower edge is the picture's
+    found = seen(box, camera(), cut=touches_border(box, (1280, 960)))
+    assert found.by.tolist() == ["bearing"]
+    assert np.isnan(found.east_north_m).all() and np.isnan(found.distance_m).all()
+    assert np.isfinite(found.bearing_rad).all()
+
+
+def test_a_person_cut_at_the_side_is_less_sure_across_than_along():
+    cam = camera(focal_px=(5000.0, 5000.0))
+    whole = boxes(np.array([[1.2, 20.0]]), 1.75, cam)
+    at_side = whole - (whole[0, 0], 0, 0, 0)
+    cut = touches_border(at_side, (1280, 960))
+    assert cut.tolist() == [True]
+    east = [seen(box, cam, cut=cut, use="feet").own_m2[0, 0, 0] for box in (whole, at_side)]
+    assert east[1] > 9 * east[0]
+
+
+def test_a_child_whose_height_and_feet_disagree_is_less_sure_than_a_typical_person():
+    people = np.array([[0.0, 10.0]])
+    surely = {"pitch_sigma_rad": 1e-3, "height_sigma_m": 0.01}
+    child, adult = (seen(boxes(people, tall, camera(**surely)), camera(**surely)) for tall in (1.0, 1.75))
+    assert child.own_m2[0].trace() > 2 * adult.own_m2[0].trace()
+
+
+def test_a_distance_that_may_be_half_or_double_is_none():
+    far = boxes(np.array([[0.0, 100.0]]), 1.75, camera())
+    assert seen(far, camera(), use="feet").by.tolist() == ["bearing"]
+    assert seen(far, camera()).by.tolist() == ["both"]
+
+
+def test_without_a_camera_height_there_is_the_body_height_alone():
+    cam = camera(height_m=float("nan"))
+    found = seen(boxes(PEOPLE, 1.75, camera()), cam)
+    assert found.by.tolist() == ["height"] * 4
+    assert np.allclose(found.east_north_m, PEOPLE) and np.isfinite(found.covariance_m2).all()
+    with pytest.raises(InputError, match=r"has no height_m; ground\.use = feet needs"):
+        seen(boxes(PEOPLE, 1.75, camera()), cam, use="feet")
+
+
+def test_nobody_is_nowhere():
+    assert len(seen(np.zeros((0, 4)), camera())) == 0
+    assert seen(np.zeros((0, 4)), camera()).covariance_m2.shape == (0, 2, 2)

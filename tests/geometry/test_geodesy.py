@@ -1,0 +1,61 @@
+"""Degrees to metres and back."""
+
+import numpy as np
+import pymap3d
+import pytest
+
+from torchvision_dddas.geometry import east_north, lonlat, plain_east_north, plain_lonlat
+
+TUCSON = (-110.95, 32.23)
+
+
+def test_there_and_back_is_the_same_place_to_a_millimetre():
+    metres = np.random.default_rng(0).uniform(-1000, 1000, (50, 2))
+    assert np.abs(east_north(lonlat(metres, TUCSON), TUCSON) - metres).max() < 1e-3
+
+
+@pytest.mark.parametrize("latitude", [0.0, 45.0, -70.0])
+def test_a_degree_of_latitude_is_as_long_as_on_the_ellipsoid(latitude):
+    eccentric = 0.00669437999014
+    degree_m = np.radians(6_378_137 * (1 - eccentric) / (1 - eccentric * np.sin(np.radians(latitude)) ** 2) ** 1.5)
+    north = east_north(np.array([[10.0, latitude + 5e-4], [10.0, latitude - 5e-4]]), (10.0, latitude))[:, 1]
+    assert (north[0] - north[1]) * 1000 == pytest.approx(degree_m, rel=2e-6)
+
+
+def test_many_points_are_converted_as_one_after_the_other_and_as_pymap3d_does():
+    metres = np.random.default_rng(1).uniform(-5000, 5000, (40_001, 2))
+    degrees = lonlat(metres, TUCSON)
+    latitude, longitude, _ = pymap3d.enu2geodetic(metres[:, 0], metres[:, 1], 0, TUCSON[1], TUCSON[0], 0)
+    assert np.abs(degrees - np.stack([longitude, latitude], 1)).max() < 1e-12
+    for row in (0, 16_383, 16_384, 40_000):
+        assert np.abs(lonlat(metres[row : row + 1], TUCSON)[0] - degrees[row]).max() < 1e-12
+        assert np.abs(east_north(degrees[row : row + 1], TUCSON)[0] - east_north(degrees, TUCSON)[row]).max() < 1e-6
+
+
+def test_no_points_are_no_points():
+    assert east_north(np.zeros((0, 2)), TUCSON).shape == lonlat(np.zeros((0, 2)), TUCSON).shape == (0, 2)
+
+
+def test_east_is_along_longitude_and_north_along_latitude():
+    (east,), (north,) = (lonlat(np.array([way]), TUCSON) - TUCSON for way in ((10.0, 0.0), (0.0, 10.0)))
+    assert east[0] > 1e-4 > abs(east[1]) * 1e3
+    assert north[1] > 8e-5 > abs(north[0]) * 1e3
+
+
+@pytest.mark.parametrize("there_and_back", [(lonlat, east_north), (plain_lonlat, plain_east_north)])
+@pytest.mark.parametrize("origin", [(179.9999, -17.0), (-179.9999, 89.0)])
+def test_places_on_both_sides_of_180_degrees_are_neighbours(there_and_back, origin):
+    to_degrees, to_metres = there_and_back
+    metres = np.array([[-50.0, 3.0], [50.0, -3.0]])
+    degrees = to_degrees(metres, origin)
+    assert (np.abs(degrees[:, 0]) <= 180).all() and np.sign(degrees[:, 0]).sum() == 0
+    assert np.allclose(to_metres(degrees, origin), metres, atol=1e-3)
+
+
+def test_the_plain_conversion_is_as_printed_and_some_decimetres_off_in_150_m():
+    there = plain_lonlat(np.array([[0.0, 150.0]]), np.array(TUCSON))
+    assert np.allclose(there, [[-110.95, 32.23 + 150 / 111_320]], atol=1e-12)
+    beside = plain_lonlat(np.array([[150.0, 0.0]]), np.array(TUCSON))
+    assert np.allclose(beside, [[-110.95 + 150 / (111_320 * np.cos(np.radians(32.23))), 32.23]], atol=1e-12)
+    assert 0.1 < np.linalg.norm(east_north(there, TUCSON) - (0, 150)) < 0.6
+    assert np.allclose(plain_east_north(there, TUCSON), [[0, 150]])

@@ -1,0 +1,161 @@
+"""Graphs are opened where they are what their manifest lists, and refused in one line where they are not."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import torchvision_dddas
+from torchvision_dddas import runtime as graphs
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import onnx_plane as onboard_plane
+from torchvision_dddas.people import onnx_scorer as onboard_people
+from torchvision_dddas.runtime import MANIFEST, SHIPPED, manifest, opened, seal, verified
+from torchvision_dddas.types import LinearSvm
+
+NAME = "homography.onnx"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the shipped graphs."""
+    return Path(shutil.copytree(SHIPPED, tmp_path / "graphs"))
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object], sealed: bool) -> None:
+    held = json.loads((folder / MANIFEST).read_text())
+    change(held)
+    if sealed:
+        held["seal"] = seal(held)
+    (folder / MANIFEST).write_text(json.dumps(held))
+
+
+def refusal(folder: Path, name: str = NAME) -> str:
+    with pytest.raises(InputError) as caught:
+        opened(folder, name)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_manifest_lists_every_shipped_graph_and_nothing_else():
+    listed = manifest(SHIPPED)["graphs"]
+    assert set(listed) == {path.name for path in SHIPPED.glob("*.onnx")}
+    assert all(verified(SHIPPED, name) == (SHIPPED / name).read_bytes() for name in listed)
+
+
+def test_the_manifest_says_what_a_graph_takes_and_gives_as_the_runtime_sees_it():
+    for name, held in manifest(SHIPPED)["graphs"].items():
+        session = opened(SHIPPED, name)
+        for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+            assert [(v.name, v.type, v.shape) for v in found] == [
+                (value, f"tensor({entry['type']})", entry["shape"]) for value, entry in held[side].items()
+            ]
+
+
+def test_every_shipped_graph_was_compared_with_torch_and_is_of_this_version():
+    held = manifest(SHIPPED)
+    assert held["package"] == torchvision_dddas.__version__
+    for entry in held["graphs"].values():
+        assert entry["checks"] and all(check["off"] <= check["limit"] for check in entry["checks"])
+        assert {"torch", "onnx", "onnxruntime"} == set(entry["versions"])
+
+
+@pytest.mark.parametrize("place", [0, 100, -1])
+def test_a_graph_of_which_one_bit_was_changed_is_refused(folder: Path, place: int):
+    content = bytearray((folder / NAME).read_bytes())
+    content[place] ^= 1
+    (folder / NAME).write_bytes(content)
+    assert f"{NAME} is not the graph that its manifest.json lists" in refusal(folder)
+
+
+def test_a_graph_in_the_place_of_another_is_refused(folder: Path):
+    shutil.copy(folder / "homography_raw.onnx", folder / NAME)
+    assert "damaged or changed" in refusal(folder)
+
+
+def test_a_manifest_that_was_changed_is_refused_even_where_it_fits_a_changed_graph(folder: Path):
+    def fit(held: dict[str, Any]) -> None:
+        held["graphs"][NAME]["sha256"] = held["graphs"]["homography_raw.onnx"]["sha256"]
+
+    shutil.copy(folder / "homography_raw.onnx", folder / NAME)
+    rewrite(folder, fit, sealed=False)
+    assert "manifest.json is not as `dddas export` wrote it" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda held: held["graphs"]["people_scores.onnx"]["knobs"].update(cell_px=4),
+        lambda held: held["graphs"][NAME]["inputs"]["weight"].update(type="float"),
+        lambda held: held.update(seal="0" * 64),
+        lambda held: held.pop("seal"),
+        lambda held: held.update(package=None),
+        lambda held: held.update(more=1),
+    ],
+)
+def test_any_change_of_the_manifest_breaks_its_seal(folder: Path, change: Callable[[dict[str, Any]], object]):
+    rewrite(folder, change, sealed=False)
+    assert "damaged or changed" in refusal(folder)
+
+
+def test_the_layout_of_the_manifest_does_not_matter_to_its_seal(folder: Path):
+    rewrite(folder, lambda held: held.update(graphs=dict(reversed(held["graphs"].items()))), sealed=False)
+    assert opened(folder, NAME) is not None
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_graphs_by_another_version_are_refused_with_both_versions(folder: Path, sealed: bool):
+    rewrite(folder, lambda held: held.update(package="9.9.9"), sealed=sealed)
+    line = refusal(folder)
+    assert "made by torchvision-dddas 9.9.9, and this is" in line and f"dddas export --out {folder}" in line
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[]", b"null", b'{"graphs": []}', b"\xff\xfe", b"[" * 100_000])
+def test_a_manifest_that_is_none_is_refused(folder: Path, text: bytes):
+    (folder / MANIFEST).write_bytes(text)
+    assert "damaged or changed" in refusal(folder)
+
+
+def test_what_is_not_there_is_named(folder: Path):
+    assert "lists no absent.onnx" in refusal(folder, "absent.onnx")
+    (folder / NAME).unlink()
+    assert f"cannot read {folder / NAME}" in refusal(folder)
+    (folder / MANIFEST).unlink()
+    assert "holds no graphs with their manifest.json" in refusal(folder)
+
+
+def test_a_graph_that_the_runtime_refuses_is_one_line(folder: Path):
+    """Listed and whole, but of no use to this runtime."""
+    import hashlib
+
+    content = b"no graph at all"
+    (folder / NAME).write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    rewrite(folder, lambda held: held["graphs"][NAME].update(sha256=digest), sealed=True)
+    assert "cannot open" in refusal(folder)
+
+
+def test_both_onboard_back_ends_refuse_tampered_graphs(folder: Path, monkeypatch):
+    for name in (NAME, "people_scores.onnx"):
+        (folder / name).write_bytes((folder / name).read_bytes() + b"\0")
+    with pytest.raises(InputError, match=r"people_scores.onnx is not the graph"):
+        onboard_people.OnboardRecognizer(PeopleKnobs(graphs=str(folder)), LinearSvm(_nothing(), 0.0, "none"))
+    monkeypatch.setattr(onboard_plane, "SHIPPED", folder)
+    with pytest.raises(InputError, match=r"homography.onnx is not the graph"):
+        onboard_plane.opened.__wrapped__("homography")
+
+
+def test_shipped_graphs_that_are_damaged_ask_for_a_new_installation(folder: Path, monkeypatch):
+    monkeypatch.setattr(graphs, "SHIPPED", folder)
+    (folder / NAME).write_bytes(b"")
+    assert "install torchvision-dddas anew" in refusal(folder)
+
+
+def _nothing() -> Any:
+    import numpy as np
+
+    return np.zeros(PeopleKnobs().features, np.float32)

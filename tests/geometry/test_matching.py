@@ -1,0 +1,54 @@
+"""One-to-one assignment is SciPy's, whether or not SciPy is asked."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from torchvision_dddas.geometry import cheapest
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 3), (2, 7), (7, 2), (12, 12), (12, 40), (40, 12)])
+def test_an_assignment_is_scipys(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(shape))
+    for _ in range(20):
+        cost = rng.normal(size=shape)
+        assert np.array_equal(cheapest(cost), linear_sum_assignment(cost))
+
+
+def test_equal_costs_give_some_assignment_of_the_least_sum() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        cost = rng.integers(-2, 3, size=tuple(rng.integers(1, 12, 2))).astype(float)
+        rows, columns = cheapest(cost)
+        assert len(set(rows.tolist())) == len(set(columns.tolist())) == min(cost.shape)
+        assert cost[rows, columns].sum() == cost[linear_sum_assignment(cost)].sum()
+
+
+def test_scipy_is_loaded_only_where_two_want_the_same() -> None:
+    script = (
+        "import sys, numpy as np; from torchvision_dddas.geometry import cheapest\n"
+        "def asked(cost):\n    cheapest(np.array(cost))\n    return 'scipy.optimize' in sys.modules\n"
+        "print(asked([[0., 1, 9], [1, 0, 9]]), asked([[0., 1], [1, 0], [9, 9]]), asked([[0., 1], [0, 2]]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.split() == ["False", "False", "True"]
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
+def test_nobody_is_assigned_to_nobody(shape: tuple[int, int]) -> None:
+    rows, columns = cheapest(np.zeros(shape))
+    assert len(rows) == len(columns) == 0
+
+
+def test_what_a_run_onboard_loads_leaves_the_slow_libraries_out() -> None:
+    """They are half of its start and a third of its memory."""
+    slow = ("scipy", "jaxtyping", "pymap3d", "onnxruntime", "torch", "rich", "asyncio")
+    script = (
+        "import sys, torchvision_dddas.cli, torchvision_dddas.pipeline, torchvision_dddas.io.output.pipeline_output\n"
+    )
+    script += f"import torchvision_dddas.detection.opencv_engine\nprint([n for n in {slow!r} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == "[]"

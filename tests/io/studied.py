@@ -1,0 +1,108 @@
+"""A small study whose clips, results and faults are known, for its report."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.config import Settings
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.studies.record import Case, Found, Results, Source, Spec, Task
+from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.scoring import score
+
+SIZE = (160, 120)
+FRAMES = 6
+HOSTILE = 'a <b>bold</b> & "quoted" clip'
+
+
+def found(frame, box_px, identity=None, masks=None, east_north_m=None, seconds=0.5) -> Found:
+    """A result by its boxes."""
+    count = len(frame)
+    return Found(
+        np.array(frame, np.int64).reshape(-1),
+        np.array(box_px, float).reshape(-1, 4),
+        np.linspace(0.9, 0.3, count),
+        np.full(count, -1) if identity is None else np.array(identity, np.int64),
+        np.full((count, 2), np.nan) if east_north_m is None else np.array(east_north_m, float),
+        np.tile(np.eye(2), (count, 1, 1)),
+        np.arange(1, FRAMES + 1),
+        masks or {},
+        seconds={"register": seconds, "foreground": 2 * seconds},
+        peak_mb=101.0,
+    )
+
+
+def picture(folder: Path, number: int, at: int) -> Path:
+    """Noise with a bright square at x = at."""
+    image = np.random.default_rng(number).integers(60, 120, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    image[40:60, at : at + 20] = 230
+    path = folder / f"{number:05d}.png"
+    cv2.imwrite(str(path), image)
+    return path
+
+
+def masked_clip(folder: Path, name: str, off: int) -> Case:
+    """A square moves; what is found lies `off` pixels to its right."""
+    (folder / name / "frames").mkdir(parents=True)
+    (folder / name / "masks").mkdir()
+    pictures, masks, boxes, true = [], {}, [], {}
+    for k in range(1, FRAMES + 1):
+        at = 10 * k
+        pictures.append(picture(folder / name / "frames", k, at))
+        label = np.zeros(SIZE[::-1], np.uint8)
+        label[40:60, at : at + 20] = 1
+        true[k] = folder / name / "masks" / f"{k:05d}.png"
+        cv2.imwrite(str(true[k]), label)
+        seen = np.roll(label, off * k, axis=1) * 255
+        masks[k] = cv2.imencode(".png", seen)[1].tobytes()
+        boxes.append([at + off * k, 40, 20, 20])
+    truth = Truth("masks", folder / name / "masks", true, {})
+    clip = Clip(name, folder / name, tuple(pictures), 10.0, FRAMES, truth)
+    return scored(clip, "motion", found(range(1, FRAMES + 1), boxes, masks=masks))
+
+
+def boxed_truth(place: Path) -> Truth:
+    """Two targets side by side, one of which goes to the right, and where they are on the ground."""
+    frame = np.repeat(np.arange(1, FRAMES + 1), 2)
+    identity = np.tile([1, 2], FRAMES)
+    box_px = np.stack([np.where(identity == 1, 10.0 * frame, 100.0), 20.0 + 50 * (identity == 2)], axis=1)
+    box_px = np.concatenate([box_px, np.full((len(frame), 2), 20.0)], axis=1)
+    places = np.stack([frame * 1.0, identity * 5.0], axis=1)
+    table = TrackTable(frame, identity, box_px)
+    by_frame = {int(k): box_px[frame == k] for k in np.unique(frame)}
+    return Truth("boxes", place, {}, by_frame, table, None, FRAMES, positions=Positions(frame, identity, places))
+
+
+def tracked_clip(folder: Path, task: Task, name: str) -> Case:
+    """No pictures; from frame 4 on the first target is called 9, and the second is lost in frame 5."""
+    truth = boxed_truth(folder)
+    assert truth.tracks is not None and truth.positions is not None
+    frame, identity, box_px = truth.tracks
+    called = np.where((identity == 1) & (frame >= 4), 9, identity)
+    kept = ~((frame == 5) & (identity == 2))
+    places = truth.positions.east_north_m + 0.5
+    clip = Clip(name, folder, (), 10.0, FRAMES, truth)
+    return scored(clip, task, found(frame[kept], box_px[kept] + 1, called[kept], None, places[kept]))
+
+
+def scored(clip: Clip, task: Task, result: Found) -> Case:
+    kept: Scored = score(clip, task, result)
+    return Case(clip, task, result, kept)
+
+
+def study(folder: Path) -> Results:
+    """Masks found well and badly, tracks, people, places; a clip that failed; names that are not to be trusted."""
+    cases = (
+        masked_clip(folder, "good", 0),
+        masked_clip(folder, "bad", 4),
+        tracked_clip(folder, "tracking", "crossing"),
+        tracked_clip(folder, "people", HOSTILE),
+        tracked_clip(folder, "location", "ground"),
+        Case(Clip("broken", folder), "motion", cause="its <masks> are 3x3, the result 4x4"),
+    )
+    spec = Spec("small <study>", (Source("folder", folder, ("*",)),))
+    facts = {"backend": "onboard", "datasets": [{"kind": "folder", "folder": folder, "terms": "free", "clips": 6}]}
+    return Results(spec, Settings(), cases, ("lost: it has no truth",), facts)

@@ -1,0 +1,162 @@
+"""Rasters of the ground: heights and photos, on local metres."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.elevation import up
+from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.io.elevation import read_elevation, read_ortho
+
+rasterio = pytest.importorskip("rasterio")
+warp = pytest.importorskip("rasterio.warp")
+
+ORIGIN = (-110.95, 32.23)
+HERE = np.zeros((1, 2))
+
+
+def centre(crs, origin=ORIGIN):
+    (x,), (y,) = warp.transform("EPSG:4326", crs, [origin[0]], [origin[1]])
+    return x, y
+
+
+def write(path, values, crs="EPSG:32612", step=1.0, middle=None, **more):
+    """A raster about a place in its own coordinates, by default ORIGIN. values: (R, C) or (B, R, C)."""
+    values = np.atleast_3d(np.moveaxis(values, 0, -1)) if values.ndim == 3 else values[..., None]
+    rows, columns, bands = values.shape
+    x, y = middle or centre(crs)
+    corner = rasterio.transform.from_origin(x - columns * step / 2, y + rows * step / 2, step, step)
+    shape = {"height": rows, "width": columns, "count": bands, "dtype": str(values.dtype)}
+    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=corner, **shape, **more) as file:
+        file.write(np.moveaxis(values, -1, 0))
+    return path
+
+
+def slope(crs="EPSG:32612", step=1.0, cells=201, base=1300.0):
+    """Heights that rise by 0.1 m a metre to the north of the grid and 0.05 m to its east."""
+    k = (np.arange(cells) - cells // 2) * step
+    return (base + 0.05 * k[None] - 0.1 * k[:, None]).astype("float32")
+
+
+def test_heights_are_relative_to_the_origin_and_lie_where_they_belong(tmp_path):
+    found = read_elevation(write(tmp_path / "a.tif", slope()), HERE, ORIGIN, 60)
+    assert found.base_m == pytest.approx(1300, abs=1e-3)
+    places = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [-30.3, 25.7]])
+    # The grid's north is turned by a third of a degree against true north here.
+    x, y = np.array(warp.transform("EPSG:4326", "EPSG:32612", *lonlat(places, ORIGIN).T)) - np.array(
+        [[v] for v in centre("EPSG:32612")]
+    )
+    np.testing.assert_allclose(up(found, places), 0.05 * x + 0.1 * y, atol=2e-3)
+
+
+def test_a_raster_in_degrees_gives_the_same_heights(tmp_path):
+    step = 1e-5
+    cells, tall = 301, 1300.0
+    k = np.arange(cells) - cells // 2
+    heights = (tall - 0.1 * k[:, None] * step * 110_900 + 0 * k[None]).astype("float32")
+    found = read_elevation(write(tmp_path / "a.tif", heights, "EPSG:4326", step), HERE, ORIGIN, 60)
+    assert up(found, np.array([[0.0, 50.0]]))[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_local_metres_without_an_origin_are_those_of_the_raster(tmp_path):
+    path = write(tmp_path / "a.tif", slope(), None, middle=(500.0, 700.0))
+    found = read_elevation(path, np.array([[500.0, 700.0]]), None, 60)
+    first, second = up(found, np.array([[500.0, 700.0], [520.0, 730.0]]))
+    assert second - first == pytest.approx(0.05 * 20 + 0.1 * 30, abs=1e-3)
+
+
+@pytest.mark.parametrize("declared", [{"nodata": -9999.0}, {}])
+def test_holes_are_unknown_whether_declared_or_not(tmp_path, declared):
+    heights = slope()
+    heights[40:60, 100:160] = -9999.0 if declared else -32768.0
+    found = read_elevation(write(tmp_path / "a.tif", heights, **declared), HERE, ORIGIN, 80)
+    row = np.array([[30.0, 50.0]])
+    assert np.isnan(up(found, row))
+    known = found.up_m[np.isfinite(found.up_m)]
+    assert known.min() > -20
+
+
+def test_where_the_origin_is_not_covered_up_is_counted_from_the_landmarks(tmp_path):
+    x, y = centre("EPSG:32612")
+    path = write(tmp_path / "a.tif", slope(base=900.0), middle=(x + 300, y))
+    places = np.array([[0.0, 0.0], [280.0, 0.0], [320.0, 0.0]])
+    found = read_elevation(path, places, ORIGIN, 50)
+    assert np.isnan(up(found, places[:1]))
+    assert up(found, places[1:]).mean() == pytest.approx(0, abs=0.1)
+    assert found.base_m == pytest.approx(900, abs=0.5)
+
+
+def test_a_fine_raster_is_averaged_down(tmp_path):
+    heights = np.full((800, 800), 100, "float32")
+    heights[::2] += 1
+    found = read_elevation(write(tmp_path / "a.tif", heights, step=0.01), HERE, ORIGIN, 200)
+    inside = found.up_m[np.isfinite(found.up_m)]
+    assert found.step_m == pytest.approx(0.2)
+    assert np.abs(inside).max() < 0.3
+    assert found.base_m == pytest.approx(100.5, abs=0.3)
+
+
+def test_a_raster_elsewhere_is_refused_with_both_areas(tmp_path):
+    path = write(tmp_path / "a.tif", slope())
+    with pytest.raises(InputError, match=r"covers longitude -110\.95.*landmarks lie at east.*longitude 2\.0") as error:
+        read_elevation(path, HERE, (2.0, 48.0))
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_raster_of_heights_is_refused(tmp_path):
+    (tmp_path / "text.tif").write_text("no raster")
+    for path, words in (
+        (tmp_path / "text.tif", "cannot be read as a raster"),
+        (tmp_path / "absent.tif", "cannot be read as a raster"),
+        (write(tmp_path / "b.tif", np.zeros((3, 20, 20), "float32")), "3 bands; wanted one"),
+        (write(tmp_path / "c.tif", slope(), None, middle=(0.0, 0.0)), "no CRS"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_elevation(path, HERE, ORIGIN)
+    degrees = write(tmp_path / "d.tif", slope(), "EPSG:4326", 1e-5)
+    with pytest.raises(InputError, match="is in degrees, the landmarks in local metres"):
+        read_elevation(degrees, HERE, None)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("origin", [ORIGIN, None])
+def test_a_picture_that_does_not_say_where_it_lies_is_refused_in_one_line(tmp_path, origin):
+    path = tmp_path / "bare.png"
+    cv2.imwrite(str(path), np.full((20, 20), 90, np.uint8))
+    with pytest.raises(InputError, match=r"bare\.png does not say where it lies"):
+        read_elevation(path, HERE, origin)
+
+
+def test_without_rasterio_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(InputError, match=r"needs rasterio: pip install 'torchvision-dddas\[elevation\]'"):
+        read_elevation(tmp_path / "a.tif", HERE, ORIGIN)
+
+
+def test_a_photo_shows_each_place_in_its_colour(tmp_path):
+    photo = np.full((3, 200, 200), 90, "uint8")
+    photo[0, :100, 100:] = 250  # red in the north-east
+    found = read_ortho(write(tmp_path / "a.tif", photo, step=0.5), HERE, ORIGIN, 40)
+    pixel_from_place = np.linalg.inv(np.vstack([found.east_north_from_pixel, [0, 0, 1]]))
+    for place, blue_green_red in (((20, 20), (90, 90, 250)), ((-20, 20), (90, 90, 90)), ((20, -20), (90, 90, 90))):
+        u, v, _ = np.rint(pixel_from_place @ [*place, 1]).astype(int)
+        assert found.image[v, u].tolist() == list(blue_green_red)
+
+
+def test_a_white_band_of_a_photo_is_no_hole(tmp_path):
+    photo = np.full((3, 60, 60), 90, "uint8")
+    photo[0, 28:32, 28:32] = 255
+    photo[:, :10] = 255
+    found = read_ortho(write(tmp_path / "a.tif", photo, nodata=255), HERE, ORIGIN, 20)
+    middle = found.image.shape[0] // 2
+    assert found.image[middle, middle].tolist() == [90, 90, 255]
+
+
+def test_a_photo_that_is_none_or_lies_elsewhere_is_refused(tmp_path):
+    with pytest.raises(InputError, match="1 bands of float32; wanted a photo"):
+        read_ortho(write(tmp_path / "a.tif", slope()), HERE, ORIGIN)
+    with pytest.raises(InputError, match="none shows"):
+        read_ortho(write(tmp_path / "b.tif", np.zeros((3, 50, 50), "uint8")), HERE, (2.0, 48.0))

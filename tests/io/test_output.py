@@ -1,0 +1,233 @@
+"""The folder of a run: whole or not at all, whatever ends it."""
+
+import errno
+import json
+import os
+import signal
+from pathlib import Path
+
+import cv2
+import pytest
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.output import Output, saved
+from torchvision_dddas.io.output.run_record import Durations, finite
+
+
+def run_json(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+def visible(folder):
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def fill(folder, scenes, save=("masks", "overlay")):
+    with Output(folder, save) as output:
+        output.begin({"backend": "onboard", "settings": {"points": 5}}, rate_hz=10)
+        for scene in scenes:
+            output.write(scene)
+
+
+ALL_OF_TWO = ["detections.csv", "detections.txt", "masks/000001.png", "masks/000002.png", "overlay.mp4", "run.json"]
+
+
+def test_a_whole_run_leaves_all_files_and_a_record(tmp_path, scene, adjustment):
+    scenes = [
+        scene(1, seconds={"track": 0.010}),
+        scene(2, 0, reliable=False, cause="blank", adjustments=(adjustment,), seconds={"track": 0.030}),
+    ]
+    fill(tmp_path / "a/b", scenes)
+    assert visible(tmp_path / "a/b") == ALL_OF_TWO
+    record = run_json(tmp_path / "a/b")
+    assert (record["state"], record["interrupted"]) == ("complete", False)
+    assert record["frames"] == {"written": 2, "unreliable": 1}
+    assert record["unreliable"] == [{"first": 2, "last": 2, "cause": "blank"}]
+    assert record["adjustments"][0] == {
+        "frame": 2, "knob": "interval_frames", "old": 1.0, "new": 2.0, "cause": "background flow 0.4 px a frame",
+    }  # fmt: skip
+    assert record["seconds"]["stages"]["track"]["total"] == pytest.approx(0.04)
+    assert record["settings"] == {"points": 5}
+    assert {"torchvision_dddas", "python", "numpy", "cv2"} <= set(record["versions"])
+
+
+def test_only_what_was_asked_for_is_saved(tmp_path, scene):
+    fill(tmp_path, [scene(1)], save=())
+    assert visible(tmp_path) == ["detections.csv", "detections.txt", "run.json"]
+
+
+def test_ctrl_c_keeps_valid_outputs_of_the_frames_seen(tmp_path, scene):
+    def scenes():
+        yield scene(1)
+        yield scene(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, scenes())
+    assert visible(tmp_path) == ALL_OF_TWO
+    assert run_json(tmp_path)["interrupted"] is True
+    assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
+
+
+def test_ctrl_c_while_a_frame_is_written_waits_for_the_whole_frame(tmp_path, scene, monkeypatch):
+    from torchvision_dddas.io.tables import Tables
+
+    honest = Tables.write
+
+    def interrupted(self, made):
+        honest(self, made)
+        if made.frame.number == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Tables, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path, [scene(1), scene(2), scene(3)])
+    assert visible(tmp_path) == ALL_OF_TWO
+    assert len((tmp_path / "detections.txt").read_text().splitlines()) == 2
+
+
+def test_another_error_leaves_no_table_and_no_film_and_says_failed(tmp_path, scene):
+    def scenes():
+        yield scene(1)
+        raise InputError("the stream ended in the middle")
+
+    with pytest.raises(InputError, match="stream ended"):
+        fill(tmp_path, scenes())
+    assert visible(tmp_path) == ["masks/000001.png", "run.json"]
+    assert run_json(tmp_path)["state"] == "failed"
+    assert run_json(tmp_path)["problems"] == ["the stream ended in the middle"]
+
+
+@pytest.mark.parametrize("victim", ["mask", "table", "overlay"])
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(tmp_path, scene, monkeypatch, victim):
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    if victim == "mask":
+        honest = Path.write_bytes
+
+        def write_bytes(self, content):
+            if "000002" in self.name:
+                honest(self, content[:10])
+                raise full
+            return honest(self, content)
+
+        monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    else:
+
+        def refuse(*_):
+            raise full
+
+        place = {"table": "tables.mot_lines", "overlay": "overlay._H264.write"}[victim]
+        monkeypatch.setattr(f"torchvision_dddas.io.output.{place}", refuse)
+    with pytest.raises(InputError, match="No space left on device") as error:
+        fill(tmp_path, [scene(1), scene(2)])
+    assert "\n" not in str(error.value)
+    assert not any(".part" in name for name in visible(tmp_path))
+    assert not {"detections.txt", "detections.csv", "overlay.mp4"} & set(visible(tmp_path))
+    # The film is encoded beside the rest: the next mask may be there, and whole, before its error is known.
+    assert ("masks/000002.png" in visible(tmp_path)) <= (victim == "overlay")
+    assert run_json(tmp_path)["state"] == "failed"
+
+
+def test_a_disk_that_fills_up_while_closing_leaves_no_table(tmp_path, scene, monkeypatch):
+    honest = Path.replace
+
+    def refuse(self, target):
+        if target.name == "detections.csv":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+        return honest(self, target)
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(InputError, match=r"detections\.csv: No space"):
+        fill(tmp_path, [scene(1)])
+    assert run_json(tmp_path)["state"] == "failed"
+    assert not any(".part" in name for name in visible(tmp_path))
+
+
+def test_a_run_that_was_killed_is_seen_to_be_unfinished(tmp_path, scene):
+    output = Output(tmp_path)
+    output.begin({}, rate_hz=10)
+    output.write(scene(1))
+    assert run_json(tmp_path)["state"] == "running"
+    output.discard()
+
+
+def test_bad_input_before_the_first_frame_leaves_the_earlier_run_and_no_new_folder(tmp_path, scene):
+    fill(tmp_path / "old", [scene(1)])
+    before = {name: (tmp_path / "old" / name).read_bytes() for name in visible(tmp_path / "old")}
+
+    def bad():
+        if tmp_path.exists():
+            raise InputError("no such clip")
+        yield scene(1)
+
+    for folder in ("old", "new/deep"):
+        with pytest.raises(InputError):
+            fill(tmp_path / folder, bad())
+    assert {name: (tmp_path / "old" / name).read_bytes() for name in visible(tmp_path / "old")} == before
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_second_run_replaces_the_first(tmp_path, scene):
+    fill(tmp_path, [scene(1), scene(2), scene(3)])
+    (tmp_path / "notes.txt").write_text("mine")
+    fill(tmp_path, [scene(1, targets=4), scene(2)])
+    assert visible(tmp_path) == sorted([*ALL_OF_TWO, "notes.txt"])
+    assert len((tmp_path / "detections.txt").read_text().splitlines()) == 5
+
+
+def test_masks_that_someone_else_made_are_not_replaced(tmp_path):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/000001.png").write_bytes(b"truth")
+    with pytest.raises(InputError, match=r"000001\.png was not written by dddas"):
+        Output(tmp_path)
+
+
+def test_a_file_in_place_of_the_folder_is_one_line(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match=r"cannot write into .*out.*--out"):
+        Output(tmp_path / "out/deeper")
+
+
+def test_a_folder_that_refuses_files_is_one_line(tmp_path, monkeypatch):
+    def refuse(self, _):
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        Output(tmp_path)
+
+
+def test_unknown_names_to_save_are_named_with_those_there_are():
+    with pytest.raises(InputError, match=r"'film'.*masks, overlay, all and none"):
+        saved("masks,film")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (None, ("masks", "overlay")),
+        ("all", ("masks", "overlay")),
+        ("none", ()),
+        ("overlay, masks", ("masks", "overlay")),
+    ],
+)
+def test_names_to_save(names, expected):
+    assert saved(names) == expected
+
+
+def test_median_of_durations_is_within_a_hundredth():
+    times = Durations()
+    for k in range(1, 1002):
+        times.add(k * 1e-4)
+    assert times.median_s == pytest.approx(501e-4, rel=0.01)
+    assert Durations().median_s == 0
+
+
+def test_numbers_that_json_cannot_hold_become_null():
+    import numpy as np
+
+    assert finite({"a": np.float32("nan"), "b": (np.int64(3), Path("x")), 1: True}) == {
+        "a": None,
+        "b": [3, "x"],
+        "1": True,
+    }

@@ -1,0 +1,235 @@
+"""The report of a study, its words and its pictures."""
+
+import json
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.io.studied import FRAMES, HOSTILE, SIZE, boxed_truth, found, masked_clip, scored, study, tracked_clip
+from tests.io.test_report import Page
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.report import report
+from torchvision_dddas.evaluation.report.curves import MOST_FAINT, ranked_charts
+from torchvision_dddas.evaluation.report.pictures import (
+    FALSE,
+    HIT,
+    TRUE,
+    UNSCORED,
+    Boxes,
+    box_pair,
+    mask_pair,
+    matched,
+)
+from torchvision_dddas.evaluation.report.worst import MOST, boxes_at, drawn, worst_frames
+from torchvision_dddas.evaluation.studies.summary import summary
+from torchvision_dddas.io.output.run_record import finite
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return study(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def metrics(results):
+    return finite(summary(results))
+
+
+@pytest.fixture(scope="module")
+def text(results, metrics):
+    return report(metrics, results)
+
+
+def decode(jpeg):
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+
+
+def near(pixel, colour, within=60):
+    return bool(np.abs(np.asarray(pixel, int) - colour).max() < within)
+
+
+def test_the_page_is_whole_escaped_and_asks_no_host_for_anything(text):
+    page = Page(text)
+    assert text.count("</html>") == 1 and "masks" not in page.found and "study" not in page.found
+    said = " ".join(page.words)
+    assert HOSTILE in said and "small <study>" in said and "its <masks> are 3x3, the result 4x4" in said
+    assert not re.search(r"https?:|url\(|@import|<link|<iframe|src=\"(?!data:)", text)
+
+
+def test_the_page_says_at_once_how_good_how_sure_where_it_fails_and_what_it_cost(text, metrics):
+    start = text[: text.index('<h2 id="motion">')]
+    said = " ".join(" ".join(Page(f"<html>{start[start.index('<h1>') :]}</html>").words).split())
+    motion = metrics["tasks"]["motion"]["pooled"]
+    low, high = motion["intervals"]["pixels"]["f"]
+    assert f"{motion['pixels']['f']:.3f} F, pixels" in said
+    assert f"95 % interval over blocks of frames: {low:.3f} to {high:.3f}" in said
+    assert "worst: bad, 0.333" in said
+    assert "4.0 frames/s (3.0 s), at most 101 MB" in said
+    assert "1 left out" in said and "lost: it has no truth" in said
+
+
+def test_every_figure_of_the_tables_is_that_of_the_metrics(text, metrics):
+    values = {float(v) for tag, name, v in Page(text).attributes if (tag, name) == ("td", "data-v") and _is_number(v)}
+    for name in ("good", "bad"):
+        for group in ("pixels", "boxes", "ranking"):
+            of_clip = metrics["tasks"]["motion"]["clips"][name][group]
+            assert {v for k, v in of_clip.items() if not k.startswith("n_") and v is not None} <= values
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def test_settings_versions_and_terms_are_told(text, results):
+    said = "".join(Page(text).words)
+    assert "numpy" in said and "free" in said
+    assert json.dumps(finite(results.settings.model_dump(mode="json")), indent=2) in said
+
+
+def test_the_same_study_gives_the_same_page(text, results, metrics):
+    assert report(metrics, results) == text
+
+
+def test_a_study_without_any_result_still_has_a_page(results):
+    empty = replace(results, cases=tuple(case for case in results.cases if case.cause))
+    said = " ".join(Page(report(finite(summary(empty)), empty)).words)
+    assert "0 clips" in said and "4x4" in said
+
+
+def test_pictures_that_are_gone_cost_no_more_than_themselves(tmp_path, metrics):
+    results = study(tmp_path)
+    for file in (tmp_path / "bad" / "frames").iterdir():
+        file.unlink()
+    page = Page(report(metrics, results))
+    assert any("no picture: " in word for word in page.words)
+    assert sum(tag == "img" for tag in page.found) >= 4  # those of other tasks
+
+
+def test_the_worst_frames_come_first_and_the_others_are_counted(tmp_path):
+    cases = [masked_clip(tmp_path, "good", 0), masked_clip(tmp_path, "bad", 4), masked_clip(tmp_path, "fair", 2)]
+    chosen, others = worst_frames(cases)
+    assert [(one.case.clip.name, one.frame) for one in chosen[:2]] == [("bad", 5), ("fair", 6)]
+    assert chosen[0].words == "F 0.00; pixels: 0 right, 400 false, 400 missed"
+    assert len(chosen) + others == 2 * FRAMES and "good" not in {one.case.clip.name for one in chosen}
+
+
+def test_pictures_are_bounded_however_many_clips_fail(tmp_path):
+    case = masked_clip(tmp_path, "bad", 4)
+    many = [replace(case, clip=replace(case.clip, name=f"bad {k}")) for k in range(30)]
+    chosen, others = worst_frames(many)
+    assert len(chosen) == MOST and len({one.case.clip.name for one in chosen}) == MOST
+    assert others == 30 * FRAMES - MOST
+
+
+def test_a_mask_shows_what_was_hit_false_and_missed_each_in_its_colour():
+    labels, mask = np.zeros((120, 160), int), np.zeros((120, 160), np.uint8)
+    labels[20:60, 20:80], mask[20:60, 50:110] = 1, 255
+    labels[90:110, 90:150], mask[90:110, 90:150] = -1, 255
+    pair = mask_pair(np.full((120, 160, 3), 90, np.uint8), labels, mask)
+    truth, result = decode(pair.truth), decode(pair.result)
+    scale = result.shape[1] / 160
+    at = {name: result[round(40 * scale), round(x * scale)] for name, x in (("missed", 35), ("hit", 65), ("false", 95))}
+    assert near(at["missed"], TRUE) and near(at["hit"], HIT) and near(at["false"], FALSE)
+    assert near(result[round(100 * scale), round(120 * scale)], UNSCORED)
+    assert near(result[round(5 * scale), round(5 * scale)], (90, 90, 90))
+    # On the other side what is true is tinted, and nothing else.
+    assert truth[round(40 * scale), round(35 * scale), 0] < 85 < truth[round(40 * scale), round(35 * scale), 2]
+    assert near(truth[round(40 * scale), round(95 * scale)], (90, 90, 90), 12)
+
+
+def test_a_fault_of_few_pixels_is_seen_in_a_large_picture():
+    labels, mask = np.zeros((2160, 3840), int), np.zeros((2160, 3840), np.uint8)
+    mask[1000:1005, 2000:2005] = 255
+    result = decode(mask_pair(np.zeros((2160, 3840, 3), np.uint8), labels, mask).result).astype(int)
+    assert result.shape[1] <= 560
+    assert (result[..., 2] - result[..., 0]).max() > 60
+
+
+@pytest.mark.parametrize("matrix", [
+    np.eye(3),
+    # Deuteranopia, protanopia and tritanopia; Machado, Oliveira and Fernandes, 2009, severity 1, linear RGB.
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+])  # fmt: skip
+def test_the_three_colours_are_far_from_each_other_for_colour_blind_eyes(matrix):
+    colours = np.array([HIT, FALSE, TRUE], float)[:, ::-1] / 255
+    seen = np.clip((colours**2.2) @ np.array(matrix).T, 0, 1) ** (1 / 2.2)
+    lab = cv2.cvtColor(seen[None].astype(np.float32), cv2.COLOR_RGB2LAB)[0]
+    apart = [float(np.linalg.norm(lab[i] - lab[j])) for i, j in ((0, 1), (0, 2), (1, 2))]
+    assert min(apart) > 30  # just noticeable is about 2
+
+
+def test_boxes_are_told_apart_by_their_lines_too():
+    true_px, found_px = np.array([[10, 10, 40, 40], [100, 10, 40, 40]], float), np.array([[12, 10, 40, 40.0]])
+    boxes = Boxes(true_px, found_px, np.array([0]), ["", ""], [""], np.zeros(1, bool), np.ones(1, bool))
+    result = decode(box_pair(None, SIZE, boxes).result)
+    scale = result.shape[1] / SIZE[0]
+    lower = result[round(50 * scale), round(100 * scale) : round(140 * scale)]
+    yellow = np.array([near(pixel, TRUE, 90) for pixel in lower])
+    assert 0.2 < yellow.mean() < 0.9  # dashed
+    assert near(result[round(30 * scale), round(12 * scale)], HIT, 90)
+
+
+def test_a_change_of_identity_is_named_and_the_lost_target_is_missed(tmp_path):
+    case = tracked_clip(tmp_path, "tracking", "crossing")
+    at_4, at_5 = boxes_at(case, 4), boxes_at(case, 5)
+    assert at_4.found_names == ["1>9", "2"] and at_4.marked.tolist() == [True, False]
+    assert at_5.found_names == ["9"] and len(at_5.true_px) == 2 and at_5.of_found.tolist() == [0]
+    said = {one.frame: one.words for one in worst_frames([case])[0]}
+    assert said[4].endswith("1 changed identity") and said[5] == "F1 0.67; boxes: 1 right, 0 false, 1 missed"
+
+
+def test_of_one_labelled_target_other_boxes_are_not_judged(tmp_path):
+    truth = boxed_truth(tmp_path)
+    one = {frame: boxes[:1] for frame, boxes in truth.boxes.items()}
+    clip = Clip("one", tmp_path, (), 10.0, FRAMES, Truth("one target", tmp_path, {}, one))
+    case = replace(tracked_clip(tmp_path, "tracking", "x"), clip=clip, task="motion")
+    boxes = boxes_at(case, 1)
+    assert boxes.of_found.tolist() == [0, -1] and boxes.judged.tolist() == [True, False]
+
+
+def test_in_a_still_clip_every_box_is_false_and_drawn(tmp_path):
+    still = Clip("still", tmp_path, (), 10.0, FRAMES, None, still=True)
+    case = scored(still, "motion", found([2, 2, 5], [[10, 10, 9, 9], [40, 40, 9, 9], [20, 20, 9, 9]]))
+    chosen, others = worst_frames([case])
+    assert (chosen[0].frame, others) == (2, 0)
+    assert chosen[0].words == "F1 0.00; boxes: 0 right, 2 false, 0 missed"
+    pair = drawn(chosen)[0].pair
+    assert pair is not None
+    pixels = decode(pair.result).reshape(-1, 3)
+    assert any(near(pixel, FALSE, 30) for pixel in pixels)
+
+
+def test_a_video_gives_the_frames_that_were_asked_for(tmp_path):
+    case = masked_clip(tmp_path, "bad", 4)
+    path = tmp_path / "clip.avi"
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
+    for k in range(FRAMES):
+        film.write(np.full((SIZE[1], SIZE[0], 3), 40 * k, np.uint8))
+    film.release()
+    case = replace(case, clip=replace(case.clip, pictures=(path,)))
+    for one in drawn(worst_frames([case])[0]):
+        assert one.pair is not None
+        assert abs(float(decode(one.pair.truth)[:20].mean()) - 40 * (one.frame - 1)) < 8
+
+
+def test_matched_boxes_are_those_that_are_counted():
+    overlap = np.array([[0.9, 0.6], [0.8, 0.0]])
+    assert matched(np.zeros((2, 4)), np.zeros((2, 4)), overlap).tolist() == [0, -1]
+
+
+def test_curves_of_many_clips_are_bounded_and_say_so(tmp_path):
+    case = tracked_clip(tmp_path, "people", "x")
+    many = [replace(case, clip=replace(case.clip, name=f"clip {k}")) for k in range(100)]
+    first, second = ranked_charts(many)
+    assert first.count('class="faint') == second.count('class="faint') == MOST_FAINT
+    assert f"{MOST_FAINT} of 100 clips" in first and "all clips" in first

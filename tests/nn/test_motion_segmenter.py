@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+import torch
+
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.nn.motion_segmenter import Core, Differences, Regions, SoftMotion
+
+KNOBS: dict[str, float] = {
+    "difference.noise_levels": 4.0,
+    "difference.gradient_share": 0.15,
+    "difference.threshold": 4.0,
+    "difference.blur_px": 5,
+    "morphology.erode_px": 2,
+    "morphology.close_px": 7,
+    "difference.peak": 5.0,
+    "gates.min_area_px": 20,
+}
+SETTINGS = with_knobs(Settings(), KNOBS)
+# Where noise is the unit, nothing is many units above it.
+NOISY = with_knobs(SETTINGS, {"difference.threshold": 1.5, "difference.peak": 1.6})
+
+
+def differences(
+    dtype: torch.dtype = torch.float32, noisy: bool = False, height: int = 24, width: int = 32
+) -> Differences:
+    """One window with two pairs: two bright squares on noise; noisy: so much of it that it sets the unit."""
+    random = torch.Generator().manual_seed(5)
+    level = 60 if noisy else 6
+    least = torch.randint(0, level, (2, 2, height, width), generator=random)
+    least[0, :, 5:13, 6:15] += 100
+    least[1, :, 14:20, 20:28] += 80
+    texture = torch.randint(0, 60, (2, 1, height, width), generator=random)
+    both = torch.ones(2, 2, height, width, dtype=torch.bool)
+    both[..., :2] = False
+    return Differences(least.to(torch.uint8), both, texture.to(dtype), texture > 16, 16.0, 240.0)
+
+
+def values(changed: dict[str, float] | None = None) -> dict[str, torch.Tensor]:
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in {**KNOBS, **(changed or {})}.items()}
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> None:
+    motion, windows = SoftMotion(NOISY if noisy else SETTINGS), differences(noisy=noisy)
+    hard = motion(windows, {}).mask
+    assert 0 < float(hard.mean()) < 1 and set(hard.unique().tolist()) == {0.0, 1.0}
+    misses = [float((motion(windows, {}, softness).mask - hard).abs().mean()) for softness in (0.5, 0.1, 0.02, 0.004)]
+    assert misses[0] > misses[1] > misses[2] > misses[3] and misses[3] < 0.01
+
+
+@pytest.mark.parametrize("kind", ["normalized", "to_reference"])
+def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
+    settings = with_knobs(SETTINGS, {"difference.kind": kind})
+    motion, windows = SoftMotion(settings), differences()
+    given, tuned = motion(windows, {}, 0.1), motion(windows, values(), 0.1)
+    torch.testing.assert_close(given.mask, tuned.mask)
+    torch.testing.assert_close(given.evidence, tuned.evidence)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_the_gradient_of_every_knob_of_the_core_is_right(noisy: bool) -> None:
+    """In double precision, between whole sizes, and where nothing is rounded."""
+    windows = differences(torch.float64, noisy)
+    motion = SoftMotion(NOISY if noisy else SETTINGS, whole=False)
+    names = [name for name in KNOBS if name not in ("difference.peak", "gates.min_area_px")]
+    at = (4.1, 0.16, 1.6 if noisy else 3.9, 4.3, 2.4, 5.6)
+    weight = torch.rand(2, 1, 24, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def total(*knobs: torch.Tensor) -> torch.Tensor:
+        return (motion(windows, dict(zip(names, knobs, strict=True)), 0.2).mask * weight).sum()
+
+    starts = tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in at)
+    # The unit of noise is told in whole steps and so has jumps; small steps stay between them.
+    assert torch.autograd.gradcheck(total, starts, eps=1e-7, atol=2e-3, rtol=2e-3)
+
+
+def regions(core: Core) -> Regions:
+    """The first picture's square is region 1 whose hull has a hole filled; a speck lies within it."""
+    near = (core.margin > 0).long()
+    return Regions(near, near, 1)
+
+
+def test_a_region_below_its_area_or_its_peak_is_gone_and_one_above_both_is_whole() -> None:
+    motion, windows = SoftMotion(SETTINGS), differences()
+    core = motion(windows, {})
+    for name, value, left in (
+        ("gates.min_area_px", 20.0, True),
+        ("gates.min_area_px", 400.0, False),
+        ("difference.peak", 14.0, True),
+        ("difference.peak", 16.0, False),
+    ):
+        mask = motion.outlined(core, regions(core), {name: torch.tensor(value)})
+        assert torch.equal(mask, core.mask if left else torch.zeros_like(mask)), name
+
+
+def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
+    motion, windows = SoftMotion(SETTINGS), differences()
+    core = motion(windows, {})
+    found = regions(core)
+    filled = found.filled.clone()
+    filled[0, 0, 0, 5] = 1
+    mask = motion.outlined(core, Regions(found.near, filled, 1), {})
+    assert float(mask[0, 0, 0, 5]) == 1.0
+    area = torch.tensor(300.0, dtype=torch.float64, requires_grad=True)
+    soft = motion.outlined(motion(windows, {}, 0.1), Regions(found.near, filled, 1), {"gates.min_area_px": area}, 0.3)
+    assert 0 < float(soft[0, 0, 0, 5].detach()) < 1
+    (slope,) = torch.autograd.grad(soft[0, 0, 0, 5], area)
+    assert float(slope) < 0
+
+
+def test_every_knob_has_a_finite_gradient_that_is_not_nothing() -> None:
+    windows = differences(noisy=True)
+    motion = SoftMotion(NOISY)
+    near = {"difference.blur_px": 4.5, "difference.threshold": 1.5, "difference.peak": 1.6}
+    knobs = {name: value.requires_grad_() for name, value in values(near).items()}
+    core = motion(windows, knobs, 0.3)
+    motion.outlined(core, regions(core), knobs, 0.3).sum().backward()
+    slopes = np.array([float(value.grad) if value.grad is not None else np.nan for value in knobs.values()])
+    assert np.isfinite(slopes).all() and (slopes != 0).all(), dict(zip(knobs, slopes, strict=True))
+
+
+def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
+    empty = Differences(
+        torch.zeros(1, 1, 20, 20, dtype=torch.uint8),
+        torch.zeros(1, 1, 20, 20, dtype=torch.bool),
+        torch.zeros(1, 1, 20, 20),
+        torch.zeros(1, 1, 20, 20, dtype=torch.bool),
+        16.0,
+        240.0,
+    )
+    knobs = {name: value.requires_grad_() for name, value in values().items()}
+    motion = SoftMotion(SETTINGS)
+    core = motion(empty, knobs, 0.1)
+    none = torch.zeros(1, 1, 20, 20, dtype=torch.int64)
+    mask = motion.outlined(core, Regions(none, none, 0), knobs, 0.1)
+    mask.sum().backward()
+    assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in knobs.values())

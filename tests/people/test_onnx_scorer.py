@@ -1,0 +1,197 @@
+"""The onboard recognizer: no torch, bounded memory, and tiles, bands and threads that leave no trace in the scores."""
+
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.people import onnx_scorer as onboard_people
+from torchvision_dddas.people import opencv_gradient as onboard_gradient
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.onnx_scorer import OnboardRecognizer
+from torchvision_dddas.people.opencv_gradient import Gradient
+from torchvision_dddas.people.scratch import Scratch, spans
+from torchvision_dddas.runtime import SHIPPED, manifest
+from torchvision_dddas.types import Part
+
+SVM = read_classifier("opencv", 3780)
+
+
+def picture(seed: int, height: int = 300, width: int = 260) -> np.ndarray:
+    """Coloured patches under noise: edges of all directions, and black and white."""
+    random = np.random.default_rng(seed)
+    patches = random.integers(-30, 286, (height // 12 + 1, width // 12 + 1, 3)).clip(0, 255).astype(np.float32)
+    large = cv2.resize(patches, (width, height), interpolation=cv2.INTER_CUBIC)
+    return (large + random.normal(0, 4, large.shape)).clip(0, 255).astype(np.uint8)
+
+
+def whole(image: np.ndarray) -> Part:
+    height, width = image.shape[:2]
+    return Part((width, height), 0, 0, width, height)
+
+
+def scored(image: np.ndarray, part: Part | None = None) -> np.ndarray:
+    ((found,),) = OnboardRecognizer(PeopleKnobs(), SVM).scores([image], [[part or whole(image)]])
+    return found
+
+
+def test_every_window_of_a_picture_of_many_tiles_scores_as_in_opencv():
+    image = picture(0, 370, 430)
+    opencv = cv2.HOGDescriptor()
+    opencv.setSVMDetector(np.append(SVM.weights, SVM.bias).astype(np.float32))
+    places, wanted = (np.asarray(hit) for hit in opencv.detect(image, -1e9, (8, 8), (0, 0)))
+    found = scored(image)
+    assert found.size == len(wanted) > 1000
+    found = found[places[:, 1] // 8, places[:, 0] // 8]
+    np.testing.assert_allclose(found, wanted.ravel(), atol=2e-5, rtol=0)
+    assert ((found > 0) == (wanted.ravel() > 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("tile_px", "gradient_px", "blocks", "band_px"),
+    [(16, 200_000, 5000, 20_000), (40, 1, 5000, 1), (72, 30_000, 1, 3000), (1000, 10**6, 10**6, 10**6)],
+)
+def test_how_the_work_is_cut_changes_nothing(monkeypatch, tile_px, gradient_px, blocks, band_px):
+    image = picture(1)
+    wanted = scored(image)
+    monkeypatch.setattr(onboard_people, "_TILE_PX", tile_px)
+    monkeypatch.setattr(onboard_people, "_GRADIENT_PX", gradient_px)
+    monkeypatch.setattr(onboard_people, "_BLOCKS", blocks)
+    monkeypatch.setattr(onboard_gradient, "_BAND_PX", band_px)
+    np.testing.assert_allclose(scored(image), wanted, atol=5e-6, rtol=0)
+
+
+def test_arrays_that_are_used_again_leave_nothing_of_an_earlier_picture():
+    recognizer = OnboardRecognizer(PeopleKnobs(), SVM)
+    images = [picture(2), np.full((300, 260, 3), 255, np.uint8), picture(3, 140, 90)[..., 0].copy(), picture(2)]
+    first, _, small, again = (recognizer.scores([image], [[whole(image)]])[0][0] for image in images)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_allclose(small, scored(images[2]), atol=5e-6, rtol=0)
+
+
+def test_a_recognizer_may_be_asked_by_several_threads_at_once():
+    recognizer = OnboardRecognizer(PeopleKnobs(), SVM)
+    images = [picture(seed, 200, 180) for seed in range(6)]
+    with ThreadPoolExecutor(3) as threads:
+        together = list(threads.map(lambda image: recognizer.scores([image], [[whole(image)]])[0][0], images))
+    for image, found in zip(images, together, strict=True):
+        np.testing.assert_allclose(found, scored(image), atol=5e-6, rtol=0)
+
+
+def test_the_gradient_of_each_pixel_is_that_of_the_channel_where_it_is_largest():
+    planes = np.zeros((3, 3, 3), np.uint8)
+    planes[0, 1, 2], planes[1, 2, 1], planes[2, 1, 0] = 100, 144, 121
+    magnitude, moment = Gradient(gamma=True, signed=True)(planes)[:, 0, 0]
+    assert magnitude == 12 and moment / magnitude == pytest.approx(np.pi / 2, abs=1e-5)
+    magnitude, moment = Gradient(gamma=False, signed=False)(planes[::-1][:1])[:, 0, 0]
+    assert magnitude == 121 and moment / magnitude == pytest.approx(np.pi, abs=1e-5)
+
+
+def test_a_gradient_and_its_opposite_have_one_direction_unless_it_is_signed():
+    planes = cv2.split(picture(4, 40, 50))
+    for signed in (False, True):
+        one, other = (
+            Gradient(False, signed)(np.stack(levels)).copy() for levels in (planes, [255 - p for p in planes])
+        )
+        steep = one[0] > 5
+        apart = np.abs(one[1] - other[1])[steep] / one[0][steep]
+        np.testing.assert_allclose(
+            apart.min() if signed else np.minimum(apart, np.pi - apart).max(), np.pi * signed, atol=1e-4
+        )
+
+
+def test_stretches_make_up_the_whole_and_none_is_longer_than_asked():
+    for length in range(1, 40):
+        for most in range(1, 45):
+            held = spans(length, most)
+            assert [begin for begin, _ in held] == [0, *(end for _, end in held[:-1])] and held[-1][1] == length
+            assert max(end - begin for begin, end in held) <= most and len(held) == -(-length // most)
+
+
+def test_an_array_is_made_anew_only_where_it_was_too_small():
+    scratch = Scratch()
+    large = scratch("a", (3, 4))
+    assert np.shares_memory(scratch("a", (2, 5)), large) and scratch("a", (2, 5)).flags.c_contiguous
+    assert not np.shares_memory(scratch("b", (3, 4)), large)
+    assert not np.shares_memory(scratch("a", (13,)), large)
+    assert scratch("a", (2,), np.uint8).dtype == np.uint8
+
+
+def test_graphs_of_another_layout_are_refused_with_what_makes_them():
+    with pytest.raises(InputError, match=r"people.cell_px = 8, not 4.*dddas export --graph people.*people.cell_px=4"):
+        OnboardRecognizer(PeopleKnobs(cell_px=4), read_classifier("opencv", 3780))
+
+
+@pytest.mark.parametrize(("x", "y"), [(-40, 8), (-200, -160), (136, 0), (176, 200), (-16, -300)])
+def test_a_part_that_reaches_out_of_the_picture_sees_it_reflected(x: int, y: int):
+    """Even one that lies beyond it altogether."""
+    image = picture(5, 180, 150)
+    border = 400
+    wide = cv2.copyMakeBorder(image, border, border, border, border, cv2.BORDER_REFLECT_101)
+    found = scored(image, Part((150, 180), x, y, 72, 144))
+    wanted = scored(wide, Part(wide.shape[1::-1], border + x, border + y, 72, 144))
+    assert found.shape == (3, 2)
+    np.testing.assert_allclose(found, wanted, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("text", [None, "", "[]", '{"graphs": {}}', '{"layout": null}'])
+def test_a_folder_without_graphs_is_refused(tmp_path: Path, text: str | None):
+    if text is not None:
+        (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(InputError, match=r"people.graphs: .*dddas export"):
+        OnboardRecognizer(PeopleKnobs(graphs=str(tmp_path)), SVM)
+
+
+def test_a_manifest_without_its_graphs_is_refused(tmp_path: Path):
+    shutil.copy(SHIPPED / "manifest.json", tmp_path)
+    with pytest.raises(InputError, match=r"people_histograms.onnx"):
+        OnboardRecognizer(PeopleKnobs(graphs=str(tmp_path)), SVM)
+
+
+def test_the_shipped_graphs_are_small_and_fit_the_default_settings():
+    assert sum(path.stat().st_size for path in SHIPPED.glob("*.onnx")) < 100_000
+    made_for = manifest(SHIPPED)["graphs"]["people_scores.onnx"]["knobs"]
+    assert made_for == {name: int(getattr(PeopleKnobs(), name)) for name in onboard_people.BAKED}
+
+
+def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
+    """In a process of its own, on two threads: torch is not imported, resident memory is flat and below 150 MB."""
+    script = textwrap.dedent("""
+        import json, sys
+        from pathlib import Path
+        import cv2
+        import numpy as np
+        from torchvision_dddas.config import PeopleKnobs
+        from torchvision_dddas.people.classifiers import read_classifier
+        from torchvision_dddas.targets import scan
+        from torchvision_dddas.people.scorer import load_recognizer
+
+        def peak_mb():
+            lines = Path("/proc/self/status").read_text().splitlines()
+            return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+
+        cv2.setNumThreads(2)
+        knobs = PeopleKnobs(scale_step=1.2)
+        recognizer = load_recognizer("auto", knobs, read_classifier("opencv", 3780))
+        image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+        peaks = []
+        for _ in range(6):
+            recognizer.scores([image], [scan.everywhere((640, 480), knobs)])
+            peaks.append(peak_mb())
+        print(json.dumps({"name": recognizer.name, "torch": "torch" in sys.modules, "peaks": peaks}))
+    """)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["name"] == "onboard" and not found["torch"]
+    assert found["peaks"][-1] < 150
+    assert found["peaks"][-1] - found["peaks"][2] < 5

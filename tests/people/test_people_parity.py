@@ -1,0 +1,316 @@
+"""Both back ends score every window as cv2.HOGDescriptor does, wherever and with whatever else they are asked to."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as effort
+from hypothesis import strategies as st
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people import suppression as suppress
+from torchvision_dddas.people import torch_scorer as torch_people
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.scorer import Recognizer, load_recognizer
+from torchvision_dddas.people.torch_scorer import TorchRecognizer
+from torchvision_dddas.types import LinearSvm, Part
+
+BACK_ENDS = "torch", "onboard"
+SVM = read_classifier("opencv", 3780)
+# What OpenCV does unless told otherwise, whatever the project's defaults.
+PLAIN: dict[str, Any] = {"enlarge": 1.0, "padding_px": 0, "window_stride_px": 8, "scale_step": 1.05, "threshold": 0.0}
+
+
+def scene(seed: int, height: int, width: int) -> np.ndarray:
+    """Blurred noise in colour, with upright figures before it."""
+    random = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(random.normal(size=(height, width, 3)), (0, 0), 2.5)
+    picture = (128 + 35 * noise / noise.std()).clip(0, 255).astype(np.uint8)
+    for _ in range(4):
+        tall = int(random.integers(80, 150))
+        x, y = int(random.integers(20, width - 20)), int(random.integers(10, max(11, height - tall)))
+        shade = random.integers(0, 256, 3).tolist()
+        cv2.ellipse(picture, (x, y + tall // 3), (tall // 8, tall // 4), 0, 0, 360, shade, -1, cv2.LINE_AA)
+        cv2.circle(picture, (x, y + tall // 14), tall // 13, shade, -1, cv2.LINE_AA)
+        for side in (-1, 1):
+            cv2.line(picture, (x + side * 4, y + tall // 2), (x + side * tall // 10, y + tall), shade, tall // 13)
+    return picture
+
+
+def descriptor(knobs: PeopleKnobs) -> cv2.HOGDescriptor:
+    window = knobs.window_width_px, knobs.window_height_px
+    block, stride, cell = ((side, side) for side in (knobs.block_px, knobs.block_stride_px, knobs.cell_px))
+    return cv2.HOGDescriptor(
+        window, block, stride, cell, knobs.bins, 1, -1, 0, knobs.clip, knobs.gamma, knobs.max_levels, knobs.signed
+    )
+
+
+def opencv(knobs: PeopleKnobs, svm: LinearSvm) -> cv2.HOGDescriptor:
+    made = descriptor(knobs)
+    made.setSVMDetector(np.append(svm.weights, svm.bias).astype(np.float32))
+    return made
+
+
+def opencv_map(level: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm = SVM) -> np.ndarray:
+    """Of every window of a level."""
+    stride, pad = knobs.window_stride_px, knobs.padding_px
+    hits = opencv(knobs, svm).detect(level, -1e9, (stride, stride), (pad, pad))
+    places, found = (np.asarray(hit) for hit in hits)
+    columns, rows = ((places + pad) // stride).T
+    wanted = np.full((rows.max() + 1, columns.max() + 1), np.nan)
+    wanted[rows, columns] = found.ravel()
+    assert not np.isnan(wanted).any()
+    return wanted
+
+
+def random_svm(knobs: PeopleKnobs) -> LinearSvm:
+    """Of mixed signs, so that about half of all windows score above zero."""
+    weights = descriptor(knobs).getDescriptorSize()
+    return LinearSvm((np.random.default_rng(0).normal(size=weights) * 6 / weights**0.5).astype(np.float32), -0.05)
+
+
+def same(maps: list[np.ndarray], others: list[np.ndarray], within: float = 2e-5) -> None:
+    for one, other in zip(maps, others, strict=True):
+        assert one.shape == other.shape and one.dtype == other.dtype == np.float32
+        np.testing.assert_allclose(one, other, atol=within, rtol=0)
+
+
+KNOBS = {
+    "as opencv": {},
+    "padding": {"padding_px": 32},
+    "half a block stride": {"window_stride_px": 4, "padding_px": 16},
+    "no multiple of the block stride": {"window_stride_px": 12, "padding_px": 12},
+    "enlarged": {"enlarge": 1.5, "scale_step": 1.2},
+    "more padding than picture": {"padding_px": 256, "window_stride_px": 16, "scale_step": 1.25},
+}
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+@pytest.mark.parametrize("given", KNOBS.values(), ids=KNOBS)
+@pytest.mark.parametrize("grey", [False, True])
+def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
+    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1} | given)
+    picture = scene(0, 171, 203)
+    picture = picture[..., 1].copy() if grey else picture
+    parts = scan.everywhere((203, 171), knobs)
+    (maps,) = load_recognizer(backend, knobs, SVM).scores([picture], [parts])
+    assert len(maps) == len(parts) >= 2
+    for part, found in zip(parts, maps, strict=True):
+        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
+        wanted = opencv_map(level, knobs)
+        assert found.shape == wanted.shape and found.dtype == np.float32
+        np.testing.assert_allclose(found, wanted, atol=2e-5, rtol=0)
+        assert ((found > 0) == (wanted > 0)).all()
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+@pytest.mark.parametrize("size", [(48, 96), (96, 96), (16, 32)])
+def test_a_window_of_another_size_scores_as_in_opencv(backend, size):
+    knobs = PeopleKnobs(**PLAIN | {"window_width_px": size[0], "window_height_px": size[1], "scale_step": 1.3})
+    svm = random_svm(knobs)
+    picture = scene(1, 120, 150)
+    parts = scan.everywhere((150, 120), knobs)
+    (maps,) = load_recognizer(backend, knobs, svm).scores([picture], [parts])
+    for part, found in zip(parts, maps, strict=True):
+        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
+        np.testing.assert_allclose(found, opencv_map(level, knobs, svm), atol=5e-5, rtol=0)
+
+
+LAYOUTS = {
+    "small": {"cell_px": 4, "block_px": 8, "block_stride_px": 4, "window_width_px": 32, "window_height_px": 64},
+    "signed": {"signed": True, "bins": 18},
+    "no gamma": {"gamma": False},
+    "large cells": {"cell_px": 16, "block_px": 32, "block_stride_px": 16, "bins": 6},
+}
+
+
+@pytest.mark.parametrize("stride", [4, 6, 16])
+@pytest.mark.parametrize("given", LAYOUTS.values(), ids=LAYOUTS)
+def test_another_descriptor_scores_as_in_opencv_at_any_stride(given, stride):
+    knobs = PeopleKnobs(**PLAIN | given | {"window_stride_px": stride, "padding_px": stride, "scale_step": 1.5})
+    svm = random_svm(knobs)
+    picture = scene(2, 140, 160)
+    parts = scan.everywhere((160, 140), knobs)
+    (maps,) = load_recognizer("torch", knobs, svm).scores([picture], [parts])
+    for part, found in zip(parts, maps, strict=True):
+        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
+        np.testing.assert_allclose(found, opencv_map(level, knobs, svm), atol=1e-4, rtol=0)
+
+
+@pytest.fixture(scope="module", params=BACK_ENDS)
+def recognizer(request) -> Recognizer:
+    return load_recognizer(request.param, PeopleKnobs(**PLAIN), SVM)
+
+
+@effort(max_examples=25, deadline=None)
+@given(st.data())
+def test_a_part_scores_as_in_a_search_everywhere(recognizer, data):
+    knobs = PeopleKnobs(**PLAIN | {"padding_px": 16, "scale_step": 1.1})
+    picture = scene(3, 160, 190)
+    whole = data.draw(st.sampled_from(scan.everywhere((190, 160), knobs)))
+    stride = knobs.window_stride_px
+    column = data.draw(st.integers(0, (whole.width - 64) // stride))
+    row = data.draw(st.integers(0, (whole.height - 128) // stride))
+    width = data.draw(st.integers(64, whole.width - column * stride))
+    height = data.draw(st.integers(128, whole.height - row * stride))
+    part = Part(whole.level, whole.x + column * stride, whole.y + row * stride, width, height)
+    ((everywhere, found),) = recognizer.scores([picture], [[whole, part]])
+    down, across = (height - 128) // stride + 1, (width - 64) // stride + 1
+    same([found], [everywhere[row : row + down, column : column + across]])
+
+
+def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
+    pictures = [scene(4, 150, 170), scene(5, 150, 170), scene(6, 150, 170)[..., 0].copy(), scene(7, 180, 140)]
+    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1})
+    parts = [
+        scan.everywhere(picture.shape[1::-1], knobs)[::step]
+        for picture, step in zip(pictures, (1, 2, 1, 1), strict=True)
+    ]
+    parts[1] = parts[1][::-1]
+    together = recognizer.scores(pictures, parts)
+    assert [len(maps) for maps in together] == [len(wanted) for wanted in parts]
+    for picture, wanted, maps in zip(pictures, parts, together, strict=True):
+        same(maps, recognizer.scores([picture], [wanted])[0], within=2e-6)
+
+
+def test_how_many_pictures_share_a_batch_changes_nothing(monkeypatch):
+    recognizer = TorchRecognizer(PeopleKnobs(**PLAIN), SVM, "cpu")
+    pictures, part = [scene(seed, 140, 90) for seed in range(5)], Part((84, 131), 0, 0, 84, 131)
+    at_once = recognizer.scores(pictures, [[part]] * 5)
+    monkeypatch.setattr(torch_people, "_PIXELS", {"cpu": 2 * 84 * 131})
+    for maps, others in zip(at_once, recognizer.scores(pictures, [[part]] * 5), strict=True):
+        same(maps, others, within=2e-6)
+    assert len({maps[0][0, 0].item() for maps in at_once}) == 5
+
+
+def test_nothing_asked_for_is_nothing_found(recognizer):
+    assert recognizer.scores([], []) == []
+    assert recognizer.scores([scene(0, 130, 70)], [[]]) == [[]]
+
+
+@pytest.mark.parametrize("size", [(63, 200), (200, 127), (8, 8)])
+def test_a_part_smaller_than_the_window_has_an_empty_map(recognizer, size):
+    ((found,),) = recognizer.scores([scene(0, 210, 220)], [[Part((220, 210), 0, 0, *size)]])
+    assert found.size == 0 and found.ndim == 2
+
+
+def test_a_grey_picture_scores_as_one_of_three_equal_channels(recognizer):
+    picture = scene(8, 140, 100)[..., 1].copy()
+    part = Part((100, 140), 0, 0, 100, 140)
+    grey, colour = recognizer.scores([picture, cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)], [[part]] * 2)
+    same(grey, colour, within=2e-6)
+
+
+def test_a_view_into_a_larger_picture_scores_as_its_copy(recognizer):
+    picture = scene(9, 300, 260)[20:180, ::2]
+    part = Part((130, 160), 0, 0, 130, 160)
+    view, copied = recognizer.scores([picture, picture.copy()], [[part]] * 2)
+    same(view, copied, within=2e-6)
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+@pytest.mark.parametrize(
+    ("stride", "pad", "step", "least"), [(8, 0, 1.05, 2), (8, 32, 1.05, 2), (4, 8, 1.1, 3), (8, 8, 1.2, 0)]
+)
+def test_detections_by_opencvs_grouping_are_opencvs(backend, stride, pad, step, least):
+    knobs = PeopleKnobs(
+        **PLAIN | {"window_stride_px": stride, "padding_px": pad, "scale_step": step, "threshold": -0.3},
+        suppression="opencv",
+        group=least,
+    )
+    assert same_boxes(scene(10, 233, 311), knobs, SVM, backend) >= 2
+
+
+SMALL: dict[str, Any] = {
+    "window_width_px": 16,
+    "window_height_px": 32,
+    "cell_px": 4,
+    "block_px": 8,
+    "block_stride_px": 4,
+}
+
+
+@effort(max_examples=40, deadline=None)
+@given(
+    size=st.tuples(st.integers(16, 80), st.integers(32, 80)),
+    stride=st.sampled_from([2, 4, 5, 6, 8]),
+    pads=st.integers(0, 3),
+    step=st.sampled_from([1.05, 1.1, 1.2, 1.37]),
+    threshold=st.floats(0, 0.8),
+    least=st.integers(0, 3),
+    seed=st.integers(0, 10_000),
+)
+def test_detections_in_any_picture_are_opencvs(size, stride, pads, step, threshold, least, seed):
+    knobs = PeopleKnobs(
+        **PLAIN | SMALL | {"window_stride_px": stride, "padding_px": pads * stride, "scale_step": step},
+        suppression="opencv",
+        group=least,
+    )
+    noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), np.uint8)
+    picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), noise, 0, 255, cv2.NORM_MINMAX)
+    svm = random_svm(knobs)
+    # No window scores so near the threshold that the order of a sum decides.
+    (maps,) = load_recognizer("torch", knobs, svm).scores([picture], [scan.everywhere(size, knobs)])
+    near = np.sort(np.concatenate([scored.ravel() for scored in maps]))
+    near = np.concatenate([[threshold], near[(near > threshold) & (near < threshold + 0.1)], [threshold + 0.1]])
+    widest = int(np.diff(near).argmax())
+    middle = float(near[widest] + near[widest + 1]) / 2
+    same_boxes(picture, knobs.model_copy(update={"threshold": middle}), svm, "torch")
+
+
+def same_boxes(picture: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm, backend: str) -> int:
+    """Asserts that grouped detections are those of detectMultiScale, and says how many there are."""
+    size, stride, pad = picture.shape[1::-1], knobs.window_stride_px, knobs.padding_px
+    rectangles, weights = opencv(knobs, svm).detectMultiScale(
+        picture,
+        hitThreshold=knobs.threshold,
+        winStride=(stride, stride),
+        padding=(pad, pad),
+        scale=knobs.scale_step,
+        groupThreshold=knobs.group,
+    )
+    wanted = np.column_stack([np.reshape(rectangles, (-1, 4)), np.ravel(weights)])
+    parts = scan.everywhere(size, knobs)
+    (maps,) = load_recognizer(backend, knobs, svm).scores([picture], [parts])
+    boxes, scores = suppress.group(*scan.windows(parts, maps, size, knobs), knobs.group, knobs.group_distance)
+    # OpenCV cuts the boxes at the picture's border, last of all; here a body's place in its window needs all of it.
+    low, high = np.maximum(boxes[:, :2], 0), np.minimum(boxes[:, :2] + boxes[:, 2:], size)
+    found = np.column_stack([low, high - low, scores])[(high > low).all(axis=1)]
+    # OpenCV's order is that in which its threads end.
+    order, own = np.lexsort(wanted.T[::-1]), np.lexsort(found.T[::-1])
+    np.testing.assert_allclose(found[own], wanted[order], atol=5e-5, rtol=0)
+    return len(wanted)
+
+
+def test_gradients_reach_the_levels_of_the_picture_and_the_weights():
+    recognizer = TorchRecognizer(PeopleKnobs(), SVM, "cpu")
+    recognizer.weights.requires_grad_()
+    picture = torch.from_numpy(scene(11, 150, 90)).permute(2, 0, 1)[None].float().requires_grad_()
+    found = recognizer.score(picture, Part((80, 134), 0, 0, 80, 134))
+    assert found.shape == (1, 1, 3)
+    levels, weights = torch.autograd.grad(found.sum(), [picture, recognizer.weights])
+    assert levels.isfinite().all() and (levels != 0).float().mean() > 0.5
+    assert weights.isfinite().all() and (weights != 0).any(-1).all()
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+def test_a_classifier_of_another_length_is_refused_with_both_lengths(backend):
+    with pytest.raises(InputError, match=r"file\.txt has 3000 weights.* has 3780"):
+        load_recognizer(backend, PeopleKnobs(), LinearSvm(np.zeros(3000, np.float32), 0.0, "file.txt"))
+
+
+@pytest.mark.parametrize("backend", BACK_ENDS)
+def test_pictures_that_must_not_be_written_to_or_lie_otherwise_in_memory_score_the_same(backend, recwarn):
+    picture, parts = scene(12, 150, 90), [Part((90, 150), 0, 0, 90, 150)]
+    locked = picture.copy()
+    locked.flags.writeable = False
+    others = [locked, np.asfortranarray(picture), np.ascontiguousarray(picture[:, ::-1])[:, ::-1]]
+    wanted, *found = load_recognizer(backend, PeopleKnobs(), SVM).scores([picture, *others], [parts] * 4)
+    for scored in found:
+        np.testing.assert_array_equal(scored[0], wanted[0])
+    assert not recwarn.list

@@ -1,0 +1,187 @@
+"""People along a clip: every frame in order, whatever the batch, and clear words for what is no picture."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import PeopleKnobs, Settings
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.people.detector import UNREAD, checked, people_in, recognize
+from torchvision_dddas.types import Frame, People
+
+SIZE = (320, 240)
+WINDOW = np.array([64, 128])
+
+
+class Brightest:
+    """A recognizer for which a window is a person where its middle is white; it counts what it is asked for."""
+
+    name = "stub"
+
+    def __init__(self):
+        self.calls, self.windows = [], 0
+
+    def scores(self, images, parts):
+        self.calls.append(len(images))
+        return [[self._map(image, part) for part in wanted] for image, wanted in zip(images, parts, strict=True)]
+
+    def _map(self, image, part):
+        level = cv2.resize(image, part.level).astype(np.float32)
+        if level.ndim == 3:
+            level = level.mean(axis=2)
+        nx, ny = (part.width - 64) // 8 + 1, (part.height - 128) // 8 + 1
+        self.windows += nx * ny
+        return np.array(
+            [[level[part.y + 8 * j + 63, part.x + 8 * i + 31] / 127.5 - 1 for i in range(nx)] for j in range(ny)],
+            np.float32,
+        ).reshape(ny, nx)
+
+
+@dataclass
+class Clip:
+    """Frames at hand, some of them missing."""
+
+    numbers: tuple[int, ...] = tuple(range(1, 13))
+    last: int = 12
+    rate_hz: float = 10.0
+    step_px: float = 4.0
+    images: dict = field(default_factory=dict)
+
+    def __iter__(self):
+        for number in self.numbers:
+            image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+            cv2.circle(image, (round(80 + self.step_px * number), 120), 6, (255, 255, 255), -1)
+            yield Frame(number, (number - 1) / self.rate_hz, self.images.get(number, image))
+
+
+def settings(**knobs):
+    return Settings(people=PeopleKnobs(**knobs))
+
+
+def table(rows):
+    rows = np.array(rows, float).reshape(-1, 5)
+    return DetectionTable("t", rows[:, 0].astype(int), rows[:, 1:], np.ones(len(rows)), np.arange(len(rows)))
+
+
+def same(one, other):
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("box_px", "score", "margin", "cut", "window_px")
+    )
+
+
+def test_who_is_there_is_found_where_he_is_in_every_frame():
+    made = list(recognize(Clip(), Brightest(), settings()))
+    assert [r.frame.number for r in made] == list(range(1, 13))
+    for r in made:
+        middle = r.people.window_px[0, :2] + r.people.window_px[0, 2:] / 2
+        assert middle == pytest.approx([80 + 4 * r.frame.number, 120], abs=20)
+        assert (r.regions_px, r.share, r.cause, r.adjustments) == (None, 1.0, "", ())
+        assert set(r.seconds) == {"read", "plan", "score", "people"}
+
+
+@pytest.mark.parametrize("around", [None, table([[n, 60 + 4 * n, 70, 40, 100] for n in (1, 2, 5, 9)])])
+@pytest.mark.parametrize("batch", [2, 5, 40])
+def test_the_result_does_not_depend_on_the_batch(batch, around):
+    clip = Clip(numbers=(1, 2, 3, 5, 6, 9, 10), last=11)
+    alone = list(recognize(clip, Brightest(), settings(), around, batch=1))
+    engine = Brightest()
+    together = list(recognize(clip, engine, settings(), around, batch=batch))
+    assert max(engine.calls) > 1
+    assert [r.frame.number for r in together] == list(range(1, 12))
+    for one, other in zip(alone, together, strict=True):
+        assert same(one.people, other.people)
+        assert (one.share, one.cause) == (other.share, other.cause)
+
+
+def test_in_regions_a_frame_waits_for_the_one_before_and_finds_the_same_with_fewer_windows():
+    whole, parts = Brightest(), Brightest()
+    everywhere = list(recognize(Clip(), whole, settings()))
+    regions = list(recognize(Clip(), parts, settings(search="regions"), batch=8))
+    assert set(parts.calls) == {1}
+    assert parts.windows < 0.5 * whole.windows
+    assert len(everywhere) == len(regions) == 12
+    for r in regions:
+        middle = r.people.window_px[0, :2] + r.people.window_px[0, 2:] / 2
+        assert middle == pytest.approx([80 + 4 * r.frame.number, 120], abs=20)
+    assert [a.frame for r in regions for a in r.adjustments][:1] == [2]
+
+
+def test_frames_that_could_not_be_read_are_black_and_say_so():
+    made = list(recognize(Clip(numbers=(2, 3, 6), last=8), Brightest(), settings(), batch=2))
+    assert [r.frame.number for r in made] == list(range(1, 9))
+    unread = [r for r in made if r.cause]
+    assert [r.frame.number for r in unread] == [1, 4, 5, 7, 8]
+    for r in unread:
+        assert (r.cause, len(r.people), r.share) == (UNREAD, 0, 0)
+        assert r.frame.image.shape == (SIZE[1], SIZE[0], 3) and not r.frame.image.any()
+        assert r.frame.time_s == pytest.approx((r.frame.number - 1) / 10)
+
+
+def test_around_a_table_nobody_is_found_elsewhere():
+    boxes = table([[2, 68, 70, 40, 100], [3, 200, 70, 40, 100]])
+    made = {r.frame.number: r for r in recognize(Clip(), Brightest(), settings(), boxes)}
+    assert len(made[2].people) and not len(made[3].people)
+    assert made[1].share == 0 and len(made[1].people) == 0
+    assert 0 < made[2].share < 1
+    assert made[2].regions_px is not None and made[2].regions_px.shape == (1, 4)
+
+
+def test_pictures_of_any_size_go_together():
+    clip = Clip(numbers=(1, 2), last=2, images={2: np.zeros((150, 90), np.uint8)})
+    made = list(recognize(clip, Brightest(), settings(), batch=2))
+    assert len(made[0].people) and not len(made[1].people)
+
+
+def test_a_picture_smaller_than_the_window_is_one_line_with_both_sizes():
+    small = Clip(numbers=(1,), last=1, images={1: np.zeros((100, 60), np.uint8)})
+    with pytest.raises(InputError, match=r"60 x 100 px.* smaller than the window of 64 x 128 px.*people\.enlarge"):
+        list(recognize(small, Brightest(), settings(enlarge=1.0)))
+    assert len(list(recognize(small, Brightest(), settings(enlarge=1.5)))) == 1
+
+
+BAD_PICTURES = [
+    (np.zeros((200, 100), np.float32), "frame 1 holds float32 pixels; wanted 8 bits"),
+    (np.full((200, 100, 3), np.nan), "frame 1 holds float64 pixels, NaN among them"),
+    (np.zeros((200, 100), np.uint16), "uint16"),
+    (np.zeros((200, 100, 4), np.uint8), "200 x 100 x 4; wanted height x width, or these x 1 or 3 channels"),
+    (np.zeros((1, 3, 200, 100), np.uint8), "1 x 3 x 200 x 100"),
+    (np.zeros(0, np.uint8), "an array of 0"),
+    (np.zeros((0, 100), np.uint8), "0 x 100"),
+    (np.uint8(3), "a single uint8; wanted height x width"),
+    (None, "is None; could its file be read?"),
+]
+
+
+@pytest.mark.parametrize(("image", "says"), BAD_PICTURES)
+def test_what_is_no_picture_is_one_line(image, says):
+    with pytest.raises(InputError) as error:
+        list(recognize(Clip(numbers=(1,), images={1: image}), Brightest(), settings()))
+    assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
+    images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
+    with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
+        people_in(images, Brightest(), PeopleKnobs())
+
+
+def test_one_channel_is_grey():
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4, 1)
+    assert np.array_equal(checked(image, "it"), image[..., 0])
+
+
+def test_pictures_at_hand_give_the_people_of_the_clip():
+    clip = Clip(numbers=(1, 2, 3), last=3)
+    images = [frame.image for frame in clip]
+    for one, r in zip(
+        people_in(images, Brightest(), PeopleKnobs()), recognize(clip, Brightest(), settings()), strict=True
+    ):
+        assert isinstance(one, People) and same(one, r.people)
+
+
+def test_a_clip_without_frames_gives_nothing():
+    assert list(recognize(Clip(numbers=(), last=0), Brightest(), settings())) == []

@@ -1,0 +1,223 @@
+"""Where people are looked for: around those expected, around what moves, and when everywhere."""
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people.search_regions import Expected, Search, around_blobs
+from torchvision_dddas.types import People
+
+SIZE = (640, 480)
+KNOBS = PeopleKnobs(search="regions", rescan_frames=10)
+
+
+def people(*boxes):
+    box_px = np.array(boxes, float).reshape(-1, 4)
+    n = len(box_px)
+    return People(box_px, np.full(n, 0.9), np.ones(n), np.zeros(n, bool), box_px)
+
+
+def walker(frame, x=100.0, speed=4.0):
+    return (x + speed * frame, 200, 40, 110)
+
+
+def looks(search, found, last, first=1):
+    """The looks at frames first .. last, where `found(frame)` is what each finds."""
+    made = {}
+    for frame in range(first, last + 1):
+        made[frame] = search.look(frame, SIZE)
+        search.learn(frame, found(frame), made[frame])
+    return made
+
+
+def inside(box, region):
+    return (box[:2] >= region[:2]).all() and (box[:2] + box[2:] <= region[:2] + region[2:]).all()
+
+
+def test_the_whole_picture_is_searched_in_every_frame_by_default():
+    made = looks(Search(PeopleKnobs()), lambda n: people(walker(n)), 12)
+    assert all(look.regions_px is None and look.share == 1 and not look.adjustments for look in made.values())
+    assert made[5].parts == scan.everywhere(SIZE, PeopleKnobs())
+
+
+def test_a_walker_is_searched_for_where_he_will_be_and_the_first_look_is_at_all():
+    made = looks(Search(KNOBS), lambda n: people(walker(n)), 30)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1]
+    for n in range(2, 31):
+        assert len(made[n].regions_px) == 1 and inside(np.array(walker(n)), made[n].regions_px[0])
+    assert 0.1 < np.mean([look.share for look in made.values()]) < 0.25
+
+
+@pytest.mark.parametrize("rescan", [1, 2, 3, 10, 17, 60])
+def test_every_level_has_its_turn_once_in_a_round_and_no_window_is_searched_twice(rescan):
+    knobs = KNOBS.model_copy(update={"rescan_frames": rescan})
+    everywhere = scan.everywhere(SIZE, knobs)
+    made = looks(Search(knobs), lambda n: people(walker(n)), 1 + 2 * rescan)
+    for begin in (2, 2 + rescan):
+        whole = [part for n in range(begin, begin + rescan) for part in made[n].parts if part in everywhere]
+        assert sorted(whole, key=str) == sorted(everywhere, key=str)
+    for look in made.values():
+        alone = {part.level for part in look.parts if part in everywhere}
+        assert all(part in everywhere for part in look.parts if part.level in alone)
+
+
+def test_levels_that_have_their_turn_after_one_another_are_not_neighbours():
+    search = Search(KNOBS)
+    everywhere = scan.everywhere(SIZE, KNOBS)
+    made = looks(search, lambda n: people(), 12)
+    first = [everywhere.index(made[n].parts[0]) for n in range(2, 12)]
+    assert np.abs(np.diff(first)).min() > 1
+
+
+def test_velocity_is_learnt_and_carries_over_frames_that_show_nobody():
+    expected = Expected(KNOBS)
+    for n in range(1, 21):
+        expected.learn(n, people(walker(n, speed=9)))
+    for n in (21, 22, 23):
+        expected.learn(n, people())
+    assert len(expected) == 1
+    assert expected.box_px(24)[0] == pytest.approx(walker(24, speed=9), abs=4)
+
+
+def test_one_who_is_missed_stays_expected_for_two_rounds_and_a_glimpse_is_soon_forgotten():
+    expected = Expected(KNOBS)
+    for n in range(1, 21):
+        expected.learn(n, people(walker(n)))
+    for n in range(21, 41):
+        expected.learn(n, people())
+        assert len(expected) == 1
+    expected.learn(41, people())
+    assert len(expected) == 0
+    expected.learn(42, people(walker(42)))
+    for n in range(43, 47):
+        expected.learn(n, people())
+        assert len(expected) == 1
+    expected.learn(47, people())
+    assert len(expected) == 0
+
+
+def test_two_who_pass_each_other_keep_their_velocities():
+    expected = Expected(KNOBS)
+    for n in range(1, 31):
+        expected.learn(n, people(walker(n, x=0, speed=6), (*walker(n, x=300, speed=-6)[:1], 230, 40, 110)))
+    assert sorted(expected.velocity_px[:, 0]) == pytest.approx([-6, 6], abs=0.5)
+
+
+def test_people_do_not_depend_on_the_order_in_which_they_are_found():
+    both = [(50, 200, 40, 110), (400, 180, 60, 150)]
+    one, other = Expected(KNOBS), Expected(KNOBS)
+    for n in range(1, 6):
+        one.learn(n, people(*both))
+        other.learn(n, people(*both[:: 1 if n % 2 else -1]))
+    assert len(one) == len(other) == 2
+    assert np.array_equal(
+        one.box_px(6)[np.argsort(one.box_px(6)[:, 0])], other.box_px(6)[np.argsort(other.box_px(6)[:, 0])]
+    )
+
+
+def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost():
+    def found(n):
+        return people(walker(n), (400, 200, 40, 110)) if n < 5 else people()
+
+    made = looks(Search(KNOBS), found, 10)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1, 6]
+    assert [(a.old < 0.2, a.new, a.cause) for a in made[6].adjustments] == [
+        (True, 1.0, "none of 2 people expected was found")
+    ]
+
+
+@pytest.mark.parametrize("share", [0.2, 0.05, 0.01])
+def test_a_bounded_look_takes_its_share_and_a_round_of_them_searches_every_window(share):
+    def found(n):
+        return people(walker(n), (400, 200, 40, 110)) if n < 15 else people()
+
+    search = Search(KNOBS.model_copy(update={"look_share": share}), lambda n: np.array([[100.0, 150, 60, 90]]))
+    everywhere = scan.everywhere(SIZE, KNOBS)
+    most = share * scan.pixels(everywhere)
+    rounds = max(10, int(np.ceil(scan.pixels(scan.tiles(everywhere, most / 2, KNOBS)) / (most / 2))))
+    made = looks(search, found, 2 * rounds)
+    costs = [scan.pixels(look.parts) for look in made.values()]
+    # However little it may cost, one tile and one level of each region are searched.
+    least = 2 * 190 * 260 + 200 * 300 + 3 * 0.04 * 2.25 * 640 * 480
+    assert max(costs) < 1.5 * most + least
+    assert np.mean(costs) < most + least
+    for begin in (1, rounds):
+        seen = {w for n in range(begin, begin + rounds) for part in made[n].parts for w in windows_of(part)}
+        assert seen >= {w for part in everywhere for w in windows_of(part)}
+
+
+def windows_of(part):
+    across, down = (part.width - 64) // 8 + 1, (part.height - 128) // 8 + 1
+    return {(part.level, part.x + 8 * column, part.y + 8 * row) for row in range(down) for column in range(across)}
+
+
+def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():
+    made = looks(Search(KNOBS), lambda n: people(walker(n)), 110)
+    lines = [a for look in made.values() for a in look.adjustments]
+    assert [(a.frame, a.knob, a.old, a.cause) for a in lines] == [(2, "people.regions_share", 1.0, "1 person expected")]
+    assert 0 < lines[0].new < 0.1
+
+
+def test_regions_that_would_cost_nearly_all_are_given_up_for_the_whole_picture():
+    knobs = PeopleKnobs(search="regions", region_margin=5, region_scales=4)
+    made = looks(Search(knobs), lambda n: people(*((x, 150, 60, 150) for x in range(0, 600, 60))), 3)
+    assert all(look.regions_px is None for look in made.values())
+
+
+def test_after_a_gap_longer_than_a_round_the_whole_picture_is_searched():
+    search = Search(KNOBS)
+    looks(search, lambda n: people(walker(n)), 3)
+    assert search.look(13, SIZE).regions_px is not None
+    assert search.look(14, SIZE).regions_px is None
+
+
+def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where_there_are_none():
+    blobs = {1: np.array([[200, 100, 50, 120.0]])}
+    made = looks(Search(PeopleKnobs(), lambda n: blobs.get(n, np.zeros((0, 4)))), lambda n: people(), 25)
+    assert len(made[1].regions_px) == 1 and 0 < made[1].share < 0.2
+    assert all(look.share == 0 and look.parts == [] and len(look.regions_px) == 0 for n, look in made.items() if n > 1)
+
+
+def test_with_blobs_alone_nothing_else_is_searched_however_much_they_cover():
+    blobs = np.array([[x, y, 200, 150.0] for x in range(0, 640, 100) for y in range(0, 480, 100)])
+    look = Search(PeopleKnobs(), lambda n: blobs).look(1, SIZE)
+    assert look.regions_px is not None and len(look.regions_px) == len(blobs)
+    assert look.share > 0.3
+    assert set(look.parts) != set(scan.everywhere(SIZE, PeopleKnobs()))
+
+
+def test_with_blobs_and_regions_both_are_searched_and_the_whole_picture_at_first():
+    blob = np.array([[400, 100, 50, 120.0]])
+    made = looks(Search(KNOBS, lambda n: blob), lambda n: people(walker(n)), 12)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1]
+    assert all(np.shape(made[n].regions_px) == (2, 4) for n in range(2, 13))
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 1.7, 2.5])
+def test_bodies_from_half_a_blob_to_those_of_which_it_is_the_legs_are_looked_for(share):
+    blob = np.array([200, 160, 40, 100.0])
+    regions_px, heights_px = around_blobs(blob[None])
+    height = share * blob[3]
+    standing = blob[1] + blob[3] + (5 if share > 1 else 0) - height  # legs alone are at the lower end
+    body = np.array([blob[0] + 20 - 0.2 * height, standing, 0.4 * height, height])
+    assert heights_px[0, 0] <= height <= heights_px[0, 1]
+    assert inside(body, regions_px[0])
+
+
+def test_a_blob_that_those_expected_explain_is_not_searched_again():
+    blob = np.array([[0, 220, 30, 80.0], [400, 220, 30, 80]])
+
+    def blobs(n):
+        return blob + np.array([4.0 * n + 105, 0, 0, 0])
+
+    search = Search(KNOBS, blobs)
+    made = looks(search, lambda n: people(walker(n)), 6)
+    assert len(made[6].regions_px) == 2
+    assert inside(np.array(walker(6)), made[6].regions_px[0])
+    assert inside(blobs(6)[1], made[6].regions_px[1])
+
+
+def test_no_blob_gives_no_region():
+    regions_px, heights_px = around_blobs(np.zeros((0, 4)))
+    assert (regions_px.shape, heights_px.shape) == ((0, 4), (0, 2))

@@ -1,0 +1,119 @@
+"""The camera's motion between frames that are looked at."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import Settings
+from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.geometry import chain, corner_error, transfer
+from torchvision_dddas.simulation.scene import render
+from torchvision_dddas.tracking.camera_motion import Camera
+
+
+class Counted:
+    """A back end that counts its registrations."""
+
+    def __init__(self) -> None:
+        self.vision, self.count = load_engine("onboard", Settings()), 0
+        self.name, self.knobs = self.vision.name, self.vision.knobs
+        self.prepare, self.foreground = self.vision.prepare, self.vision.foreground
+
+    def register(self, pairs):
+        self.count += len(pairs)
+        return self.vision.register(pairs)
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """A large picture of the simulator's ground."""
+    return cv2.resize(render(3, 1, (640, 480)).images[0], (1600, 1200), interpolation=cv2.INTER_CUBIC)
+
+
+def seen(ground, ground_from_image, noise=0, size=(640, 480)):
+    image = cv2.warpPerspective(ground, ground_from_image, size, flags=cv2.INTER_AREA | cv2.WARP_INVERSE_MAP)
+    return np.clip(image + np.random.default_rng(noise).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+def shift(x, y=0.0):
+    return np.array([[1, 0, 300 + x], [0, 1, 200 + y], [0, 0, 1.0]])
+
+
+def test_a_camera_that_stands_still_is_never_registered(ground):
+    vision = Counted()
+    camera = Camera(vision)
+    assert [camera.step(seen(ground, shift(0), k)) for k in range(40)] == [(None, "")] * 40
+    assert vision.count == 0
+
+
+def test_a_large_target_before_a_standing_camera_moves_nothing(ground):
+    camera = Camera(Counted())
+    for k in range(6):
+        image = seen(ground, shift(0), k)
+        image[180:460, 40 + 25 * k : 260 + 25 * k] = image[100:380, 300:520]
+        now_from_before, cause = camera.step(image)
+        assert cause == ""
+        assert now_from_before is None or corner_error(now_from_before, np.eye(3), (640, 480)) < 0.5
+
+
+@pytest.mark.parametrize("speed_px", [0.05, 0.2, 0.7, 6.0])
+def test_a_pan_however_slow_is_not_lost(ground, speed_px):
+    """What has been followed so far never differs from what was panned by more than the stillness that is allowed."""
+    vision, steps = Counted(), []
+    camera, looks = Camera(vision), 30
+    for k in range(looks):
+        now_from_before, cause = camera.step(seen(ground, shift(speed_px * k), k))
+        assert cause == ""
+        steps += [] if now_from_before is None else [now_from_before]
+        followed = transfer(chain(steps), np.array([[320.0, 240.0]]))[0]
+        assert np.abs(followed - (320 - speed_px * k, 240)).max() < 0.25 + 0.01 * k
+    assert vision.count < looks * min(1, 8 * speed_px)
+
+
+@pytest.mark.parametrize("turn", ["zoom", "roll"])
+def test_a_zoom_or_roll_about_the_middle_is_seen(ground, turn):
+    camera = Camera(Counted())
+    to = cv2.getRotationMatrix2D((320, 240), 1.0 * (turn == "roll"), 1.01 if turn == "zoom" else 1.0)
+    true = np.vstack([to, [0, 0, 1]])
+    camera.step(seen(ground, shift(0), 1))
+    now_from_before, cause = camera.step(seen(ground, shift(0) @ np.linalg.inv(true), 2))
+    assert cause == ""
+    assert now_from_before is not None
+    assert corner_error(now_from_before, true, (640, 480)) < 0.5
+
+
+@pytest.mark.parametrize("size", [(640, 480), (300, 200), (801, 607)])
+def test_the_motion_is_that_of_the_picture_s_own_pixels_whatever_its_size(ground, size):
+    camera = Camera(Counted())
+    camera.step(seen(ground, shift(0), 1, size))
+    now_from_before, _ = camera.step(seen(ground, shift(7, -4), 2, size))
+    assert now_from_before is not None
+    assert corner_error(now_from_before, np.array([[1, 0, -7], [0, 1, 4], [0, 0, 1.0]]), size) < 0.4
+
+
+def test_a_picture_that_shows_nothing_costs_no_motion(ground):
+    """The pan goes on behind it: what the next picture is told makes up for the step that was not known."""
+    camera, moved = Camera(Counted()), np.eye(3)
+    for k in range(8):
+        image = seen(ground, shift(12.0 * k), k)
+        now_from_before, cause = camera.step(np.zeros_like(image) if k == 4 else image)
+        assert bool(cause) == (k == 4)
+        moved = moved if now_from_before is None else now_from_before @ moved
+    assert corner_error(moved, np.array([[1, 0, -84.0], [0, 1, 0], [0, 0, 1]]), (640, 480)) < 1.0
+
+
+def test_a_cut_is_unknown_with_a_cause_and_the_next_step_is_known_again(ground):
+    camera = Camera(Counted())
+    camera.step(seen(ground, shift(0)))
+    now_from_before, cause = camera.step(np.random.default_rng(5).integers(0, 255, (480, 640, 3), np.uint8))
+    assert (now_from_before, cause != "") == (None, True)
+    camera.step(seen(ground, shift(0), 1))
+    assert camera.step(seen(ground, shift(0), 2)) == (None, "")
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (48, 64, 3), (3, 90, 3), (1, 1)])
+def test_grey_blank_and_tiny_pictures_pass(shape):
+    camera = Camera(Counted())
+    for _ in range(3):
+        now_from_before, _ = camera.step(np.full(shape, 90, np.uint8))
+        assert now_from_before is None

@@ -1,0 +1,221 @@
+"""The source's association on small scenes, its identities, and where it fails."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchvision_dddas.config import PaperKnobs, Settings, load_config, with_knobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
+from torchvision_dddas.tracking import jaccard
+from torchvision_dddas.tracking.gating import gate
+from torchvision_dddas.tracking.source_tracker import Look, PaperTracker, assign, associate, inherited
+from torchvision_dddas.types import Detections
+
+SIZE = (20.0, 40.0)
+
+
+def at(*centres: tuple[float, float]) -> Detections:
+    box = np.array([(u - SIZE[0] / 2, v - SIZE[1] / 2, *SIZE) for u, v in centres]).reshape(-1, 4)
+    return Detections(box, np.ones(len(box)))
+
+
+def coloured(*levels: int) -> Callable[[], np.ndarray]:
+    """One level in each channel a target."""
+    counts = np.zeros((len(levels), 3, 256))
+    counts[np.arange(len(levels)), :, levels] = 800
+    return lambda: counts.reshape(-1, 768)
+
+
+def never() -> np.ndarray:
+    raise AssertionError("histograms were made")
+
+
+def knobs(**values: object) -> PaperKnobs:
+    return PaperKnobs.model_validate(values)
+
+
+def tracked(frames: Sequence[Detections], appearance: Sequence | None = None, **values: object) -> list[list[int]]:
+    """The identities of each frame's targets."""
+    tracker = PaperTracker(with_knobs(Settings(), {f"paper.{k}": v for k, v in values.items()}), 5)
+    found = []
+    for number, detections in enumerate(frames):
+        (tracks,) = tracker.feed(1 + 5 * number, detections, None, appearance[number] if appearance else None)
+        assert tracks.frame == 1 + 5 * number
+        assert tracks.row.tolist() == list(range(len(detections)))
+        found.append(tracks.identity.tolist())
+    assert tracker.end() == []
+    return found
+
+
+@pytest.mark.parametrize("window", [2, 3])
+def test_targets_keep_their_identities_whatever_order_they_come_in(window):
+    frames = [at((100, 100), (400, 300)), at((410, 300), (105, 100)), at((110, 100), (420, 300))]
+    assert tracked(frames, window=window) == [[1, 2], [2, 1], [1, 2]]
+
+
+def test_a_newcomer_gets_a_new_identity_and_a_lost_one_is_never_given_again():
+    frames = [at((100, 100)), at((100, 100), (600, 500)), at((600, 500)), at((600, 500), (20, 20))]
+    assert tracked(frames, window=2) == [[1], [1, 2], [2], [2, 3]]
+
+
+@pytest.mark.parametrize(("window", "back"), [(2, 3), (3, 1)])
+def test_three_frames_bridge_one_that_missed_a_target_two_do_not(window, back):
+    frames = [at((50, 50), (600, 500)), at((600, 500)), at((50, 52), (600, 500))]
+    assert tracked(frames, window=window)[2] == [back, 2]
+
+
+def test_histograms_are_not_made_while_targets_are_scattered_and_once_when_they_are_close():
+    scattered, close = at((20, 40), (100, 100), (400, 300)), at((400, 300), (404, 300), (100, 100))
+    tracked([scattered] * 4, [never] * 4)
+    made: list[int] = []
+
+    def counted(number: int) -> Callable[[], np.ndarray]:
+        def make() -> np.ndarray:
+            made.append(number)
+            return coloured(1, 2, 3)()
+
+        return make
+
+    tracked([scattered, scattered, close, close], [counted(n) for n in range(4)])
+    assert sorted(made) == [0, 1, 2, 3]
+
+
+def test_without_pictures_location_alone_decides():
+    frames = [Look(at((400, 300), (404, 300)).box_px, None), Look(at((404, 300), (400, 300)).box_px, None)]
+    for rule in ("dispersion", "fixed"):
+        found = associate(frames, knobs(window=2, rule=rule, weight=0.0))
+        assert (found.weight, found.appearance_dispersion) == (1.0, None)
+        assert found.rows.tolist() == [[1, 2], [2, 1]]
+
+
+def test_appearance_tells_apart_who_changed_places():
+    frames = [Look(at((400, 300), (404, 300)).box_px, coloured(*c)) for c in ((10, 200), (200, 10))]
+    found = associate(frames, knobs(window=2))
+    assert (found.weight, found.location_dispersion, found.appearance_dispersion) == (0.0, 0.0, 1.0)
+    assert found.rows.tolist() == [[1, 2], [2, 1]]
+
+
+def test_counts_tell_a_large_box_from_a_small_one_and_shares_do_not():
+    small, large = coloured(10)(), 3 * coloured(10)()
+    close = at((400, 300), (404, 300)).box_px
+    looks = [Look(close, partial(np.concatenate, both)) for both in ((small, large), (large, small))]
+    by_count = associate(looks, knobs(window=2, rule="fixed", weight=0.0, histogram="count"))
+    assert by_count.rows.tolist() == [[1, 2], [2, 1]]
+    shares = [look.histogram("channel") for look in looks]
+    np.testing.assert_array_equal(jaccard.similarity(*shares), np.ones((2, 2)))
+
+
+def test_histograms_of_another_shape_are_refused_in_one_line():
+    look = Look(at((400, 300), (404, 300)).box_px, lambda: np.zeros((2, 240)))
+    with pytest.raises(InputError, match=r"\(2, 768\).*got \(2, 240\)"):
+        look.histogram("channel")
+
+
+def test_gating_features_or_their_sum_by_hand():
+    location, appearance = (np.pad(np.array([[s]]), ((1, 0), (1, 0))) for s in (0.5, 0.9))
+    # Features: the pair 0.7 · 0.5 + 0.3 · 0.9 = 0.62 against two dummies at 0.7 · 0.6. The sum: 0.62 is not below 0.6.
+    assert assign(location, appearance, 0.7, knobs(window=2)).tolist() == [[0, 1], [1, 0]]
+    assert assign(location, appearance, 0.7, knobs(window=2, gated="affinity")).tolist() == [[1, 1]]
+
+
+@given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 1000), st.floats(0.1, 0.9))
+@settings(max_examples=60, deadline=None)
+def test_pairs_are_the_best_of_all_assignments_with_the_dummy(count, older, seed, threshold):
+    score = np.pad(np.random.default_rng(seed).random((count, older)), ((1, 0), (1, 0)))
+    gated = gate(score, threshold, "one_dummy")
+    found = assign(score, None, 1.0, knobs(window=2, threshold=threshold))
+    for axis, size in enumerate((count, older)):
+        assert sorted(found[found[:, axis] > 0, axis]) == list(range(1, size + 1))
+    best = max(
+        sum(gated[i + 1, j + 1] for i, j in zip(some, others, strict=True))
+        + sum(gated[i + 1, 0] for i in range(count) if i not in some)
+        + sum(gated[0, j + 1] for j in range(older) if j not in others)
+        for size in range(min(count, older) + 1)
+        for some in combinations(range(count), size)
+        for others in permutations(range(older), size)
+    )
+    assert gated[tuple(found.T)].sum() == pytest.approx(best)
+
+
+@given(st.lists(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 60)), max_size=4), max_size=6), st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_no_identity_stands_twice_in_a_frame_and_none_is_zero(scene, exact):
+    """Identical boxes, empty frames and all."""
+    for identities in tracked([at(*centres) for centres in scene], exact_targets=12 * exact):
+        assert len(set(identities)) == len(identities)
+        assert 0 not in identities
+
+
+@pytest.mark.parametrize("window", [2, 3])
+@pytest.mark.parametrize("frames", [[at()] * 4, [at((50, 50))] * 5, [at(), at((5, 5)), at(), at((5, 5), (5, 5))]])
+def test_empty_frames_one_target_for_ever_and_two_identical_boxes(frames, window):
+    found = tracked(frames, [never if not len(f) else coloured(*range(len(f))) for f in frames], window=window)
+    assert [len(identities) for identities in found] == [len(f) for f in frames]
+    if all(len(f) == 1 for f in frames):
+        assert found == [[1]] * len(frames)
+
+
+def test_the_newest_link_names_a_target_before_a_bridge_does():
+    """1 → 1 → 1 holds the identity that the bridge of 2 would take as well."""
+    assert inherited(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([5]), np.array([5])]).tolist() == [5, 0]
+    assert inherited(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([6]), np.array([5])]).tolist() == [6, 5]
+
+
+def test_larger_windows_are_solved_by_relaxation_to_the_same_end():
+    random = np.random.default_rng(0)
+    centres = [tuple(c) for c in random.random((14, 2)) * (3000, 2000) + 50]
+    frames = [at(*centres)] * 3
+    assert tracked(frames, exact_targets=12) == tracked(frames, exact_targets=20) == [list(range(1, 15))] * 3
+
+
+def test_the_configuration_of_the_source_chooses_it():
+    assert load_config("paper").track.mode == "paper"
+
+
+# -- what fails in the source ----------------------------------------------------------------------------------------
+
+
+def test_the_weight_rule_loses_to_a_fixed_weight_where_looks_change():
+    """Two couples, close together, whose colours tell them apart but halve their likeness from frame to frame.
+
+    The rule sees low dispersion of places and high dispersion of colours, and trusts colours alone; then every true
+    pair is worth 0.5 and every dummy 0.6.
+    """
+    centres = ((300, 300), (306, 300), (500, 400), (506, 400))
+
+    def looks(number: int) -> np.ndarray:
+        counts = np.zeros((4, 3, 256))
+        for target in range(4):
+            counts[target, :, 10 * target] = 2.0
+            counts[target, :, 10 * target + 1 + number] = 1.0
+        return counts.reshape(4, 768)
+
+    window = [Look(at(*((u + 2 * n, v) for u, v in centres)).box_px, partial(looks, n)) for n in (1, 0)]
+    known = [np.arange(4)] * 2
+    ruled = associate(window, knobs(window=2))
+    fixed = associate(window, knobs(window=2, rule="fixed", weight=0.7))
+    assert ruled.weight == 0.0
+    assert accuracy_ratio(ruled.rows, known) == 0.0
+    assert accuracy_ratio(fixed.rows, known) == 1.0
+
+
+def test_a_target_that_leaves_takes_the_identity_of_another_with_it():
+    """Two stood and one stays: the true triplet is worth 1, but each false one leaves two dummies worth 0.6 behind."""
+    frames = [at((100, 100), (400, 300)), at((105, 100), (410, 300)), at((110, 100), (420, 300)), at((115, 105))]
+    assert tracked(frames)[-1] == [3]
+    assert tracked(frames, gate="off")[-1] == tracked(frames, window=2)[-1] == [1]
+
+
+def test_to_the_letter_nobody_is_ever_followed_over_three_frames():
+    """Far apart, standing still, of unmistakable colours: every triplet scores 1, three dummies 1.8."""
+    frames = [at((100, 100), (400, 300), (700, 500))] * 4
+    appearance = [coloured(10, 100, 200)] * 4
+    literal = tracked(frames, appearance, gate="every_dummy")
+    assert literal[2:] == [[4, 5, 6], [7, 8, 9]]
+    assert tracked(frames, appearance) == [[1, 2, 3]] * 4

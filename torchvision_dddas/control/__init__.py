@@ -1,0 +1,1 @@
+"""The feedback rules, and the commands that steer the vehicles."""

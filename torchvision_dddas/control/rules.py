@@ -1,0 +1,355 @@
+"""The feedback rules: how what was found steers the knobs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from torchvision_dddas.config import IntervalKnobs, LandmarkKnobs, LiveKnobs, Settings, SteeringKnobs, with_knobs
+from torchvision_dddas.detection.gates import Gates, gates_at, pixels_per_metre
+from torchvision_dddas.types import Adjustment, Marks
+
+SAMPLING = "sampling.every"
+"""Of so many frames one is looked at: no knob, but named like one in the record."""
+
+# A change of altitude by this share moves the gates: less is not worth a line in the record.
+_ALTITUDE_STEP = 0.2
+
+# Between two looks a target moves by this share of its size at most.
+_MOVED_SHARE = 0.5
+
+# How fast people walk, and how wide one shows with his shadow: who comes into the picture is at least that.
+_WALKER_M_S, _WALKER_M = 1.4, 1.0
+
+# Landmarks count as well detected again once they are slower than this share of the speed at which they are not.
+_CALM = 0.8
+# Others are taken for the landmarks in use once they are spread better by this factor.
+_BETTER = 1.25
+# Of more landmarks than this, only so many that lie far apart are tried.
+_TRIED = 12
+
+# Looks that take so many times what they may are made as cheap as can be at once.
+_FAR_OVER = 2.0
+# More is looked at again where it is expected to take this share of what it may at most: else it would flutter.
+_SPARE = 0.9
+# Twice the keypoints, or a wider search, is expected to cost so many times as much.
+_DEARER = 1.4
+# A look at people takes this share of the windows at the least.
+_LEAST_SHARE = 0.002
+# The longest wait before more is looked at again, in calm_s.
+_MOST_PATIENCE = 16.0
+
+
+def interval_from_telemetry(altitude_m: float, speed_m_s: float, rate_hz: float, knobs: IntervalKnobs) -> float:
+    """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
+
+    Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz; the floor of the speed, which keeps
+    hovering finite, is ours.
+    """
+    speed = max(speed_m_s, knobs.lowest_speed_m_s)
+    by_height = altitude_m / knobs.reference_altitude_m * knobs.reference_speed_m_s / speed
+    return by_height * rate_hz / knobs.reference_rate_hz * knobs.cost
+
+
+def interval_from_flow(flows_px: Sequence[float], width: int, knobs: IntervalKnobs) -> float:
+    """The same without telemetry: the background's flow is proportional to S / (A R), so its inverse takes their place.
+
+    flows_px: median background flow of the latest steps, pixels a frame. width: of the picture, pixels.
+    """
+    flow = float(np.median(flows_px)) / width
+    return knobs.reference_flow / max(flow, 1e-4) * knobs.cost
+
+
+def bounded(interval: float, knobs: IntervalKnobs) -> int:
+    """Rounded and within the interval's bounds."""
+    return int(np.clip(round(min(interval, 1e6)), knobs.minimum_frames, knobs.maximum_frames))
+
+
+def adjusted(frame: int, now: int, wanted: float, why: str, knobs: IntervalKnobs) -> tuple[int, tuple[Adjustment, ...]]:
+    """The interval from here on, and the record of its change, if any.
+
+    A change by one frame waits until the rule is past the middle by a quarter, so that noise does not make it flutter.
+    """
+    new = bounded(wanted, knobs)
+    if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75 and knobs.minimum_frames <= now):
+        return now, ()
+    return new, (Adjustment(frame, "interval.frames", now, new, why),)
+
+
+def every_wanted(
+    interval: float, rate_hz: float, speed_m_s: np.ndarray, size_m: np.ndarray, knobs: SteeringKnobs
+) -> tuple[float, str]:
+    """Of how many frames one is worth a look, before rounding and bounds; in words what limits it beside the rule.
+
+    interval: as the rule gives it, before its bounds; sampling_share of it is taken. speed_m_s, size_m: (N,) of the
+    targets that are known. Between two looks none may move by more than half its size: the two places then still share
+    half of it, and are nearer to each other than to any other target, since two that part are a size apart. Where none
+    is known, so that a walker who comes into the picture is found.
+    """
+    wanted = knobs.sampling_share * interval
+    known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
+    if not known.any():
+        most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / _WALKER_M_S)), 1.0)
+        return (most, "; nothing is found yet") if most < min(wanted, knobs.maximum_every) else (wanted, "")
+    frames = _MOVED_SHARE * size_m[known] * rate_hz / np.maximum(speed_m_s[known], 1e-3)
+    tightest = int(frames.argmin())
+    if frames[tightest] >= min(wanted, knobs.maximum_every):
+        return wanted, ""
+    speed, size = speed_m_s[known][tightest], size_m[known][tightest]
+    # Whole frames, so that it holds.
+    return max(float(np.floor(frames[tightest])), 1.0), f"; a target of {size:.1f} m goes at {speed:.1f} m/s"
+
+
+def every_least(pixels_per_metre: float, rate_hz: float, knobs: SteeringKnobs) -> float:
+    """Of how many frames one is worth a look at the least: between two looks a walker must move far enough to show."""
+    return knobs.least_move_px * rate_hz / (_WALKER_M_S * pixels_per_metre)
+
+
+def sampled(frame: int, now: int, wanted: float, why: str, knobs: SteeringKnobs) -> tuple[int, tuple[Adjustment, ...]]:
+    """Of how many frames one is looked at from here on, and the record of its change, if any; steady as `adjusted`."""
+    new = int(np.clip(round(min(wanted, 1e6)), 1, knobs.maximum_every))
+    if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75):
+        return now, ()
+    return new, (Adjustment(frame, SAMPLING, now, new, why),)
+
+
+@dataclass(frozen=True)
+class Regime:
+    """What the expected size of a target decides. altitude_m, gates: None where no telemetry tells.
+
+    settings: those given, with the smallest area and the path for small targets chosen for the altitude.
+    """
+
+    settings: Settings
+    altitude_m: float | None = None
+    gates: Gates | None = None
+
+    def values(self) -> dict[str, float]:
+        """The numbers in force, by name."""
+        gates = self.gates or Gates(0.0, np.inf, np.inf)
+        return {
+            "gates.min_area_px": self.settings.gates.min_area_px,
+            "small.on": float(self.settings.small.on),
+            "morphology.close_px": self.settings.morphology.close_px,
+            "gates.min_size_px": gates.min_size_px,
+            "gates.max_size_px": gates.max_size_px,
+            "gates.max_speed_px": gates.max_speed_px,
+        }
+
+
+def regime_at(altitude_m: float, rate_hz: float, base: Settings) -> Regime:
+    """The regime for an altitude above ground: e = expected_size_m x focal / altitude pixels is what a target measures.
+
+    Gaps of close_m, where it is set, are closed, as far as close_px goes: in pixels it would join ever more from above.
+    The smallest area is expected_share x e^2, between the small path's and the one in the settings. The small path is
+    on while e^2 is within its largest box: larger targets show without it.
+    """
+    gates, small = base.gates, base.small
+    square = (gates.expected_size_m * pixels_per_metre(altitude_m, gates.focal_px)) ** 2
+    area = int(min(gates.min_area_px, max(small.min_area_px, round(gates.expected_share * square))))
+    on = small.on and square <= small.max_box_px
+    close = base.morphology.close_px
+    if base.morphology.close_m:
+        close = int(np.clip(round(base.morphology.close_m * pixels_per_metre(altitude_m, gates.focal_px)), 1, close))
+    settings = with_knobs(base, {"gates.min_area_px": area, "small.on": on, "morphology.close_px": close})
+    return Regime(settings, altitude_m, gates_at(altitude_m, rate_hz, gates))
+
+
+def steered(
+    frame: int, now: Regime, altitude_m: float | None, rate_hz: float, base: Settings
+) -> tuple[Regime, tuple[Adjustment, ...]]:
+    """The regime from here on, and the record of what changed.
+
+    The altitude must have changed by a fifth since the last time, or have become known or unknown.
+    """
+    if altitude_m is None:
+        new, why = Regime(base), "no telemetry for this frame"
+        if now.altitude_m is None:
+            return now, ()
+    else:
+        was = now.altitude_m
+        if was is not None and abs(altitude_m - was) <= _ALTITUDE_STEP * max(was, 1.0):
+            return now, ()
+        new, why = regime_at(altitude_m, rate_hz, base), f"altitude {altitude_m:.1f} m"
+        why += "" if was is None else f", was {was:.1f} m"
+    old = now.values()
+    changed = {name: value for name, value in new.values().items() if value != old[name]}
+    return new, tuple(Adjustment(frame, name, old[name], value, why) for name, value in changed.items())
+
+
+@dataclass(frozen=True)
+class LandmarkUse:
+    """Which landmarks are in use, and whether more than `least` of them may be: their detection is poor."""
+
+    landmark: tuple[int, ...] = ()
+    poor: bool = False
+
+
+def chosen(
+    frame: int, now: LandmarkUse, marks: Marks, speed_m_s: np.ndarray, knobs: LandmarkKnobs
+) -> tuple[np.ndarray, LandmarkUse, tuple[Adjustment, ...]]:
+    """The rows of `marks` to use, of those in view; what is in use from here on; and the record of a change of number.
+
+    speed_m_s: (n,) over the ground, of the landmarks in marks' order; NaN where unknown.
+    rule = all: every landmark in view. Our study finds six never worse than four; the source's finding of the contrary
+    is one of its numerics. rule = source: more than `least` only where more are in view and their mean speed is above
+    poor_speed_m_s, so that they are detected poorly (appendix A, section V); else those `least` that are best spread.
+    """
+    view = np.flatnonzero(np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1))
+    if knobs.rule == "all":
+        return view, LandmarkUse(tuple(marks.landmark[view].tolist())), ()
+    known = np.asarray(speed_m_s, float)[view]
+    speed = float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else None
+    poor, cause = now.poor, ""
+    if speed is not None and poor and speed < _CALM * knobs.poor_speed_m_s:
+        poor, cause = False, f"below {_CALM * knobs.poor_speed_m_s:.2g}: they are detected well"
+    elif speed is not None and not poor and speed > knobs.poor_speed_m_s and len(view) > knobs.least:
+        poor, cause = True, f"above {knobs.poor_speed_m_s:g}: they are detected poorly"
+    rows = view if poor or len(view) <= knobs.least else view[_best_spread(marks, view, now, knobs.least)]
+    use = LandmarkUse(tuple(marks.landmark[rows].tolist()), poor)
+    if not cause or len(rows) == len(now.landmark):
+        return rows, use, ()
+    why = f"{len(view)} landmarks in view go at {speed:.1f} m/s on average, {cause}"
+    return rows, use, (Adjustment(frame, "landmarks.used", len(now.landmark) or knobs.least, len(rows), why),)
+
+
+def _best_spread(marks: Marks, view: np.ndarray, now: LandmarkUse, count: int) -> np.ndarray:
+    """Of the rows in view, those `count` that are used already, unless others are spread clearly better."""
+    places = marks.east_north_m[view]
+    best = best_spread(places, count)
+    held = np.flatnonzero(np.isin(marks.landmark[view], now.landmark))
+    if len(held) == count and spread_m2(places[best]) <= _BETTER * spread_m2(places[held]):
+        return held
+    return best
+
+
+def best_spread(places: np.ndarray, count: int) -> np.ndarray:
+    """(count,) rows of (n, 2) places, sorted, whose smallest triangle is the largest: no three are near one line."""
+    tried = _far_apart(places, max(count, min(_TRIED, len(places))))
+    if len(tried) > _TRIED:
+        return np.sort(tried[:count])
+    sets = np.array(list(combinations(np.sort(tried), count)))
+    smallest = np.full(len(sets), np.inf)
+    for triple in combinations(range(count), 3):
+        smallest = np.minimum(smallest, _area(places[sets[:, triple]]))
+    # Where all lie on one line, those furthest apart.
+    ties = np.flatnonzero(smallest >= smallest.max() * (1 - 1e-9))
+    widths = np.ptp(places[sets[ties]], axis=1).sum(axis=1)
+    return sets[ties[int(widths.argmax())]]
+
+
+def spread_m2(places: np.ndarray) -> float:
+    """The area of the smallest triangle among (n, 2) places; 0 for fewer than three."""
+    triples = np.array(list(combinations(range(len(places)), 3)), int).reshape(-1, 3)
+    return float(_area(places[triples]).min()) if len(triples) else 0.0
+
+
+def _area(corners: np.ndarray) -> np.ndarray:
+    """(T,) of triangles (T, 3, 2)."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+
+
+def _far_apart(places: np.ndarray, count: int) -> np.ndarray:
+    """(count,) rows of (n, 2) places, each the one furthest from those before it."""
+    rows = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
+    nearest = np.full(len(places), np.inf)
+    while len(rows) < min(count, len(places)):
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[rows[-1]], axis=1))
+        nearest[rows] = -1.0  # where several are in one place, each is taken once
+        rows.append(int(nearest.argmax()))
+    return np.array(rows)
+
+
+@dataclass(frozen=True)
+class Load:
+    """How much less than everything is looked at, because it takes too long: a rung of `rungs`, 0 is everything.
+
+    spare_s: since when there is time for more; None while there is none. eased_s: when more was last looked at again.
+    patience: by how much longer than calm_s time must be spare, because it was not enough the last time.
+    """
+
+    rung: int = 0
+    spare_s: float | None = None
+    eased_s: float = -np.inf
+    patience: float = 1.0
+
+
+def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
+    """What may be looked at, from everything to the least: knobs by name, the same in each, `sampling.every` the last.
+
+    First keypoints are halved, then, where people are searched for in regions, a look takes a smaller share of the
+    windows, both of which make it cheaper; then only every 2nd, 3rd, ... picture is looked at.
+    """
+    live, search = base.live, base.people
+    rung: dict[str, float] = {"registration.keypoints": base.registration.keypoints}
+    if people and search.search == "regions":
+        rung["people.look_share"] = search.look_share
+    rung[SAMPLING] = 1
+    made = [rung]
+    while (keypoints := made[-1]["registration.keypoints"]) > live.least_keypoints:
+        fewer = max(int(keypoints) // 2, live.least_keypoints)
+        made.append(made[-1] | {"registration.keypoints": fewer})
+    if "people.look_share" in rung:
+        for narrower in (2, 4, 8):
+            made.append(made[-1] | {"people.look_share": max(search.look_share / narrower, _LEAST_SHARE)})
+    made += [made[-1] | {SAMPLING: every} for every in range(2, live.maximum_every + 1)]
+    return made
+
+
+def shed(
+    frame: int, now: Load, cost_s: float, apart_s: float, now_s: float, base: Settings, people: bool = False
+) -> tuple[Load, tuple[Adjustment, ...]]:
+    """How much is looked at from here on, and the record of what changed.
+
+    cost_s: what a look takes, as things are; apart_s: from picture to picture, 0: they wait. now_s: by any clock.
+    Less: a rung, when looks take more than `live.load` of the time between them, or a picture more than its deadline;
+    all that makes a look cheaper, and as many pictures as it takes, when it is more than twice as much. More: when it
+    is expected to fit for calm_s on end; for twice as long each time that it did not last.
+    """
+    knobs, ladder = base.live, rungs(base, people)
+    at = min(now.rung, len(ladder) - 1)
+    if not knobs.shed or apart_s <= 0:
+        return now, ()
+    shares = [cost_s / (rung[SAMPLING] * apart_s) for rung in ladder]
+    cheapest = next((i for i, rung in enumerate(ladder) if rung[SAMPLING] > 1), len(ladder)) - 1
+    slow = cost_s * 1000 > knobs.deadline_ms and at < cheapest
+    if shares[at] > knobs.load or slow:
+        far = shares[at] > _FAR_OVER * knobs.load
+        to = max(at, cheapest) if far else min(at + 1, len(ladder) - 1)
+        # How many pictures can be had is known, what a cheaper look costs is not.
+        while (far or at >= cheapest) and shares[to] > knobs.load and to < len(ladder) - 1:
+            to += 1
+        undone = now_s - now.eased_s < 2 * now.patience * knobs.calm_s
+        patience = min(2 * now.patience, _MOST_PATIENCE) if undone else 1.0
+        new = replace(now, rung=to, spare_s=None, patience=patience if to != at else now.patience)
+        limit = (
+            f"{knobs.load:.0%} is allowed" if shares[at] > knobs.load else f"its deadline is {knobs.deadline_ms:g} ms"
+        )
+        return new, _moved(frame, ladder[at], ladder[to], _took(cost_s, shares[at], limit))
+    to = _eased(at, shares, cost_s, cheapest, knobs)
+    if to == at:
+        return replace(now, spare_s=None), ()
+    if now.spare_s is None:
+        return replace(now, spare_s=now_s), ()
+    if now_s - now.spare_s < now.patience * knobs.calm_s:
+        return now, ()
+    why = _took(cost_s, shares[at], f"for {now_s - now.spare_s:.1f} s there was time to spare")
+    return replace(now, rung=to, spare_s=None, eased_s=now_s), _moved(frame, ladder[at], ladder[to], why)
+
+
+def _eased(at: int, shares: Sequence[float], cost_s: float, cheapest: int, knobs: LiveKnobs) -> int:
+    """The rung that is expected to fit with time to spare, if lower than `at`."""
+    if at > cheapest:  # how much more often it may be is known
+        return next(i for i in range(cheapest, at + 1) if i == at or shares[i] <= _SPARE * knobs.load)
+    dearer = _DEARER * cost_s * 1000 <= knobs.deadline_ms and _DEARER * shares[at] <= _SPARE * knobs.load
+    return at - 1 if at and dearer else at
+
+
+def _took(cost_s: float, share: float, limit: str) -> str:
+    return f"a look takes {cost_s * 1000:.0f} ms, {share:.0%} of the time until the next; {limit}"
+
+
+def _moved(frame: int, old: dict[str, float], new: dict[str, float], why: str) -> tuple[Adjustment, ...]:
+    return tuple(Adjustment(frame, name, old[name], value, why) for name, value in new.items() if value != old[name])

@@ -1,0 +1,258 @@
+"""The orders of the ground vehicles: stations that move with the crowd, closer looks, and when a picture is wanted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.config import Settings
+from torchvision_dddas.control import ugv_placement as stations
+from torchvision_dddas.control.adjustments import Record, counted
+from torchvision_dddas.control.footprint import Stand
+from torchvision_dddas.control.prediction import Outlook
+from torchvision_dddas.types import Marks, Order
+
+# A vehicle that reports no place is counted on for so long: planned waypoints bridge dropouts.
+_SILENT_S = 10.0
+# A vehicle that was near counts as far again beyond this many times near_m.
+_FAR = 1.5
+# A target this surely human or not is seldom looked at: at every so many-th picture; and below it often again.
+_SURE, _UNSURE, _SELDOM = 0.95, 0.9, 5
+# A vehicle sent to a target stays so long at most, and that target is let be for a while.
+_TRIED_S, _LET_BE_S = 15.0, 30.0
+# A vehicle looks at a target for so long at least.
+_LOOK_S = 2.0
+# The ring is no wider than so many times station_m, however far apart targets are: vehicles are sent to those afar.
+_WIDEST = 1.5
+# Stations are where the crowd will be so much later.
+_LEAD_S = 1.0
+NEEDED = 4
+
+
+@dataclass
+class _Vehicle:
+    """What is known of one vehicle, and what it was asked to do."""
+
+    place_m: np.ndarray
+    heard_s: float
+    near: bool = False
+    watches: int = -1
+    watched_s: float = -np.inf
+    sure: bool = False
+    pictured_s: float = -1e6
+    sent_to: int = -1
+    sent_s: float = 0.0
+
+
+class Team:
+    """The ground vehicles, by name."""
+
+    def __init__(self, settings: Settings, vehicles: Sequence[str]) -> None:
+        self.knobs, self.names = settings.steering, tuple(vehicles)
+        self._known: dict[int, _Vehicle] = {}
+        self._ring: stations.Ring | None = None
+        self._on_ring: tuple[int, ...] = ()
+        self._place_of: np.ndarray | None = None
+        self._let_be: dict[int, float] = {}
+
+    def hear(self, marks: Marks, now_s: float, record: Record) -> np.ndarray:
+        """Take on the places that the team reports; the places (V, 2) of those that are counted on."""
+        for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
+            if 0 <= row < len(self.names) and np.isfinite(place).all():
+                if row not in self._known:
+                    self._known[row] = _Vehicle(np.asarray(place, float), now_s)
+                self._known[row].place_m, self._known[row].heard_s = np.asarray(place, float), now_s
+        before = len(self._known)
+        for row in [row for row, vehicle in self._known.items() if now_s - vehicle.heard_s > _SILENT_S]:
+            del self._known[row]
+            record.set("team.vehicles", len(self._known), f"{self.names[row]} silent for {_SILENT_S:.0f} s", old=before)
+        if before == len(self._known):
+            record.set("team.vehicles", before, "all that report", old=before)
+        return np.array([self._known[row].place_m for row in self.present]).reshape(-1, 2)
+
+    @property
+    def present(self) -> list[int]:
+        """The vehicles that are counted on."""
+        return sorted(self._known)
+
+    def orders(
+        self, outlook: Outlook, rows: np.ndarray, stand: Stand | None, now_s: float, record: Record
+    ) -> tuple[Order, ...]:
+        """What each is asked to do; none while there is nothing to go to. rows: the targets that are followed."""
+        present = self.present
+        if not len(rows) or not present:
+            self._ring = None
+            return ()
+        middle = self._middle(outlook, rows, stand)
+        self._send(outlook, now_s, record)
+        team_m = np.array([self._known[v].place_m for v in present])
+        goals = self._stations(outlook, middle, rows, team_m, stand, record)
+        goals = stations.kept_off(goals, outlook, team_m)
+        passing = stations.around(goals, team_m, outlook)
+        drift = outlook.velocity_m_s[rows].mean(axis=0)
+        return tuple(
+            self._order(v, goals[k], passing[k], outlook, float(np.linalg.norm(drift)), now_s, record)
+            for k, v in enumerate(present)
+        )
+
+    def _middle(self, outlook: Outlook, rows: np.ndarray, stand: Stand | None) -> np.ndarray:
+        """Of what the ring is about: the targets that are wanted, a little later."""
+        later = outlook.east_north_m[rows] + _LEAD_S * outlook.velocity_m_s[rows]
+        return later.mean(axis=0) if stand is None else stand.centre(later, stand.altitude_m)[0]
+
+    def _stations(
+        self,
+        outlook: Outlook,
+        middle: np.ndarray,
+        rows: np.ndarray,
+        team_m: np.ndarray,
+        stand: Stand | None,
+        record: Record,
+    ) -> np.ndarray:
+        """(V, 2) the goals of those on the ring and of those sent to look."""
+        present, knobs = self.present, self.knobs
+        reach = np.linalg.norm(outlook.east_north_m[rows] - middle, axis=1) + outlook.radius_m[rows]
+        radius = float(np.clip(reach.max() + stations.KEEP_OFF_M, knobs.station_m, _WIDEST * knobs.station_m))
+        on = [k for k, v in enumerate(present) if self._known[v].sent_to < 0]
+        names = tuple(present[k] for k in on)
+        goals = team_m.copy()
+        if on:
+            held = self._place_of if names == self._on_ring else None
+            turn = self._ring.turn_rad if self._ring is not None else 0.0
+            self._ring, self._place_of = stations.assigned(team_m[on], stations.Ring(middle, radius, turn), held)
+            self._on_ring = names
+            goals[on] = self._ring.places(len(on))[self._place_of]
+            about = f"{counted(len(rows), 'target')} at ({middle[0]:.0f}, {middle[1]:.0f}) m"
+            why = f"{counted(len(on), 'vehicle')} about {about}"
+            record.set("team.ring_m", round(radius, 1), why, least=2.0)
+        for k, v in enumerate(present):
+            if self._known[v].sent_to >= 0:
+                row = int(np.flatnonzero(outlook.target == self._known[v].sent_to)[0])
+                goals[k] = self._close_to(outlook, row, team_m[k])
+        tied = on if len(present) > NEEDED else list(range(len(present)))
+        goals[tied] = stations.drawn_in(goals[tied], middle, stand)
+        return goals
+
+    def _close_to(self, outlook: Outlook, row: int, from_m: np.ndarray) -> np.ndarray:
+        """A place from which a vehicle sees a target well, on its own side of it."""
+        place = outlook.east_north_m[row] + _LEAD_S * outlook.velocity_m_s[row]
+        apart = from_m - place
+        away = outlook.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.knobs.look_m)
+        return place + apart / max(float(np.linalg.norm(apart)), 1e-6) * away
+
+    def _send(self, outlook: Outlook, now_s: float, record: Record) -> None:
+        """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
+        knobs, wanted = self.knobs, dict(zip(outlook.target.tolist(), range(len(outlook)), strict=True))
+        needs = stations.need(outlook)
+        for v, vehicle in self._known.items():
+            if vehicle.sent_to < 0:
+                continue
+            row, why = wanted.get(vehicle.sent_to), ""
+            if row is None:
+                why = f"target {vehicle.sent_to} is lost"
+            elif not outlook.unseen[row] and needs[row] < 1 - _UNSURE:
+                why = f"target {vehicle.sent_to}: {_known(outlook, row)}"
+            elif now_s - vehicle.sent_s > _TRIED_S:
+                why = f"target {vehicle.sent_to} told nothing for {_TRIED_S:.0f} s"
+                self._let_be[vehicle.sent_to] = now_s
+            if why:
+                vehicle.sent_to = -1
+                record.set(f"{self.names[v]}.sent_to", 0, why)
+        free = max(len(self._known) - NEEDED, 1) - sum(vehicle.sent_to >= 0 for vehicle in self._known.values())
+        gone_to = {vehicle.sent_to for vehicle in self._known.values()}
+        if self._ring is None:
+            return
+        ring_m = self._ring.places(max(len(self._on_ring), 1))
+        afar = np.linalg.norm(outlook.east_north_m[:, None] - ring_m, axis=2).min(axis=1) - outlook.radius_m
+        for row in np.argsort(-needs, kind="stable"):
+            target = int(outlook.target[row])
+            let_be = now_s - self._let_be.get(target, -np.inf) < _LET_BE_S
+            if free <= 0 or needs[row] < 1 - _UNSURE:
+                break
+            seen_from_ring = afar[row] < knobs.look_m
+            too_fast = outlook.speed_m_s[row] > knobs.fast_m_s or not outlook.steady[row]
+            if target in gone_to or let_be or too_fast or seen_from_ring or outlook.lost_s[row] > 1:
+                continue
+            idle = [v for v, vehicle in self._known.items() if vehicle.sent_to < 0]
+            away = [float(np.linalg.norm(self._known[v].place_m - outlook.east_north_m[row])) for v in idle]
+            if min(away) - outlook.radius_m[row] < 0.8 * knobs.look_m:
+                continue  # somebody sees it already
+            v = idle[int(np.argmin(away))]
+            self._known[v].sent_to, self._known[v].sent_s = target, now_s
+            why = f"{afar[row]:.0f} m from the nearest station: {_known(outlook, row)}"
+            record.set(f"{self.names[v]}.sent_to", target, why)
+            free -= 1
+
+    def _order(
+        self,
+        v: int,
+        station: np.ndarray,
+        goal: np.ndarray,
+        outlook: Outlook,
+        drift_m_s: float,
+        now_s: float,
+        record: Record,
+    ) -> Order:
+        vehicle, knobs, name = self._known[v], self.knobs, self.names[v]
+        away = float(np.linalg.norm(station - vehicle.place_m))
+        vehicle.near = away < knobs.near_m * (_FAR if vehicle.near else 1.0)
+        # It must not fall behind a crowd that walks faster than it should go near it.
+        slow = round(min(max(knobs.slow_m_s, 1.1 * drift_m_s), max(knobs.fast_m_s, knobs.slow_m_s)), 1)
+        record.set(
+            f"{name}.speed_m_s",
+            slow if vehicle.near else knobs.fast_m_s,
+            f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s",
+            least=1.0,
+        )
+        row = self._watched(v, outlook, now_s, record)
+        speed = slow if vehicle.near else knobs.fast_m_s
+        picture = self._pictured(v, outlook, row, now_s, record)
+        return Order(name, goal, speed, outlook.east_north_m[row], picture)
+
+    def _watched(self, v: int, outlook: Outlook, now_s: float, record: Record) -> int:
+        """The row of the target that a vehicle looks at."""
+        vehicle, knobs, name = self._known[v], self.knobs, self.names[v]
+        row = stations.most_needed(outlook, vehicle.place_m, knobs.look_m, vehicle.watches)
+        here = np.flatnonzero(outlook.target == vehicle.watches)
+        if len(here) and now_s - vehicle.watched_s < _LOOK_S:
+            row = int(here[0])
+        if vehicle.sent_to >= 0:
+            row = int(np.flatnonzero(outlook.target == vehicle.sent_to)[0])
+        target = int(outlook.target[row])
+        if target != vehicle.watches:
+            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, self._sure(outlook, row, False)
+            apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m))
+            often = f"a picture every {self._period_s(vehicle):g} s"
+            record.set(
+                f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {_known(outlook, row)}; {often}"
+            )
+            record.know(f"{name}.picture_s", self._period_s(vehicle))
+        return row
+
+    def _sure(self, outlook: Outlook, row: int, now: bool) -> bool:
+        """Whether a target counts as surely human or surely not; now: whether it did."""
+        surely = abs(float(outlook.probability[row]) - 0.5) + 0.5
+        return not bool(outlook.unseen[row]) and surely > (_UNSURE if now else _SURE)
+
+    def _period_s(self, vehicle: _Vehicle) -> float:
+        return self.knobs.picture_s * (_SELDOM if vehicle.sure else 1)
+
+    def _pictured(self, v: int, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
+        """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
+        vehicle, name = self._known[v], self.names[v]
+        vehicle.sure = self._sure(outlook, row, vehicle.sure)
+        period = self._period_s(vehicle)
+        why = f"target {outlook.target[row]}: {_known(outlook, row)}"
+        record.set(f"{name}.picture_s", period, why, old=self.knobs.picture_s)
+        apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
+        # One vehicle after the other, each in its part of the period.
+        shift_s = 1e-6 - v * period / len(self.names)
+        turn, last = (int((when_s + shift_s) // period) for when_s in (now_s, vehicle.pictured_s))
+        if apart > self.knobs.look_m or turn == last:
+            return False
+        vehicle.pictured_s = now_s
+        return True
+
+
+def _known(outlook: Outlook, row: int) -> str:
+    return "nobody has seen it" if outlook.unseen[row] else f"human with {outlook.probability[row]:.2f}"

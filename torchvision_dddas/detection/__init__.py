@@ -1,0 +1,1 @@
+"""Moving targets from a moving camera: frames to targets."""

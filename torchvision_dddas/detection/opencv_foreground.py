@@ -1,0 +1,217 @@
+"""Pixel steps of the onboard back end, each in as few passes over 8-bit memory as it takes."""
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.detection.engine import WHITE
+from torchvision_dddas.geometry import transfer
+
+# An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
+# round places to 1/32 px.
+_TILE_ERROR_PX = 1 / 32
+_MOST_TILES = 16
+_STRIP_ROWS = 64
+# The least median distance between grey levels that exposures are trimmed by; times 3.7 it is 3 levels.
+_LEAST_DISTANCE = 3 / 3.7
+_LEVELS = np.arange(256)
+_ROWS = 257 * _LEVELS
+
+
+def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
+    """The picture as the reference sees it, bilinear, (H, W) uint8; border pixels are repeated outside.
+
+    `cv2.warpPerspective` divides for every pixel; one affine map a tile takes half its time and stays within the
+    1/32 px to which both round places.
+    """
+    height, width = picture.shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    # The error falls with the square of the number of tiles across: that of a single one tells how many it takes.
+    tiles = np.array([[0, 0, width - 1, height - 1]])
+    maps, error = _affine_maps(picture_from_reference, tiles)
+    count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
+    if not 0 <= count <= _MOST_TILES:
+        return cv2.warpPerspective(
+            picture, picture_from_reference, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+    if count > 1:
+        tiles = _tiles(width, height, int(count))
+        maps, _ = _affine_maps(picture_from_reference, tiles)
+    warped = np.empty_like(picture)
+    for (left, top, right, bottom), affine in zip(tiles.tolist(), maps, strict=True):
+        tile, size = warped[top : bottom + 1, left : right + 1], (right - left + 1, bottom - top + 1)
+        cv2.warpAffine(picture, affine, size, dst=tile, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return warped
+
+
+def _tiles(width: int, height: int, count: int) -> np.ndarray:
+    """(N, 4) first column, first row, last column, last row of count x count tiles."""
+    across, down = (sorted({i * side // count for i in range(count + 1)}) for side in (width, height))
+    return np.array(
+        [(left, top, right - 1, bottom - 1) for top, bottom in pairwise(down) for left, right in pairwise(across)]
+    )
+
+
+def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, float]:
+    """The tiles' affine maps, (N, 2, 3), from pixels counted within the tile, and their largest error in pixels.
+
+    The slopes are the means over opposite sides; the error is shared between the corners and the middle.
+    """
+    left, top, right, bottom = tiles.T.astype(float)
+    from_places = np.empty((3, 5, len(tiles)))
+    from_places[0] = left, right, left, right, (left + right) / 2
+    from_places[1] = top, top, bottom, bottom, (top + bottom) / 2
+    from_places[2] = 1
+    away = to_from @ from_places.reshape(3, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = (away[:2] / away[2]).reshape(2, 5, -1)
+    first, second, third, fourth, middle = places.transpose(1, 2, 0)
+    wide, tall = np.maximum(right - left, 1)[:, None], np.maximum(bottom - top, 1)[:, None]
+    by_u, by_v = (second + fourth - first - third) / (2 * wide), (third + fourth - first - second) / (2 * tall)
+    twist = (first + fourth - second - third) / 4
+    bulge = (middle - (first + second + third + fourth) / 4) / 2
+    error = (np.abs(twist) + np.abs(bulge)).max() if (away[2] > 0).all() else np.inf
+    maps = np.empty((len(tiles), 2, 3))
+    maps[:, :, 0], maps[:, :, 1], maps[:, :, 2] = by_u, by_v, first - twist + bulge
+    return maps, float(error)
+
+
+def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
+    """255 where the reference's pixels see the picture, a strip inside its border left out; (H, W) uint8.
+
+    size: (width, height) of both.
+    """
+    width, height = size
+    first, last = (border, border), (width - 1 - border, height - 1 - border)
+    mask = np.zeros((height, width), np.uint8)
+    if first[0] > last[0] or first[1] > last[1]:
+        return mask
+    corners = np.array([first, (last[0], first[1]), last, (first[0], last[1])], float)
+    reference_from_picture = np.linalg.inv(picture_from_reference)
+    homogeneous = np.ones((4, 3))
+    homogeneous[:, :2] = corners
+    depth = homogeneous @ (reference_from_picture / reference_from_picture[2, 2])[2]
+    if (depth > 0.1).all():
+        outline = transfer(reference_from_picture, corners)
+        cv2.fillConvexPoly(mask, np.round(16 * outline).astype(np.int32), 255, shift=4)
+        return mask
+    mask[first[1] : last[1] + 1, first[0] : last[0] + 1] = 255
+    return cv2.warpPerspective(mask, picture_from_reference, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+
+
+def texture_of(grey: np.ndarray) -> np.ndarray:
+    """Mean gradient magnitude over 5x5 px, 4 x grey levels a pixel, uint8."""
+    steep = np.empty_like(grey)
+    # In strips, with a row more on either side: float pictures of the whole would hold 11 MB at 1280x720.
+    for top in range(0, len(grey), _STRIP_ROWS):
+        above, bottom = min(top, 1), top + _STRIP_ROWS
+        strip = grey[top - above : bottom + 1]
+        across = cv2.Sobel(strip, cv2.CV_32F, 1, 0, scale=0.5)
+        down = cv2.Sobel(strip, cv2.CV_32F, 0, 1, scale=0.5)
+        slope = cv2.convertScaleAbs(cv2.magnitude(across, down, across))
+        steep[top:bottom] = slope[above : above + _STRIP_ROWS]
+    return cv2.blur(steep, (5, 5))
+
+
+def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The warped picture in the reference's exposure: gain and offset by trimmed least squares on every 4th pixel.
+
+    seen: 255 where the warped picture may be compared. All are (H, W) uint8.
+    """
+    samples = [warped[::4, ::4], reference[::4, ::4]]
+    # The fit needs no more than how often each pair of grey levels occurs.
+    pairs = _GreyPairs(cv2.calcHist(samples, [0, 1], seen[::4, ::4], [256, 256], [0, 256, 0, 256]))
+    if pairs.count < 100:
+        return warped
+    x = np.arange(256.0)
+    gain, offset = 1.0, pairs.median_offset()
+    for _ in range(4):
+        before = gain, offset
+        middle = gain * x + offset
+        n, y = pairs.near(middle, pairs.trimming(middle))
+        total = n.sum()
+        mean_x, mean_y = n @ x / total, y.sum() / total
+        spread = n @ (x - mean_x) ** 2 / total
+        gain = float((x - mean_x) @ y / total / spread) if spread > 1e-3 else 1.0
+        offset = float(mean_y - gain * mean_x)
+        if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
+            break
+    return lit(reference, warped, gain, offset)
+
+
+def lit(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
+    """The warped picture through gain and offset; what it has cut off at white agrees with anything brighter."""
+    table = np.clip(np.round(gain * _LEVELS + offset), 0, 255).astype(np.uint8)
+    if (table == _LEVELS).all():
+        return warped
+    through = cv2.LUT(warped, table)
+    if table[255] < WHITE:
+        # Cut off at white, a pixel only tells that the place was at least so bright.
+        cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
+        cv2.copyTo(cv2.max(through, reference), cut, through)
+    return through
+
+
+class _GreyPairs:
+    """How often grey level y meets grey level x in two pictures; summed along y: a band of y takes two looks."""
+
+    def __init__(self, times: np.ndarray) -> None:
+        """times: (256, 256), x down, y across."""
+        self.below = _sums_along(times)
+        self.sum_below = _sums_along(times * np.arange(256, dtype=np.float32))
+        self.count = float(self.below[:, -1].sum())
+
+    def near(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """(256,) for each x: how many y lie within `reach` of `middle`, and their sum."""
+        low, high = self._band(middle, reach)
+        return self.below.take(high) - self.below.take(low), self.sum_below.take(high) - self.sum_below.take(low)
+
+    def share(self, middle: np.ndarray, reach: float) -> float:
+        """The share of all pairs whose y lies within `reach` of `middle`."""
+        low, high = self._band(middle, reach)
+        return float(self.below.take(high).sum() - self.below.take(low).sum()) / self.count
+
+    def median_offset(self) -> float:
+        """The median of y - x."""
+        low, high = -255, 255
+        while low < high:
+            middle = (low + high) // 2
+            if 2 * self.below.take(_ROWS + np.clip(_LEVELS + middle + 1, 0, 256)).sum() >= self.count:
+                high = middle
+            else:
+                low = middle + 1
+        return float(low)
+
+    def trimming(self, middle: np.ndarray) -> float:
+        """How far y may lie from `middle`: 3.7 times the median distance, at least 3 levels."""
+        near, held = _LEAST_DISTANCE, 0.0
+        while (more := self.share(middle, near)) < 0.5:
+            near, held = 1.25 * near, more
+        if near == _LEAST_DISTANCE:
+            return 3.7 * near
+        return 3.7 * float(np.interp(0.5, [held, more], [near / 1.25, near]))
+
+    def _band(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sums begin and end, as flat indices."""
+        low = np.clip(np.ceil(middle - reach), 0, 256)
+        high = np.maximum(np.clip(np.floor(middle + reach) + 1, 0, 256), low)
+        return _ROWS + low.astype(np.intp), _ROWS + high.astype(np.intp)
+
+
+def _sums_along(values: np.ndarray) -> np.ndarray:
+    """(H, W + 1) float64 sums of all values to the left: five times as quick as `np.cumsum`."""
+    return np.diff(cv2.integral(values, sdepth=cv2.CV_64F), axis=0)
+
+
+def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int = 500) -> float:
+    """The larger of `least` and the median of uint8 values where a mask is set; `least` if that is hardly anywhere."""
+    count = cv2.countNonZero(mask)
+    if count <= enough:
+        return least
+    above = cv2.threshold(values, int(least), 255, cv2.THRESH_BINARY)[1]
+    if 2 * cv2.countNonZero(cv2.bitwise_and(above, mask, dst=above)) < count:
+        return least  # the usual case, at a fraction of a histogram's cost
+    so_far = np.cumsum(cv2.calcHist([values], [0], mask, [256], [0, 256]).ravel())
+    low, high = np.searchsorted(so_far, [(count + 1) // 2, count // 2 + 1])
+    return max(least, (int(low) + int(high)) / 2)

@@ -1,0 +1,1 @@
+"""How good results are: measures, data sets, studies."""

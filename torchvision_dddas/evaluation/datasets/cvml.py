@@ -1,0 +1,123 @@
+"""CVML: the annotation of PETS 2009 and CAVIAR as XML.
+
+    NAME.xml    <dataset><frame number="0"><objectlist><object id="1"><box h="" w="" xc="" yc=""/></object>...
+
+with the pictures in a folder of the XML's name beside it, or in the XML's own folder: frame_0000.jpg ..., or a video.
+The folder holds such XML, itself or in its folders. Frames count from 0; xc, yc is the middle of a box. XML that is
+something else, such as a camera's calibration, is passed over.
+
+Terms: PETS 2009 is the University of Reading's, for research; CAVIAR is for any use, with thanks to the EC funded
+project IST 2001 37540; the annotation of PETS 2009 by A. Milan, for research.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.annotations import LAST
+from torchvision_dddas.evaluation.datasets.boxes import table_of, truth_of
+from torchvision_dddas.evaluation.datasets.footage import agreed, whole
+from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.kinds import Wanted
+from torchvision_dddas.evaluation.datasets.numbering import number_of
+from torchvision_dddas.evaluation.datasets.options import checked
+from torchvision_dddas.evaluation.datasets.pictures import images_in, videos_in
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.metrics.mot_text import FARTHEST
+from torchvision_dddas.evaluation.metrics.truth import Truth
+
+TERMS = "research only; cite PETS 2009 or CAVIAR"
+_DEEP = 2
+_BEGINNING = 4096
+
+
+def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
+    """Options. rate_hz: frames a second of pictures; PETS 2009 has 7, CAVIAR 25."""
+    rate_hz = checked("cvml", options, {"rate_hz": None})["rate_hz"]
+    places = {path.stem: path for path in _below(folder, _DEEP) if _is_cvml(path)}
+    if not places:
+        lacking = f"{folder} holds no CVML annotation; wanted NAME.xml with <dataset><frame number=...>"
+        return Dataset("cvml", folder, (), TERMS, (lacking,))
+    notes: list[str] = []
+
+    def clip_of(name: str) -> Clip:
+        path = places[name]
+        homes = (path.with_suffix(""), *((path.parent,) if _alone(path, places.values()) else ()))
+        images = next((found for home in homes if (found := images_in(home))), ())
+        pictures = whole(images, number_of(images[0]) or 0) if images else _video(homes)
+        frames = agreed(pictures, 0, "")
+        truth = read_truth(path, frames)
+        if not pictures:
+            notes.append(f"{name}: no pictures, which belong in {homes[0]}")
+        frames = frames or truth.frames[-1]
+        return Clip(name, path, pictures, rate_hz, frames, truth, shows=("people",))
+
+    found = gather("cvml", folder, TERMS, filter(wanted, places), clip_of)
+    return replace(found, notes=tuple(notes))
+
+
+def read_truth(path: Path, length: int = 0) -> Truth:
+    """An annotation; length: frames of the clip, 0 where it is not known. Raises InputError with file and frame."""
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path} is broken XML: {error}") from None
+    rows = []
+    for frame in root.iter("frame"):
+        number = _number(path, frame, "number", "a frame")
+        where = f"frame {number:g}"
+        if number != int(number) or not 0 <= number < LAST:
+            raise InputError(f"{path}: a frame has the number {number:g}; wanted a whole one, 0 to {LAST - 1}")
+        for target in frame.iterfind("objectlist/object"):
+            identity, box = _number(path, target, "id", where), target.find("box")
+            if box is None or identity != int(identity):
+                raise InputError(f"{path}: object {identity:g} of {where} has no box or no whole id")
+            xc, yc, w, h = (_number(path, box, key, where) for key in ("xc", "yc", "w", "h"))
+            rows.append([number + 1, identity, xc - w / 2, yc - h / 2, w, h])
+    if not rows:
+        raise InputError(f"{path} holds no box; wanted <dataset><frame number=...><objectlist><object id=...><box ...>")
+    v = np.array(rows)
+    table = table_of(path, v[:, 0], v[:, 1], v[:, 2:], np.arange(1, len(v) + 1))
+    return truth_of(path, table, np.ones(len(v), bool), length)
+
+
+def _number(path: Path, element: ElementTree.Element, key: str, where: str) -> float:
+    text = element.get(key, "")
+    try:
+        value = float(text) if "_" not in text else float("nan")
+    except ValueError:
+        value = float("nan")
+    if not (isfinite(value) and abs(value) <= FARTHEST):
+        raise InputError(f"{path}: {element.tag} of {where} has {key}='{text}'; wanted a number")
+    return value
+
+
+def _is_cvml(path: Path) -> bool:
+    """Whether an XML file may be one: broken ones are, so that they are told; calibrations are not."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING)
+    except OSError:
+        return True
+    return b"<dataset" in beginning or b"<Camera" not in beginning
+
+
+def _below(folder: Path, deep: int) -> list[Path]:
+    here = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xml" and path.is_file())
+    return here + [path for name in folders_in(folder) if deep for path in _below(folder / name, deep - 1)]
+
+
+def _alone(path: Path, others: Any) -> bool:
+    return sum(other.parent == path.parent for other in others) == 1
+
+
+def _video(homes: tuple[Path, ...]) -> tuple[Path, ...]:
+    return next((found[:1] for home in homes if (found := videos_in(home))), ())

@@ -1,0 +1,107 @@
+"""What `dddas simulate` writes: a folder a run, or one run.
+
+    RUN/frames/000001.jpg     the UAV's pictures, or clip.mp4; a dropped one is an empty file
+    RUN/truth/masks/          the targets that move, ground vehicles among them
+    RUN/truth/gt.txt          the targets without the ground vehicles, with identities
+    RUN/truth/positions.csv   where they are
+    RUN/telemetry.csv, landmarks.csv, colours.toml, camera.toml, dem.tif
+    RUN/run.json              frames a second, and whether the run was finished
+
+Pixels and boxes are scored by the masks, identities by gt.txt, places by positions.csv; of the latter the targets that
+show, and not the ground vehicles, which are the landmarks. A track on one of them, as the masks show it, is neither
+right nor false. Where masks were not saved, gt.txt has the boxes. The
+pictures of the ground vehicles, ground/, are not read. Options: none. Terms of use: none but this project's licence.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.fitting import fitted
+from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.kinds import Wanted
+from torchvision_dddas.evaluation.datasets.options import checked
+from torchvision_dddas.evaluation.datasets.own import clip_at, pictures_at
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.io.csv_text import opened
+from torchvision_dddas.io.position_tables import read_positions
+
+
+def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
+    """The runs of a folder, or the one that it is. See `kinds.KINDS`."""
+    checked("simulated", options, {})
+    one = (folder / "truth").is_dir()
+    places = {folder.resolve().name: folder} if one else {name: folder / name for name in folders_in(folder)}
+
+    def clip_of(name: str) -> Clip:
+        place = places[name]
+        if not (place / "truth").is_dir():
+            raise InputError(f"{place} has no truth/; wanted what `dddas simulate --out` writes")
+        if not pictures_at(place):
+            raise InputError(f"{place} holds neither frames/ nor clip.mp4; simulate it with --save frames,masks")
+        clip = clip_at(place, name, _rate(place / "run.json"))
+        return fitted(replace(clip, truth=_truth(place / "truth", clip.frames)))
+
+    return gather("simulated", folder, "", filter(wanted, places), clip_of)
+
+
+def _truth(place: Path, frames: int) -> Truth:
+    """Masks, identities and places of a run. Raises InputError where a file is not there or damaged."""
+    for name in ("gt.txt", "positions.csv"):
+        if not (place / name).is_file():
+            raise InputError(f"{place / name} is not there; the run was not finished, simulate it again")
+    empty = not (place / "gt.txt").read_bytes().strip()
+    followed = Truth("boxes", place, {}, {}) if empty else truths.load(place / "gt.txt")
+    shown = Truth("masks", place, truths.load(place / "masks", 1).masks, {}) if (place / "masks").is_dir() else followed
+    if not shown.masks and empty:
+        raise InputError(f"{place}: nothing to find shows in the pictures")
+    positions, fleet = _positions(place / "positions.csv")
+    return replace(
+        shown,
+        boxes=followed.boxes,
+        tracks=followed.tracks,
+        ignored=followed.ignored,
+        length=frames,
+        positions=positions,
+        fleet=fleet,
+    )
+
+
+def _positions(path: Path) -> tuple[Positions, Positions]:
+    """The places of the targets that show, and of the ground vehicles, which are the landmarks. Raises InputError."""
+    said = read_positions(path)
+    with opened(path, "positions") as (header, lines):
+        if lacking := [name for name in ("kind", "visible_px") if name not in header]:
+            raise InputError(f"positions {path} lacks {', '.join(lacking)}; wanted what `dddas simulate` writes")
+        cells = [line.cells for line in lines]
+    frame, kind, shown = (header.index(name) for name in ("frame", "kind", "visible_px"))
+    cells.sort(key=lambda row: float(row[frame]))  # a stable sort, as that of the reader
+    fleet = np.array([row[kind] == "ugv" for row in cells], bool)
+    shows = np.array([row[shown] not in ("", "0") for row in cells], bool)
+
+    def only(rows: np.ndarray) -> Positions:
+        degrees = None if said.lonlat_deg is None else said.lonlat_deg[rows]
+        return Positions(said.frame[rows], said.target[rows], said.east_north_m[rows], degrees)
+
+    return only(shows & ~fleet), only(fleet)
+
+
+def _rate(path: Path) -> float | None:
+    """Frames a second of the run. Raises InputError where it was not finished, or the file is damaged."""
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+        rate, state = said["clip"]["rate_hz"], said["state"]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise InputError(f"{path} does not tell the frames a second: {str(error)[:80]}") from None
+    if state != "complete":
+        raise InputError(f"{path}: the run is {state}; simulate it again")
+    return float(rate) if isinstance(rate, (int, float)) and 0 < rate <= 1000 else None

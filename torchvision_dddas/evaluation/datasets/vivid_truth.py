@@ -1,0 +1,123 @@
+"""The truth of a clip of VIVID (see `vivid`): all its vehicles, or one target by boxes or by masks."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.numbering import labelled
+from torchvision_dddas.evaluation.datasets.picture_size import size_of
+from torchvision_dddas.evaluation.datasets.pictures import images_in
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.mot_text import FARTHEST
+from torchvision_dddas.evaluation.metrics.truth import Truth, read_mask
+from torchvision_dddas.io.csv_text import opened
+
+
+def vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
+    """All vehicles: name,frame,identity,x,y,width,height under a line of names. frames: number of a picture -> frame.
+
+    Frames without a row are taken as empty up to the last that has one. Raises InputError with file and line.
+    """
+    rows = []
+    with opened(path, "truth") as (_, lines):
+        for line in lines:
+            where = f"truth {path}, line {line.number}"
+            if len(line.cells) != 7:
+                raise InputError(f"{where}: {len(line.cells)} columns; wanted name,frame,identity,x,y,width,height")
+            row = _numbers(line.cells[1:], where)
+            rows.append([_frame(row[0], frames, where), *row[1:]])
+    if not rows:
+        raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height a line")
+    values = np.array(rows)
+    if len(strange := values[values[:, 1] % 1 != 0]):
+        raise InputError(f"{path}: {strange[0, 1]:g} is no identity; wanted whole numbers")
+    table = TrackTable(values[:, 0].astype(np.int64), values[:, 1].astype(np.int64), values[:, 2:])
+    if (table.box_px[:, 2:] <= 0).any():
+        raise InputError(f"{path}: a box has no width or height; wanted more than 0")
+    if len(np.unique(values[:, :2], axis=0)) < len(values):
+        raise InputError(f"{path}: an identity stands twice in a frame; wanted one box a frame")
+    last = int(table.frame.max())
+    boxes = {frame: table.box_px[table.frame == frame] for frame in range(1, last + 1)}
+    return Truth("boxes", path, {}, boxes, table, length=len(frames))
+
+
+def boxes(path: Path, frames: Mapping[int, int]) -> Truth:
+    """One target: frame,x,y,width,height of some frames, or x,y,width,height of each. Raises InputError."""
+    try:
+        lines = [x.replace(",", " ").split() for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from None
+    if not lines or len(lines[0]) not in (4, 5):
+        held = f"has {len(lines[0])} columns" if lines else "is empty"
+        raise InputError(f"{path} {held}; wanted frame,x,y,width,height, or x,y,width,height, a line")
+    found: dict[int, np.ndarray] = {}
+    for number, cells in enumerate(lines, 1):
+        where = f"{path}, line {number}"
+        if len(cells) != len(lines[0]):
+            raise InputError(f"{where}: {len(cells)} columns; the first line has {len(lines[0])}")
+        row = _numbers(cells, where, unseen=True)
+        frame = number if len(row) == 4 else _frame(row[0], frames, where)
+        if frame in found:
+            raise InputError(f"{where}: frame {row[0]:g} stands there twice; wanted one box a frame")
+        found[frame] = np.array(row[-4:])
+    if len(lines[0]) == 4 and len(lines) != len(frames):
+        raise InputError(f"{path} has {len(lines)} lines, but the clip {len(frames)} frames; wanted a line a frame")
+    return _one(path, found, len(frames))
+
+
+def masks(place: Path, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
+    """One target, by the box about what is not 0 in its masks. Raises InputError."""
+    files = labelled(images_in(place), frames, place.parent)
+    if not files:
+        raise InputError(f"{place} holds no masks; there belongs the truth of every tenth frame")
+    size = size_of(pictures[0])
+    found = {}
+    for frame, path in files.items():
+        mask = read_mask(path)
+        if mask.shape != size[::-1]:
+            raise InputError(
+                f"{path} is {mask.shape[1]}×{mask.shape[0]} pixels, but {pictures[0].name} {size[0]}×{size[1]}; "
+                "wanted masks of the size of the pictures"
+            )
+        found[frame] = _about(mask)
+    return _one(place, found, len(frames))
+
+
+def _one(place: Path, found: Mapping[int, np.ndarray], length: int) -> Truth:
+    """The truth of one target. found: its box by frame, NaN where it is not seen."""
+    frames = sorted(found)
+    rows = np.array([found[frame] for frame in frames])
+    seen = ~np.isnan(rows).any(axis=1)
+    tracks = TrackTable(np.array(frames)[seen], np.ones(int(seen.sum()), np.int64), rows[seen])
+    return Truth("one target", place, {}, {frame: found[frame][None] for frame in frames}, tracks, length=length)
+
+
+def _about(mask: np.ndarray) -> np.ndarray:
+    v, u = np.nonzero(mask)
+    if not len(u):
+        return np.full(4, np.nan)
+    return np.array([u.min(), v.min(), np.ptp(u) + 1, np.ptp(v) + 1], float)
+
+
+def _numbers(cells: list[str], where: str, unseen: bool = False) -> list[float]:
+    """Cells as numbers. unseen: they may be NaN. Raises InputError."""
+    values = []
+    for cell in cells:
+        try:
+            value = float(cell)
+        except ValueError:
+            value = np.inf
+        if not (abs(value) <= FARTHEST or (unseen and np.isnan(value))):
+            raise InputError(f"{where}: '{cell[:40]}' will not do; wanted a number, {-FARTHEST:g} to {FARTHEST:g}")
+        values.append(value)
+    return values
+
+
+def _frame(number: float, frames: Mapping[int, int], where: str) -> int:
+    """The frame of the picture with a number. Raises InputError where there is none."""
+    found = frames.get(int(number)) if number == number and number == int(number) else None
+    if found is None:
+        raise InputError(f"{where}: there is no picture {number:g}; the clip has {min(frames)} to {max(frames)}")
+    return found

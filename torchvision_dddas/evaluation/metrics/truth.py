@@ -1,0 +1,183 @@
+"""Reading what is true of a clip: masks, one labelled box a frame, or MOTChallenge boxes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.metrics import mot_text
+from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
+from torchvision_dddas.evaluation.metrics.mot_text import FARTHEST
+from torchvision_dddas.evaluation.metrics.seqinfo import read_seqinfo
+from torchvision_dddas.io.image_bytes import decoded
+
+UNNAMED = 1 << 24
+"""The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the values of a mask mean. background: nothing moves there. unscored: nobody knows, or nobody asks.
+
+    Each other value is a mover; movers: where given, only these are, and any other value is unscored. separate: each is
+    one target, so that boxes can be scored too.
+    """
+
+    background: tuple[int, ...] = (0,)
+    unscored: tuple[int, ...] = ()
+    separate: bool = True
+    movers: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres.
+
+    lonlat_deg: (N, 2), None where unknown; of use where results count their metres from another origin.
+    """
+
+    frame: np.ndarray
+    identity: np.ndarray
+    east_north_m: np.ndarray
+    lonlat_deg: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
+
+    tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
+    length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown;
+    fleet: the same of the landmarks, by numbers of their own.
+    ignoring: what becomes of a found box on an ignored one (see `matching.pair`). others: boxes that are neither true
+    nor ignored but may take a found box in that. regions: where nobody labelled; identities mean nothing there. See
+    `uncounted.counted` for all three.
+    """
+
+    kind: Literal["masks", "one target", "boxes"]
+    place: Path
+    masks: dict[int, Path]
+    boxes: dict[int, np.ndarray]
+    tracks: TrackTable | None = None
+    ignored: TrackTable | None = None
+    length: int = 0
+    labels: Labels = Labels()
+    positions: Positions | None = None
+    fleet: Positions | None = None
+    ignoring: Ignoring = "dropped"
+    others: TrackTable | None = None
+    regions: TrackTable | None = None
+
+    @property
+    def frames(self) -> list[int]:
+        """The labelled frames in order."""
+        return sorted(self.masks or self.boxes)
+
+
+def find(place: Path) -> Path | None:
+    """Where the truth of a clip lies: a file, a folder of PNGs, or what a clip's folder holds; None if it has none."""
+    if place.is_file() or _numbered(place):
+        return place
+    for inside in (place / "masks", place / "boxes_xywh.txt", place / "gt.txt", place / "gt" / "gt.txt"):
+        if inside.is_file() or _numbered(inside):
+            return inside
+    return None
+
+
+def load(place: Path, first_frame: int | None = None) -> Truth:
+    """Read the truth. first_frame is the number in a mask's name that is the clip's first frame.
+
+    By default it is 0 if there is a file of that number, else 1. Raises InputError if nothing usable is there.
+    """
+    if not place.exists():
+        raise InputError(f"no truth at {place}")
+    found = find(place)
+    if found is None:
+        raise InputError(f"{place} holds no truth: wanted numbered PNG masks, boxes_xywh.txt or a MOTChallenge gt.txt")
+    if found.is_dir():
+        numbers = _numbered(found)
+        first = first_frame if first_frame is not None else 0 if 0 in numbers else 1
+        early = [n for n in numbers if n < first]
+        if early:
+            raise InputError(f"{numbers[early[0]]} is numbered below the first frame, {first}: see --first-frame")
+        return Truth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
+    return _boxes(found)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
+    try:
+        image = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+    except OSError:
+        image = None
+    if image is None:
+        raise InputError(f"{path} is no picture that can be read")
+    if image.ndim == 2:
+        return image.astype(np.int32)
+    blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
+    return blue + 256 * green + 65536 * red
+
+
+def labels_of(truth: Truth, frame: int) -> np.ndarray:
+    """(H, W) int32 of a frame's mask: 0 background, above it movers, -1 where nothing counts. Raises as `read_mask`."""
+    values, said = read_mask(truth.masks[frame]), truth.labels
+    if said == Labels():
+        return values
+    labels = np.where(np.isin(values, said.background), 0, np.where(values == 0, UNNAMED, values))
+    labels[np.isin(values, said.unscored)] = -1
+    if said.movers:
+        labels[~np.isin(values, said.movers + said.background)] = -1
+    return labels
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    if not folder.is_dir():
+        return {}
+    return {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdecimal()}
+
+
+def _boxes(path: Path) -> Truth:
+    try:
+        lines = [x.replace(",", " ").split() for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from error
+    if not lines:
+        raise InputError(f"{path} is empty: wanted one box a line")
+    if len(lines[0]) == 4:
+        return _one_target(path, lines)
+    if len(lines[0]) < 6:
+        raise InputError(
+            f"{path} has {len(lines[0])} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
+        )
+    rows = mot_text.read_rows(path, "truth")
+    # MOTChallenge: a 0 in the seventh column marks a box that does not count.
+    counts = rows.mark != 0
+    kept = rows.table.at(counts)
+    boxes = {int(f): kept.box_px[kept.frame == f] for f in np.unique(rows.table.frame)}
+    if not rows.named:
+        return Truth("boxes", path, {}, boxes)
+    table = mot_text.with_identities(rows, path)
+    return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), _length(path))
+
+
+def _one_target(path: Path, lines: list[list[str]]) -> Truth:
+    try:
+        table = np.array([[float(v) for v in row] for row in lines])
+    except ValueError as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from error
+    if far := [row for row, far in zip(lines, (np.abs(table) > FARTHEST).any(axis=1), strict=True) if far]:
+        raise InputError(f"{path}: the box {','.join(far[0])} is none; wanted {-FARTHEST:g} to {FARTHEST:g}")
+    there = np.flatnonzero(~np.isnan(table).any(axis=1))
+    tracks = TrackTable(there + 1, np.ones(len(there), np.int64), table[there])
+    return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)}, tracks, None, len(table))
+
+
+def _length(path: Path) -> int:
+    """Frames of the clip by MOTChallenge's seqinfo.ini, beside the truth or above its folder; 0 where there is none."""
+    for place in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini"):
+        if place.is_file():
+            return read_seqinfo(place).length
+    return 0

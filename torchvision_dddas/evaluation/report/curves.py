@@ -1,0 +1,116 @@
+"""Curves of a task: precision over recall, misses against false alarms, and how right it is as a clip goes on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchvision_dddas.evaluation.metrics.ranking import precision_recall, ranking
+from torchvision_dddas.evaluation.report.tallies import main_group, tally
+from torchvision_dddas.evaluation.studies.record import Case
+from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
+
+MOST_CLIPS = 6
+"""Clips whose course is drawn."""
+MOST_FAINT = 40
+"""Curves of single clips behind that of all."""
+_BINS = 80
+_LEAST, _MOST = 0.01, 10.0
+"""False positives an image from which and up to which misses are drawn."""
+_ALL = "all clips"
+
+
+def ranked_charts(cases: Sequence[Case]) -> list[str]:
+    """Precision against recall, and the miss rate against false positives an image, of each group with scores."""
+    charts: list[str] = []
+    for group in dict.fromkeys(g for case in cases if case.scored for g in case.scored.ranked):
+        mine = [(case.clip.name, case.scored) for case in cases if case.scored and group in case.scored.ranked]
+        each = [(name, scored) for name, scored in mine if _true(scored, group)]
+        if not each:
+            continue
+        exact, missing = [], []
+        shown = each[:MOST_FAINT]
+        several = "each clip" if len(shown) == len(each) else f"{len(shown)} of {len(each)} clips"
+        for k, (name, scored) in enumerate([*shown, (_ALL, None)] if len(each) > 1 else each):
+            whole = scored is None or len(each) == 1
+            taken = [one for _, one in each] if scored is None else [scored]
+            said = name if whole else several if k == 0 else ""
+            colour = 1 if whole else 6
+            precision, recall, false = _rates(taken, group)
+            # Both curves go on to where nothing is found, and the second to where no more can be had.
+            start, end = precision[:1], recall[-1:]
+            exact.append(Line(said, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, not whole))
+            ways = np.r_[_LEAST, np.maximum(false, _LEAST), _MOST], 1 - np.r_[0.0, recall, end if len(end) else 0.0]
+            missing.append(Line(said, *ways, colour, not whole, steps=True))
+        up, misses = Axis("precision", 0, 1), Axis("miss rate", 0, 1)
+        across = Axis("false positives an image", _LEAST, _MOST, log=True)
+        charts.append(chart("Precision and recall", Axis("recall", 0, 1), up, exact))
+        charts.append(chart("Misses and false alarms", across, misses, missing))
+    return charts
+
+
+def course_charts(cases: Sequence[Case]) -> list[str]:
+    """How right each clip is as it goes on, of the first MOST_CLIPS that have any course."""
+    charts: list[str] = []
+    for case in cases:
+        if case.scored is None or len(charts) == MOST_CLIPS:
+            continue
+        drawn = _metres(case.clip.name, case.scored) if "error_m" in case.scored.samples else None
+        drawn = drawn or _course(case.clip.name, case.scored)
+        charts += [drawn] if drawn else []
+    return charts
+
+
+def _true(scored: Scored, group: str) -> int:
+    counts = scored.counts.get(group)
+    return getattr(counts, "hit", 0) + getattr(counts, "missed", 0)
+
+
+def _rates(clips: Sequence[Scored], group: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(K,) precision, recall and false positives an image of clips together, as ever lower scores are taken."""
+    rows = np.concatenate([scored.ranked[group] for scored in clips])
+    unit = np.repeat(np.arange(len(clips)), [len(scored.ranked[group]) for scored in clips])
+    true = np.array([_true(scored, group) for scored in clips], float)
+    curve = ranking(rows[:, 0], rows[:, 1], unit, true).curve()
+    precision, recall = precision_recall(curve, float(true.sum()))
+    return precision, recall, curve.false / sum(len(scored.frames) for scored in clips)
+
+
+def _course(name: str, scored: Scored) -> str | None:
+    """F or F1 in bins of frames; crosses where identities change."""
+    group = main_group(scored)
+    if group is None or len(scored.frames) < 2:
+        return None
+    parts = tally(scored, group)
+    size = max(1, -(-len(scored.frames) // _BINS))
+    starts = np.arange(0, len(scored.frames), size)
+    right, wrong = (np.add.reduceat(x, starts) for x in (parts.right, parts.false + parts.missed))
+    whole = 2 * right + wrong
+    share = np.divide(2 * right, whole, out=np.full(len(starts), np.nan), where=whole > 0)
+    at = np.add.reduceat(scored.frames.astype(float), starts) / np.diff(np.r_[starts, len(scored.frames)])
+    measure = parts.measure
+    changed = scored.frames[parts.switched > 0]
+    words = [f"frame {frame}" for frame in changed.tolist()]
+    dots = [Dots("change of identity", changed.astype(float), np.zeros(len(changed)), 2, words, "cross")]
+    line = Line(measure, at, share, 1)
+    return chart(name, Axis("frame"), Axis(measure, 0, 1), [line], dots if len(changed) else [])
+
+
+def _metres(name: str, scored: Scored) -> str | None:
+    frame, error = scored.samples.get("frame"), scored.samples["error_m"]
+    if frame is None or not np.isfinite(error).any():
+        return None
+    known = np.isfinite(error)
+    numbers = np.unique(frame[known])
+    groups = np.array_split(numbers, max(1, min(_BINS, len(numbers))))
+    middle, high, at = [], [], []
+    for group in groups:
+        mine = error[known & (frame >= group[0]) & (frame <= group[-1])]
+        at.append(float(np.mean(group)))
+        middle.append(float(np.median(mine)))
+        high.append(float(np.percentile(mine, 95)))
+    lines = [
+        Line("95 % of the targets", np.array(at), np.array(high), 6, dashed=True),
+        Line("median", np.array(at), np.array(middle), 1),
+    ]
+    return chart(name, Axis("frame"), Axis("error, m", 0), lines)

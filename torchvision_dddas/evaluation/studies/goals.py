@@ -1,0 +1,122 @@
+"""What a sweep wants to be best: one measure of one task, over the clips."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Case, Task
+from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures, names
+
+BY = ("pooled", "mean", "worst")
+
+OF_TASK: Mapping[Task, tuple[str, ...]] = {
+    "motion": ("pixels", "boxes", "ranking", "target", "still"),
+    "tracking": ("tracks", "target_track"),
+    "association": ("tracks",),
+    "people": ("boxes", "ranking"),
+    "location": ("metres", "location"),
+}
+"""The groups of measures that a task can have; which of them a clip has depends on its truth."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """by: over the counts of all clips (pooled), the mean of the clips' values, or the worst of them."""
+
+    task: Task
+    group: str
+    measure: str
+    by: str = "pooled"
+
+    @property
+    def least(self) -> bool:
+        """Whether less is better."""
+        return self.measure in BETTER_LOW
+
+    @property
+    def name(self) -> str:
+        """As it is asked for."""
+        return f"{self.task}.{self.group}.{self.measure}"
+
+
+def goal_of(text: str, by: str = "pooled") -> Goal:
+    """A goal from `task.group.measure`. Raises InputError where it is none, or nothing says whether less is better."""
+    parts = text.split(".", 2)
+    if len(parts) != 3 or not all(parts):
+        raise InputError(f"'{text}' is no measure; wanted task.group.measure, such as motion.pixels.f")
+    task, group, measure = parts
+    for what, word, known in (("task", task, get_args(Task)), ("way", by, BY)):
+        if word not in known:
+            raise InputError(f"'{word}' is no {what} that a study knows; wanted {', '.join(known)}")
+    found: Task = next(known for known in get_args(Task) if known == task)
+    if group not in OF_TASK[found]:
+        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(OF_TASK[found])}")
+    if measure.startswith("n_") and measure not in BETTER_LOW:
+        raise InputError(f"{measure} is a count, of which neither more nor less is better; wanted a measure")
+    if measure not in names(group):
+        raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(names(group))}")
+    return Goal(found, group, measure, by)
+
+
+def groups_of(clip: Clip, task: Task) -> tuple[str, ...]:
+    """The groups of measures that a clip's truth allows, of a task that the clip allows."""
+    truth = clip.truth
+    if task == "motion" and clip.still:
+        return ("still",)
+    if truth is None or task in ("association", "people", "location"):
+        return OF_TASK[task]
+    alone = truth.kind == "one target"
+    if task == "tracking":
+        return ("target_track",) if alone else ("tracks",)
+    if truth.kind == "masks":
+        return ("pixels", "boxes", "ranking") if truth.labels.separate else ("pixels",)
+    return ("target",) if alone else ("boxes", "ranking")
+
+
+def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
+    """Raises InputError where no clip's truth has the goal's group of measures: told before anything is computed."""
+    having = dict.fromkeys(group for clip in clips for group in groups_of(clip, goal.task))
+    if goal.group not in having:
+        told = ", ".join(f"{goal.task}.{group}" for group in having)
+        raise InputError(f"no clip has truth for {goal.name}; there is truth for {told or 'nothing'}")
+
+
+def value_of(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:
+    """The goal's value, NaN where it has none, and why. Raises InputError where no clip can have such a measure."""
+    cases = [case for case in cases if case.task == goal.task]
+    if lost := [case for case in cases if case.scored is None]:
+        # Without its worst clip every setting would look better.
+        return math.nan, f"{lost[0].clip.name}: {lost[0].cause}"
+    having = sorted((case for case in cases if case.scored is not None), key=lambda case: case.clip.name)
+    by_clip = [measures([case.scored]) for case in having if case.scored is not None]
+    if not any(goal.measure in clip.get(goal.group, {}) for clip in by_clip):
+        raise InputError(f"no clip has {goal.name}; there are {_known(by_clip) or 'none'}")
+    if goal.by == "pooled":
+        value = _in(measures([case.scored for case in having if case.scored is not None]), goal)
+    else:
+        values = [value for clip in by_clip if not math.isnan(value := _in(clip, goal))]
+        if not values:
+            value = math.nan
+        elif goal.by == "mean":
+            value = math.fsum(values) / len(values)
+        else:
+            value = max(values) if goal.least else min(values)
+    return value, "the measure is not defined here" if math.isnan(value) else ""
+
+
+def _in(found: Mapping[str, Mapping[str, Any]], goal: Goal) -> float:
+    return float(found.get(goal.group, {}).get(goal.measure, math.nan))
+
+
+def _known(clips: Sequence[Mapping[str, Mapping[str, Any]]]) -> str:
+    names = dict.fromkeys(
+        f"{group}.{name}"
+        for clip in clips
+        for group, found in clip.items()
+        for name in found
+        if not name.startswith("n_") or name in BETTER_LOW
+    )
+    return ", ".join(names)

@@ -1,0 +1,152 @@
+"""The measures of a study: of each clip, of all together, with how sure they are. The content of metrics.json.
+
+It tells nothing of the machine, the time or the folders: the same data, code and settings give the same bytes.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.evaluation.metrics import bootstrap, metres
+from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
+from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.ranking import ranking
+from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
+from torchvision_dddas.evaluation.studies import estimates
+from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
+from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results, Task
+from torchvision_dddas.evaluation.studies.scored import Scored
+
+FORMAT = 1
+
+GROUPS = ("pixels", "boxes", RANKED, "target", "tracks", "target_track", "still", "location", METRES)
+
+BETTER_LOW = frozenset(
+    {
+        *("log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1", "mostly_lost", "other_blobs_per_frame"),
+        *("false_blobs_per_frame", "alarmed", "mean_m", "median_m", "p95_m", "rms_m"),
+        *("relative_mean_m", "relative_median_m", "relative_p95_m", "relative_rms_m"),
+        *("n_switches", "n_fragmentations"),
+    }
+)
+"""Measures of which less is better; of all others more is."""
+
+_EMPTY: Mapping[str, Any] = {
+    "pixels": Pixels(),
+    "boxes": Boxes(),
+    "target": OneTarget(),
+    "tracks": TrackCounts(),
+    "target_track": TargetTrack(),
+    "still": Still(),
+    "location": Located(),
+}
+"""Groups whose measures come of counts, and no counts at all."""
+
+
+def summary(results: Results) -> dict[str, Any]:
+    """By task: "clips" by name, "pooled" over all counts, "mean" over clips, "worst" clip of each measure.
+
+    {"tasks": {task: {"clips": {name: {"frames": F, group: {measure: value}, "intervals": {group: {measure:
+    [low, high] or None}}}}, "pooled": {group: ..., "intervals": ..., "over": {group: "clips" or "frames"}},
+    "mean": {group: {measure: value}}, "worst": {group: {measure: {"clip": name, "value": value}}}, "notes": [...]}},
+    "left_out": [...]}. Groups, measures and n_ counts are those of `dddas evaluate`, and ranking, still, location and
+    metres beside. Intervals of a clip are over blocks of its frames; of all together over clips, where there are
+    enough, else over blocks of frames, which says nothing of other clips.
+    """
+    tasks = {}
+    for task in TASKS:
+        cases = [case for case in results.cases if case.task == task and case.scored is not None]
+        if cases:
+            tasks[task] = _task(task, sorted(cases, key=lambda case: case.clip.name))
+    left_out = [
+        {"clip": case.clip.name, "task": case.task, "cause": _placeless(case.cause)}
+        for case in sorted(results.cases, key=lambda case: (case.clip.name, case.task))
+        if case.scored is None
+    ]
+    return {"format": FORMAT, "name": results.spec.name, "tasks": tasks, "left_out": left_out}
+
+
+def _task(task: Task, cases: Sequence[Case]) -> dict[str, Any]:
+    scored = [case.scored for case in cases if case.scored is not None]
+    clips = {case.clip.name: clip_measures(of_clip) for case, of_clip in zip(cases, scored, strict=True)}
+    notes = [_placeless(note) for one in scored for note in one.notes]
+    return {
+        "what": TASKS[task],
+        "clips": clips,
+        "pooled": pooled_measures(scored),
+        "mean": mean(list(clips.values()), GROUPS),
+        "worst": _worst(clips),
+        "notes": notes,
+    }
+
+
+def clip_measures(scored: Scored) -> dict[str, Any]:
+    """One clip's measures by group, with their intervals over blocks of its frames."""
+    spread = {group: _intervals(group, estimate) for group, estimate in estimates.over_frames([scored]).items()}
+    return {"frames": len(scored.frames), **measures([scored]), "intervals": spread}
+
+
+def pooled_measures(cases: Sequence[Scored]) -> dict[str, Any]:
+    """The measures of all counts together. Cases in the order of their names: sums of reals depend on it."""
+    by_clip, by_frame = estimates.over_clips(cases), estimates.over_frames(cases)
+    spread, over = {}, {}
+    for group, estimate in by_clip.items():
+        enough = bootstrap.parts(estimate.strata) >= bootstrap.FEWEST
+        over[group] = "clips" if enough else "frames"
+        if enough or group in by_frame:
+            spread[group] = _intervals(group, estimate if enough else by_frame[group])
+    return {**measures(cases), "intervals": spread, "over": over}
+
+
+def measures(cases: Sequence[Scored]) -> dict[str, dict[str, float]]:
+    """The figures of one case, or of several together, by group."""
+    found = figures(pooled([scored.counts for scored in cases]))
+    if having := [scored for scored in cases if "boxes" in scored.ranked]:
+        ranked = estimates.ranking_of(having)
+        counts = {"n_true": int(ranked.true.sum()), "n_found": len(ranked.right), "n_images": int(ranked.images.sum())}
+        found[RANKED] = {**ranked.measures(), **counts}
+    if having := [scored for scored in cases if "error_m" in scored.samples]:
+        samples = estimates.samples_of(having)
+        found[METRES] = {**metres.measures(samples), "n_places": len(samples["error_m"])}
+    return {group: found[group] for group in GROUPS if group in found}
+
+
+def names(group: str) -> tuple[str, ...]:
+    """The measures that a group of GROUPS can have, and those of its counts of which less is better."""
+    if group == RANKED:
+        return tuple(ranking(*np.zeros((5, 0))).measures())
+    if group == METRES:
+        none = dict.fromkeys(("error_m", "inside", "relative_error_m", "relative_inside"), np.zeros(0))
+        return tuple(metres.measures(none))
+    found = figures({group: _EMPTY[group]})[group]
+    return tuple(name for name in found if not name.startswith("n_") or name in BETTER_LOW)
+
+
+def _intervals(group: str, estimate: Estimate) -> dict[str, list[float] | None]:
+    found = bootstrap.intervals(estimate.statistic, estimate.strata, estimate.seed(group))
+    return {name: None if span is None else list(span) for name, span in found.items()}
+
+
+def _worst(clips: dict[str, dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+    worst: dict[str, dict[str, dict[str, Any]]] = {}
+    for group in GROUPS:
+        for name, clip in clips.items():
+            for measure, value in clip.get(group, {}).items():
+                if measure.startswith("n_") or math.isnan(value):
+                    continue
+                known = worst.setdefault(group, {}).get(measure)
+                sign = -1 if measure in BETTER_LOW else 1
+                if known is None or sign * value < sign * known["value"]:
+                    worst[group][measure] = {"clip": name, "value": value}
+    return worst
+
+
+def _placeless(words: str) -> str:
+    """Words without the folders that lie on this machine alone: of a path its last part stays."""
+    return re.sub(r"(?:(?<=[\s('\"])|^)(?:[A-Za-z]:)?[\\/](?:[^\s:;,'\"()]*[\\/])?([^\s:;,'\"()\\/]*)", r"\1", words)

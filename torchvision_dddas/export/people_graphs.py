@@ -1,0 +1,240 @@
+"""The graphs that score windows for people, from the constants of `ops.hog`.
+
+    people.onnx             uint8 picture (H + 2, W + 2, 3 or 1) with a border of one pixel -> `scores` (ny, nx)
+    people_histograms.onnx  `polar` (1, 2, H, W), magnitude and magnitude x direction in radians, -> `histograms`
+                            (F, ny, nx) of all blocks, not yet normalised
+    people_scores.onnx      `histograms` -> `scores`
+
+The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
+tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
+of the same cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
+
+The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 160 ns a pixel on
+one core at 640x480 where people.onnx takes 110 and people_histograms.onnx 14 (cv2.HOGDescriptor all in all 54), as ONNX
+Runtime has quick convolutions and slow copies.
+"""
+
+import math
+
+import numpy as np
+import onnxruntime
+import torch
+from onnx import TensorProto
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.export.checked import Check, Made
+from torchvision_dddas.export.graph_builder import FAR, Graph
+from torchvision_dddas.functional import hog
+from torchvision_dddas.people.onnx_scorer import BAKED
+from torchvision_dddas.people.torch_scorer import layout
+
+TOLERANCE = 5e-5
+CHANNELS = 16  # ONNX Runtime's quick convolutions take channels by 16, on smaller vectors by 8 or 4
+ABOUT = {
+    "people.onnx": "scores of all windows of a picture for people (HOG and a linear SVM), for any runtime",
+    "people_histograms.onnx": "the same, first half as the onboard back end runs it: histograms of all blocks",
+    "people_scores.onnx": "the same, second half: scores from histograms",
+}
+
+
+def made(knobs: PeopleKnobs) -> dict[str, Made]:
+    """The files by their names, compared with torch."""
+    wanted = layout(knobs)
+    files = graphs(wanted)
+    check = Check("score", largest_difference(files, wanted), TOLERANCE)
+    return {name: Made(content, ABOUT[name], "ops.hog", baked(wanted), (check,)) for name, content in files.items()}
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The steps of `ops.hog`.
+
+
+def polar(graph: Graph, image: str, layout: hog.Layout) -> str:
+    """`ops.hog.gradient` and `angle`: (1, 2, H, W)."""
+    levels = graph("Transpose", graph("Expand", image, graph.whole(1, 1, 3)), perm=[2, 0, 1])
+    levels = graph("Cast", levels, to=TensorProto.FLOAT)
+    if layout.gamma:
+        levels = graph("Sqrt", levels)
+    inner = graph.cut(levels, 1, 1, -1)
+    across = graph("Sub", graph.cut(inner, 2, 2, FAR), graph.cut(inner, 2, 0, -2))
+    inner = graph.cut(levels, 2, 1, -1)
+    down = graph("Sub", graph.cut(inner, 1, 2, FAR), graph.cut(inner, 1, 0, -2))
+    square = graph("Add", graph("Mul", across, across), graph("Mul", down, down))
+    dx, dy, largest = (graph.cut(name, 0, 0, 1) for name in (across, down, square))
+    for channel in (1, 2):
+        here = graph.cut(square, 0, channel, channel + 1)
+        wins = graph("Greater", here, largest)
+        dx = graph("Where", wins, graph.cut(across, 0, channel, channel + 1), dx)
+        dy = graph("Where", wins, graph.cut(down, 0, channel, channel + 1), dy)
+        largest = graph("Max", here, largest)
+    magnitude = graph("Sqrt", largest)
+    x, y = graph("Abs", dx), graph("Abs", dy)
+    ratio = graph("Div", graph("Min", x, y), graph("Add", graph("Max", x, y), graph.number(hog.TINY)))
+    squared = graph("Mul", ratio, ratio)
+    arc = [math.radians(power) for power in hog.ARC]
+    angle = graph("Add", graph("Mul", squared, graph.number(arc[3])), graph.number(arc[2]))
+    for power in (arc[1], arc[0]):
+        angle = graph("Add", graph("Mul", angle, squared), graph.number(power))
+    angle = graph("Mul", angle, ratio)
+    nothing, half_turn = graph.number(0.0), graph.number(math.pi)
+    angle = graph("Where", graph("Less", x, y), graph("Sub", graph.number(math.pi / 2), angle), angle)
+    if layout.signed:
+        angle = graph("Where", graph("Less", dx, nothing), graph("Sub", half_turn, angle), angle)
+        angle = graph("Where", graph("Less", dy, nothing), graph("Sub", graph.number(2 * math.pi), angle), angle)
+    else:
+        folded = graph("Less", graph("Mul", dx, dy), nothing)
+        angle = graph("Where", folded, graph("Sub", half_turn, angle), angle)
+    both = graph("Concat", magnitude, graph("Mul", magnitude, angle), axis=0)
+    return graph("Unsqueeze", both, graph.whole(0))
+
+
+def histograms(graph: Graph, polar: str, layout: hog.Layout, out: str = "") -> str:
+    """From `ops.hog.ramps` to the middle of `blocks`: (F, ny, nx), not yet normalised.
+
+    Ramps are a convolution of one pixel with the rectifier that follows it; pooling is one of each channel by itself,
+    over rows, then over columns; the hats and the order of a block's numbers are one of one pixel again.
+    """
+    at = hog.knots(layout.bins)[:-1]
+    used = len(at) + 1
+    channels = -(-used // CHANNELS) * CHANNELS
+    ramps = np.zeros((channels, 2, 1, 1), np.float32)
+    ramps[0, 0] = 1
+    ramps[1:used, 0, 0, 0] = [-(knot + 0.5) for knot in at]
+    ramps[1:used, 1] = layout.bins / (2 * math.pi if layout.signed else math.pi)
+    maps = graph("Relu", graph("Conv", polar, graph.constant(ramps), kernel_shape=[1, 1]))
+    hats = hog.hats(layout.bins).numpy().astype(np.float32)
+    cells = layout.cells
+    order = np.zeros((layout.bins, cells, cells, cells, cells, channels), np.float32)
+    pooled = []
+    for cy, rows in enumerate(hog.cell_weights(layout).numpy().astype(np.float32)):
+        over_rows = pool(graph, maps, rows[:, None], channels, (layout.stride, 1))
+        for cx, columns in enumerate(hog.cell_weights(layout).numpy().astype(np.float32)):
+            pooled.append(pool(graph, over_rows, columns[None], channels, (1, layout.stride)))
+            order[:, cy, cx, cy, cx, :used] = hats
+    kernel = graph.constant(order.reshape(layout.bins * cells**2, -1, 1, 1))
+    found = graph("Conv", graph("Concat", *pooled, axis=1), kernel, kernel_shape=[1, 1])
+    return graph("Squeeze", found, graph.whole(0), out=out)
+
+
+def pool(graph: Graph, maps: str, weights: np.ndarray, channels: int, stride: tuple[int, int]) -> str:
+    """Weighted sums of each channel by itself."""
+    kernel = graph.constant(np.ascontiguousarray(np.broadcast_to(weights, (channels, 1, *weights.shape))))
+    return graph("Conv", maps, kernel, kernel_shape=list(weights.shape), strides=list(stride), group=channels)
+
+
+def scores(graph: Graph, histograms: str, layout: hog.Layout, out: str) -> str:
+    """The end of `ops.hog.blocks`, and `scores`: (ny - down + 1, nx - across + 1)."""
+    size = layout.bins * layout.cells**2
+    flat = graph("Reshape", histograms, graph.whole(size, -1))
+    # Sums over a block's numbers as products with ones: ONNX Runtime is slow at sums over the first axis.
+    ones = graph.constant(np.ones((1, size), np.float32))
+
+    def norm(numbers: str, soft: float) -> str:
+        square = graph("MatMul", ones, graph("Mul", numbers, numbers))
+        return graph("Add", graph("Sqrt", square), graph.number(soft))
+
+    clipped = graph("Min", graph("Div", flat, norm(flat, size * hog.SOFT_FIRST)), "clip")
+    blocks = graph("Div", clipped, norm(clipped, hog.SOFT_SECOND))
+
+    def length(name: str, axis: int) -> str:
+        return graph("Shape", name, start=axis, end=axis + 1)
+
+    def joined(*names: str) -> str:
+        return graph("Concat", *names, axis=0)
+
+    down, across, ny, nx = length("weights", 0), length("weights", 1), length(histograms, 1), length(histograms, 2)
+    zero, one, rest = graph.whole(0), graph.whole(1), graph.whole(-1)
+    places = graph("Mul", ny, nx)
+    weights = graph("Reshape", "weights", graph.whole(-1, size))
+    part = graph("MatMul", weights, blocks)
+    # Sums over a window's blocks: see `ops.hog.scores`.
+    part = graph("Pad", graph("Reshape", part, joined(down, rest)), joined(graph.whole(0, 0, 0), across))
+    part = graph("ReduceSum", graph("Reshape", part, joined(down, across, rest)), one, keepdims=0)
+    more = graph("Mul", down, nx)
+    part = graph("Pad", graph("Reshape", part, rest), joined(zero, more))
+    part = graph("ReduceSum", graph("Reshape", part, joined(down, rest)), zero, keepdims=0)
+    part = graph("Reshape", graph("Slice", part, zero, places, zero), joined(ny, nx))
+    ends = graph("Add", graph("Sub", joined(ny, nx), joined(down, across)), one)
+    return graph("Add", graph("Slice", part, graph.whole(0, 0), ends, graph.whole(0, 1)), "bias", out=out)
+
+
+def graphs(layout: hog.Layout) -> dict[str, bytes]:
+    """Files by their names."""
+    size = layout.bins * layout.cells**2
+    number: tuple[int, list] = (TensorProto.FLOAT, [])
+    svm = {"weights": (TensorProto.FLOAT, ["down", "across", size]), "bias": number, "clip": number}
+    image = {"image": (TensorProto.UINT8, ["H + 2", "W + 2", "channels"])}
+    made = {"polar": (TensorProto.FLOAT, [1, 2, "H", "W"])}
+    held = {"histograms": (TensorProto.FLOAT, [size, "ny", "nx"])}
+    found = {"scores": (TensorProto.FLOAT, ["windows down", "windows across"])}
+    properties = {name: str(value) for name, value in baked(layout).items()}
+    whole, first, second = Graph(), Graph(), Graph()
+    scores(whole, histograms(whole, polar(whole, "image", layout), layout), layout, "scores")
+    histograms(first, "polar", layout, "histograms")
+    scores(second, "histograms", layout, "scores")
+    return {
+        "people.onnx": whole.model({**image, **svm}, found, properties),
+        "people_histograms.onnx": first.model(made, held, properties),
+        "people_scores.onnx": second.model({**held, **svm}, found, properties),
+    }
+
+
+def baked(layout: hog.Layout) -> dict[str, int]:
+    """The knobs that a graph is made for."""
+    values = layout.cell, layout.block, layout.stride, layout.bins, int(layout.signed), int(layout.gamma)
+    return dict(zip(BAKED, values, strict=True))
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Checking them.
+
+
+def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
+    """Inputs of a picture that is so many pixels larger than the window: patches with noise."""
+    rng = np.random.default_rng(seed)
+    width, height = (length + more + 2 for length, more in zip(layout.window, spare, strict=True))
+    patches = rng.integers(0, 256, (height // 4 + 1, width // 4 + 1, channels))
+    image = np.kron(patches, np.ones((4, 4, 1), int))[:height, :width] + rng.integers(-20, 20, (height, width, 1))
+    across, down = layout.blocks
+    weights = rng.normal(0, 0.02, (down, across, layout.features // (down * across)))
+    return {
+        "image": image.clip(0, 255).astype(np.uint8),
+        "weights": weights.astype(np.float32),
+        "bias": np.array(-0.25, np.float32),
+        "clip": np.array(layout.clip, np.float32),
+    }
+
+
+def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
+    """Between the graphs' scores and torch's, over pictures and windows of several sizes."""
+    sessions = {
+        name: onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        for name, content in files.items()
+    }
+
+    def run(name: str, given: dict[str, np.ndarray]) -> np.ndarray:
+        wanted = [entry.name for entry in sessions[name].get_inputs()]
+        (found,) = sessions[name].run(None, {entry: given[entry] for entry in wanted})
+        return found
+
+    worst, step = 0.0, layout.stride
+    cases = ((0, 0), 0, 3), ((1, 3 * step), 0, 1), ((5 * step, 2), 1, 3), ((87, 190), 2, 3)
+    for seed, (spare, wider, channels) in enumerate(cases, 1):
+        window = (layout.window[0] + wider * step, layout.window[1])
+        other = hog.Layout(window, *tuple(vars(layout).values())[1:])
+        given = example(other, spare, channels, seed)
+        bordered = torch.from_numpy(given["image"]).permute(2, 0, 1)[None].float()
+        dx, dy = hog.gradient(bordered, layout.gamma)
+        magnitude = torch.sqrt(dx * dx + dy * dy)
+        turn = 2 * math.pi if layout.signed else math.pi
+        angle = (hog.angle(dx, dy, layout) + 0.5) * (turn / layout.bins)
+        given["polar"] = torch.cat([magnitude, magnitude * angle], 1).numpy()
+        weights, bias = torch.from_numpy(given["weights"]), torch.from_numpy(given["bias"])
+        wanted = hog.scores(hog.blocks(bordered, other), weights, bias)[0].numpy()
+        given["histograms"] = run("people_histograms.onnx", given)
+        for name in ("people_scores.onnx", "people.onnx"):
+            found = run(name, given)
+            if found.shape != wanted.shape:
+                return float("inf")
+            worst = max(worst, float(np.abs(found - wanted).max()))
+    return worst

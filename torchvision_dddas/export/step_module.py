@@ -1,0 +1,147 @@
+"""What is traced: warp and difference, and the whole step from three pictures to the mask, built from `ops`.
+
+Both do what the chain does with `difference.kind = "to_reference"` and one pair of neighbours, as configs/fast.toml has
+it, but for the correction of exposures. What the controller moves is an input; sizes and budgets are baked in.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchvision_dddas.config import DifferenceKnobs, MorphologyKnobs, RegistrationKnobs
+from torchvision_dddas.detection.keypoint_grid import cell_side
+from torchvision_dddas.detection.torch_foreground import LEVEL, apart, seen_by_both
+from torchvision_dddas.functional import affine, blur, consensus, flow, homography, keypoints, morphology, warp
+
+LEAST_GRID = 8  # a grid of fewer keypoints than this squared is none
+HYPOTHESES = 128
+# Keypoints that search the whole pyramid; the others start where these say, in the full resolution alone. 200 of them
+# all searching would take three times the nodes' work. With 64 scouts, or 3 steps, a motion in some dozens is lost.
+SCOUTS, STEPS, REACH_PX = 96, 6, 3
+REFITS = 1.0, 0.5  # of the tolerance of RANSAC
+
+
+class WarpDifference(nn.Module):
+    """Where three pictures differ after two of them were brought onto the first."""
+
+    def __init__(self, difference: DifferenceKnobs, morphology: MorphologyKnobs) -> None:
+        super().__init__()
+        self.difference, self.morphology = difference, morphology
+
+    def forward(
+        self, reference: Tensor, neighbours: Tensor, neighbour_from_reference: Tensor, threshold: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Difference and mask (255 where something moves), both uint8 (H, W).
+
+        reference: uint8 (H, W). neighbours: uint8 (2, H, W). neighbour_from_reference: float64 (2, 3, 3), px.
+        threshold: uint8 (), grey levels; a larger difference is foreground.
+        """
+        height, width = reference.shape
+        grey, levels = reference[None, None], neighbours[:, None].float()
+        warped = (warp.sample(levels, neighbour_from_reference, (height, width)) + 0.5).floor().to(torch.uint8)
+        first, last = warp.seen_columns(
+            neighbour_from_reference, (height, width), (height, width), self.difference.border_px
+        )
+        seen = seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
+        least = torch.minimum(apart(grey, warped[:1]), apart(grey, warped[1:]))
+        found = blur.gaussian_levels(least, self.difference.blur_px) * seen
+        core = (found > threshold).to(torch.uint8) * 255
+        core = morphology.erode(core, self.morphology.erode_px, "ellipse")
+        return found[0, 0], morphology.closing(core, self.morphology.close_px, "ellipse")[0, 0]
+
+
+class Register(nn.Module):
+    """The background's motion from a picture to each of its neighbours."""
+
+    def __init__(self, size: tuple[int, int], knobs: RegistrationKnobs) -> None:
+        """size: (width, height) in px."""
+        super().__init__()
+        self.knobs, self.cell = knobs, cell_side(*size, knobs)
+        self.count = (size[0] // self.cell) * (size[1] // self.cell)
+        self.levels = 1
+        while self.levels <= knobs.levels and min(size) / 2**self.levels > knobs.window_px:
+            self.levels += 1
+        self.model = affine if knobs.model == "affine" else homography
+
+    def forward(
+        self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """neighbour_from_reference float64 (2, 3, 3), the inliers it has and the keypoints followed, int64 (2,).
+
+        samples: int64 (S, 4), numbers of keypoints from which the hypotheses are drawn. tolerance_px: float64 ().
+        Where nothing agrees: the identity, with 0 inliers.
+        """
+        knobs, pairs = self.knobs, len(neighbours)
+        levels = reference[None, None].float()
+        points, _, valid = keypoints.grid_features(
+            levels, self.cell, knobs.quality, knobs.block_px, least=1e-7 * LEVEL**2
+        )
+        points, valid = points.expand(pairs, -1, -1), valid.expand(pairs, -1)
+        earlier = [level.expand(pairs, -1, -1, -1) for level in flow.pyramid(levels, self.levels)]
+        later = flow.pyramid(neighbours[:, None].float(), self.levels)
+        samples = samples.expand(pairs, -1, -1)
+
+        scouts = consensus.spread(valid, SCOUTS)
+        start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
+        ahead, found = self._track(start, earlier, later, None)
+        found = found & valid.gather(1, scouts)
+        places = samples * SCOUTS // self.count
+        motion = self._ransac(start, ahead, found, places, tolerance_px, (1.0,))[0]
+
+        guess = consensus.transfer(motion.float(), points)
+        end, tracked = self._track(points, earlier[:1], later[:1], guess)
+        tracked = tracked & valid
+        matrix, inliers, agreed = self._ransac(points, end, tracked, samples, tolerance_px, REFITS)
+        return matrix, (inliers & agreed[:, None]).sum(1), tracked.sum(1)
+
+    def _track(
+        self, points: Tensor, earlier: list[Tensor], later: list[Tensor], guess: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        knobs = self.knobs
+        reach = {} if guess is None else {"reach_px": REACH_PX}
+        settings = {
+            "window_px": knobs.window_px,
+            "iterations": min(knobs.iterations, STEPS),
+            "epsilon_px": knobs.epsilon_px,
+            "min_eigen": 1e-4 * LEVEL**2,
+            **reach,
+        }
+        return flow.track(points, earlier, later, guess, **settings)  # type: ignore[arg-type]
+
+    def _ransac(
+        self,
+        start: Tensor,
+        end: Tensor,
+        tracked: Tensor,
+        samples: Tensor,
+        tolerance_px: Tensor,
+        shares: Sequence[float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        gates = tuple(share * tolerance_px for share in shares)
+        samples = samples[..., : self.model.SAMPLE_SIZE]
+        found: tuple[Tensor, Tensor, Tensor] = self.model.ransac(
+            start.double(), end.double(), tracked, samples, tolerance_px, gates
+        )
+        return found
+
+
+class Step(nn.Module):
+    """Registration and difference in one."""
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        registration: RegistrationKnobs,
+        difference: DifferenceKnobs,
+        morph: MorphologyKnobs,
+    ) -> None:
+        super().__init__()
+        self.register, self.compare = Register(size, registration), WarpDifference(difference, morph)
+
+    def forward(
+        self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor, threshold: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What `Register` gives, then what `WarpDifference` does."""
+        matrix, inliers, tracked = self.register(reference, neighbours, samples, tolerance_px)
+        return matrix, inliers, tracked, *self.compare(reference, neighbours, matrix, threshold)

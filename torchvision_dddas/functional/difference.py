@@ -1,0 +1,106 @@
+"""What changed between registered frames, apart from the light (appendix B, step S4)."""
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from torchvision_dddas.functional.blur import box_sum
+from torchvision_dddas.functional.borders import reflected
+
+
+def three_frame(warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
+    """|I(t+2dt -> t) - I(t+dt -> t)|: both warped frames, never one against the raw reference (appendix B, eq. 9)."""
+    return (warped_2 - warped_1).abs()
+
+
+def pair(
+    reference: Float[Tensor, "B C H W"], warped_a: Float[Tensor, "B C H W"], warped_b: Float[Tensor, "B C H W"]
+) -> Float[Tensor, "B C H W"]:
+    """min(|I - A|, |I - B|): marks a mover once, where it stands in the reference (departs from eq. 9)."""
+    return torch.minimum((reference - warped_a).abs(), (reference - warped_b).abs())
+
+
+def exposure(
+    reference: Float[Tensor, "B C H W"],
+    warped: Float[Tensor, "B C H W"],
+    inside: Bool[Tensor, "B 1 H W"],
+    rounds: int = 4,
+    floor: float = 3 / 255,
+    stride: int | None = None,
+) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
+    """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
+
+    Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
+    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every `stride`-th pixel is looked at
+    (default: about 80 rows of them). Without inside pixels, or on a frame of one single
+    grey, the gain stays 1 (and the offset what the mean asks for).
+    """
+    if stride is None:
+        stride = max(1, min(reference.shape[-2:]) // 80)
+    wanted = reference[..., ::stride, ::stride].flatten(1)
+    given = warped[..., ::stride, ::stride].flatten(1)
+    seen = inside[..., ::stride, ::stride].expand(-1, reference.shape[1], -1, -1).flatten(1)
+    gain, offset = torch.ones_like(wanted[:, :1]), masked_median((wanted - given).detach(), seen)
+    for _ in range(rounds):
+        error = (wanted - gain * given - offset).abs().detach()
+        kept = (seen & (error <= (3.7 * masked_median(error, seen)).clamp(min=floor))).to(wanted.dtype)
+        count = kept.sum(1, keepdim=True).clamp(min=1.0)
+        given_mean = (kept * given).sum(1, keepdim=True) / count
+        wanted_mean = (kept * wanted).sum(1, keepdim=True) / count
+        deviation = kept * (given - given_mean)
+        spread = deviation.square().sum(1, keepdim=True) / count
+        together = (deviation * (wanted - wanted_mean)).sum(1, keepdim=True) / count
+        fitted, one = spread > 1e-6, torch.ones_like(spread)
+        gain = torch.where(fitted, together / torch.where(fitted, spread, one), one)
+        offset = wanted_mean - gain * given_mean
+    return gain[:, 0], offset[:, 0]
+
+
+def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
+    """Lower median of the values under the mask; 0 where there are none."""
+    if not torch.compiler.is_compiling():
+        # Several times faster than sorting, but a graph cannot hold it.
+        return values.masked_fill(~mask, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(0.0)
+    middle = (mask.sum(1, keepdim=True) - 1) // 2
+    ordered = values.masked_fill(~mask, torch.inf).sort(1).values
+    return torch.where(middle >= 0, ordered.gather(1, middle.clamp(min=0)), torch.zeros_like(ordered[:, :1]))
+
+
+def noise_weight(
+    texture: Float[Tensor, "B 1 H W"], noise_levels: float | Tensor, gradient_share: float | Tensor
+) -> Float[Tensor, "B 1 H W"]:
+    """One over the noise expected of a pixel, in grey levels: that of a flat region, and a share of the gradient.
+
+    texture: 4 x grey levels a pixel, as `gradient` gives it.
+    """
+    # In place where that keeps the gradient of the knobs.
+    return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()
+
+
+def noise_units(
+    z: UInt8[Tensor, "B 1 H W"], textured: Bool[Tensor, "B 1 H W"], scale: float, least: int = 500
+) -> Float[Tensor, "B"]:
+    """The median of z / scale over textured pixels where that is above 1, else 1; 1 too where they are too few."""
+    units = []
+    for one, here in zip(z, textured, strict=True):
+        counts = torch.bincount(one[here], minlength=256).cumsum(0)
+        total = int(counts[-1])
+        # The mean of the two in the middle, as NumPy takes it.
+        ranks = torch.tensor([(total - 1) // 2, total // 2], device=z.device)
+        median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > least else 0.0
+        units.append(max(1.0, median / scale))
+    return torch.tensor(units, dtype=torch.float64, device=z.device)
+
+
+def gradient(levels: Float[Tensor, "B 1 H W"], block: int = 5) -> Float[Tensor, "B 1 H W"]:
+    """Mean gradient magnitude over block x block pixels, 4 x grey levels a pixel, for pictures in whole grey levels.
+
+    Rounded to whole numbers and cut off at 255 before and after the mean, as OpenCV's 8-bit pictures are.
+    """
+    padded = reflected(levels, 1, 1)
+    steep = padded[..., 2:, :] - padded[..., :-2, :]
+    smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
+    across = smooth[..., 2:] - smooth[..., :-2]
+    down = torch.add(steep[..., 2:] + steep[..., :-2], steep[..., 1:-1], alpha=2.0)
+    magnitude = across.square_().addcmul_(down, down).sqrt_().mul_(0.5).round_().clamp_(max=255.0)
+    return (box_sum(magnitude, block) / block**2).round()

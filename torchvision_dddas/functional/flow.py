@@ -1,0 +1,207 @@
+"""Pyramidal Lucas-Kanade: where points of one frame are in another (appendix B, step S2).
+
+Agrees with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker; sampling patches with `grid_sample` in every
+iteration costs 17-20x OpenCV's time on a CPU, the correlation table per point that is used here 7-9x, 4-5x when sparse
+and predicted: what an iteration needs at a fractional displacement is a bilinear mix of sums at whole ones, made once.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchvision_dddas.functional.borders import reflected, reflected_index
+
+Pyramid = list[Tensor]
+
+
+def pyramid(gray: Float[Tensor, "B 1 H W"], levels: int) -> Pyramid:
+    """`levels` pictures, full size first, each half the one before: cv2.buildOpticalFlowPyramid (5-tap binomial)."""
+    pictures = [gray]
+    for _ in range(levels - 1):
+        pictures.append(_halved(pictures[-1]))
+    return pictures
+
+
+def track(
+    points: Float[Tensor, "B N 2"],
+    pyramid_from: Pyramid,
+    pyramid_to: Pyramid,
+    guess: Float[Tensor, "B N 2"] | None = None,
+    window_px: int = 21,
+    iterations: int = 30,
+    epsilon_px: float = 0.01,
+    min_eigen: float = 1e-4,
+    reach_px: int = 4,
+    rounds: int = 1,
+) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+    """The points' places in the second frame, and which were found.
+
+    guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
+    anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
+    texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the frame.
+    """
+    place = points if guess is None else guess
+    place = place / 2.0 ** (len(pyramid_from) - 1)
+    found = torch.ones_like(points[..., 0], dtype=torch.bool)
+    for level in reversed(range(len(pyramid_from))):
+        patch = _FromPatch(pyramid_from[level], points / 2.0**level, window_px, min_eigen)
+        settled = torch.zeros_like(found)
+        for _ in range(rounds):
+            moved, arrived = _descend(patch, pyramid_to[level], place, settled, iterations, epsilon_px, reach_px)
+            place = torch.where((patch.textured & ~settled)[..., None], moved, place)
+            settled = settled | arrived
+            if _all_true(settled | ~patch.textured):
+                break
+        found = patch.textured & settled
+        if level:
+            place = place * 2.0
+    height, width = pyramid_to[0].shape[-2:]
+    limit = torch.tensor([width - 1.0, height - 1.0], dtype=place.dtype, device=place.device)
+    return place, found & ((place >= 0) & (place <= limit)).all(-1)
+
+
+def forward_backward(
+    points: Float[Tensor, "B N 2"],
+    pyramid_from: Pyramid,
+    pyramid_to: Pyramid,
+    guess: Float[Tensor, "B N 2"] | None = None,
+    limit_px: float = 1.0,
+    **settings: float,
+) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+    """As `track`; found only where tracking back returns to within limit_px of the start. settings: those of `track`.
+
+    The way back is predicted by the same displacement as the way there, so that the start itself is not given away.
+    """
+    there, found = track(points, pyramid_from, pyramid_to, guess, **settings)  # type: ignore[arg-type]
+    back_guess = None if guess is None else there - (guess - points)
+    back, returned = track(there, pyramid_to, pyramid_from, back_guess, **settings)  # type: ignore[arg-type]
+    return there, found & returned & ((back - points).square().sum(-1) <= limit_px**2)
+
+
+class _FromPatch:
+    """What a level needs of the first frame around each point: gradients times the inverse structure tensor.
+
+    gradients: (B, N, 2, window^2), such that their product with a grey patch is the displacement that it asks for.
+    target: (B, N, 2), what the first frame's own patch asks for. textured: whether the tensor can be inverted.
+    """
+
+    def __init__(self, image: Tensor, points: Tensor, window: int, min_eigen: float) -> None:
+        self.window = window
+        corner = points - (window - 1) / 2
+        base = corner.detach().floor()
+        # One pixel more on every side for the gradient, one more to the right and below for the interpolation.
+        grey = _gather(image, base.long() - 1, window + 3)
+        inside = _inside(image, base.long(), window + 1)
+        across = grey[..., 2:] - grey[..., :-2]
+        down = grey[..., 2:, :] - grey[..., :-2, :]
+        along_u = torch.add((across[..., :-2, :] + across[..., 2:, :]) * 3.0, across[..., 1:-1, :], alpha=10.0)
+        along_v = torch.add((down[..., :-2] + down[..., 2:]) * 3.0, down[..., 1:-1], alpha=10.0)
+        # Like OpenCV: grey is mirrored outside the picture, gradients are zero there.
+        slopes = torch.stack([along_u, along_v], 2) * (inside / 32.0)[:, :, None]
+        planes = torch.cat([slopes, grey[..., 1:-1, 1:-1][:, :, None]], 2)
+        part = (corner - base)[..., None, None, None, :]
+        planes = torch.lerp(planes[..., :-1], planes[..., 1:], part[..., 0])
+        planes = torch.lerp(planes[..., :-1, :], planes[..., 1:, :], part[..., 1]).flatten(3)
+        gradients = planes[:, :, :2]
+        products = gradients @ planes.mT
+        uu, uv, vv = products[..., 0, 0], products[..., 0, 1], products[..., 1, 1]
+        smaller = 0.5 * (uu + vv - ((uu - vv).square() + 4.0 * uv.square()).detach().sqrt())
+        # OpenCV's unit: grey levels 0..255, Scharr sums 32 times the slope, scaled by 2^-20, per pixel.
+        self.textured = smaller.detach() * (255.0**2 / 1024.0 / window**2) >= min_eigen
+        determinant = torch.where(self.textured, uu * vv - uv * uv, torch.ones_like(uu))
+        inverse = torch.stack([vv, -uv, -uv, uu], -1).unflatten(-1, (2, 2)) / determinant[..., None, None]
+        self.gradients = inverse @ gradients
+        self.target = (inverse @ products[..., 2:])[..., 0]
+
+
+def _descend(
+    patch: _FromPatch, image: Tensor, start: Tensor, settled: Tensor, iterations: int, epsilon_px: float, reach: int
+) -> tuple[Tensor, Tensor]:
+    """Newton steps from `start` inside one table: the places reached, and whether each stayed within it."""
+    corner = start - (patch.window - 1) / 2
+    base = corner.detach().floor()
+    span = 2 * reach + 2
+    table = _table(patch, image, base.long() - reach, span)
+    # Places are kept relative to the table's origin, where a table index is a whole displacement.
+    origin = base - reach
+    place = corner - origin
+    corners = torch.tensor([0, 1, span, span + 1], device=place.device)
+    active = ~settled
+    last = torch.zeros_like(place)
+    for _ in range(iterations):
+        whole = place.detach().floor().clamp(max=span - 2)
+        part = place - whole
+        columns, rows = whole.long().unbind(-1)
+        index = (rows * span + columns)[..., None] + corners
+        (left, above), (right, below) = (1.0 - part).unbind(-1), part.unbind(-1)
+        weights = torch.stack([left * above, right * above, left * below, right * below], -1)
+        seen = (weights[..., None, :] * table.gather(3, index[..., None, :].expand(-1, -1, 2, -1))).sum(-1)
+        step = patch.target - seen
+        length = step.detach()
+        # At rest, or swinging between two places: then OpenCV stops half-way.
+        rest = length.square().sum(-1) <= epsilon_px**2
+        swing = ((length + last).abs().amax(-1) < 0.01) & ~rest
+        last = length
+        share = active * (1.0 - 0.5 * swing)
+        # Beyond the table mixing would extrapolate: a point waits at the edge, and the next table is centred there.
+        place = (place + share[..., None] * step).clamp(0, span - 1)
+        active = active & ~(rest | swing)
+        if _all_true(~active):
+            break
+    inside = ((place > 0) & (place < span - 1)).all(-1)
+    return place + origin + (patch.window - 1) / 2, inside
+
+
+def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float[Tensor, "B N 2 T"]:
+    """The displacement that the second frame's patch asks for at each of span x span whole displacements."""
+    window = patch.window
+    grey = _gather(image, corner, window + span - 1)
+    batch, count, side = grey.shape[:3]
+    # Columns unfolded, rows not: rows of one displacement lie together in memory, so each is one strided product.
+    # Dimension 3 and not -1: torch's older ONNX exporter gets a negative one wrong.
+    strips = grey.unfold(3, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
+    gradients = patch.gradients.flatten(0, 1)
+    area = window * window
+    rows = [gradients @ strips[..., shift * window : shift * window + area].mT for shift in range(span)]
+    return torch.stack(rows, 2).reshape(batch, count, 2, span * span)
+
+
+def _gather(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side side"]:
+    """Pixels from each whole corner (u, v), mirrored outside the picture."""
+    batch, _, height, width = image.shape
+    steps = torch.arange(side, device=image.device)
+    columns = reflected_index(corner[..., :1] + steps, width)
+    rows = reflected_index(corner[..., 1:] + steps, height) * width
+    frame = torch.arange(batch, device=image.device).reshape(-1, 1, 1) * (height * width)
+    return image.take((rows + frame)[..., :, None] + columns[..., None, :])
+
+
+def _inside(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side side"]:
+    """1 where the pixels from each corner lie in the picture, else 0."""
+    steps = torch.arange(side, device=image.device)
+    columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps
+    along_u = ((columns >= 0) & (columns < image.shape[-1])).to(image.dtype)
+    along_v = ((rows >= 0) & (rows < image.shape[-2])).to(image.dtype)
+    return along_v[..., :, None] * along_u[..., None, :]
+
+
+def _halved(gray: Tensor) -> Tensor:
+    padded = reflected(gray, 2, 2)
+    for dim in (-2, -1):
+        size = (padded.shape[dim] - 3) // 2
+        taps = [padded.narrow(dim, k, padded.shape[dim] - k) for k in range(5)]
+        even = [tap[..., ::2, :] if dim == -2 else tap[..., ::2] for tap in taps]
+        far, near, middle = (
+            even[0].narrow(dim, 0, size) + even[4].narrow(dim, 0, size),
+            even[1].narrow(dim, 0, size) + even[3].narrow(dim, 0, size),
+            even[2].narrow(dim, 0, size),
+        )
+        padded = torch.add(torch.add(far, near, alpha=4.0), middle, alpha=6.0) / 16.0
+    return padded
+
+
+def _all_true(condition: Tensor) -> bool:
+    """Whether to stop early: only where asking is cheap and the graph is not being traced; results are the same."""
+    if condition.device.type != "cpu" or torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[attr-defined]
+        return False
+    return bool(condition.all())

@@ -1,0 +1,175 @@
+"""Errors of telemetry and of the landmarks' receivers from frame to frame: they change slowly, so a clip tells them.
+
+Each is an Ornstein-Uhlenbeck process and noise: together they have the standard deviation that the error is said to
+have, and the process forgets itself by a time constant. The first frame thus is like any single one; later ones gain
+by what is independent, pixels and motion, and no confidence grows beyond what slow errors allow.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+
+from torchvision_dddas.geo.linearization import Glimpse
+from torchvision_dddas.geo.pose_estimation import EXACT_M, Expected, Prior, Solution
+from torchvision_dddas.types import Marks
+
+FORGOTTEN = 4.0
+"""A landmark not seen for so many time constants is forgotten."""
+
+ANOTHER = 1.5
+"""A receiver whose standard deviation changes by more than this factor works another way: its error is another."""
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """What of the errors lasts from frame to frame; the rest is new in every frame.
+
+    telemetry: share of the variance of its angles and place: a gimbal shakes, samples are older than the picture.
+    landmarks: share of that of their reports. pace: how many times faster than by aerial.correlation_s the rest is
+    forgotten; infinite where nothing is kept.
+    """
+
+    telemetry: float = 0.9
+    landmarks: float = 1.0
+    pace: float = 1.0
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What is known of the errors at a time: truth less report, telemetry's seven first, then two a landmark.
+
+    covariance: with the mean, (7 + 2m,) of landmarks `ids` (m,), last seen at `seen_s`. sigma: (7 + 2m,) that they
+    have when nothing is known; NaN for what the telemetry has never told.
+    """
+
+    time_s: float = float("nan")
+    ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    seen_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    mean: np.ndarray = field(default_factory=lambda: np.zeros(7))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((7, 7)))
+    sigma: np.ndarray = field(default_factory=lambda: np.full(7, np.nan))
+    lasting: Lasting = Lasting()
+
+    @property
+    def told(self) -> bool:
+        """Whether any frame has told anything."""
+        return bool(self.mean.any())
+
+    def at(self, time_s: float, prior: Prior, marks: Marks, correlation_s: float) -> "Memory":
+        """The same at a later time, with the landmarks that are new."""
+        correlation_s /= self.lasting.pace
+        gap_s = time_s - self.time_s
+        keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
+        known, before = np.flatnonzero(prior.known), self._of(time_s, marks, FORGOTTEN * correlation_s)
+        was, size = before.sigma, len(before.mean)
+        sigma = was.copy()
+        sigma[known] = 1 / np.sqrt(np.diag(prior.information)[known])
+        sigma[places_of(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
+        with np.errstate(invalid="ignore"):
+            grown = sigma / was
+        # The telemetry's may be a share of the altitude, and grow with it.
+        grown[7:] = np.where((grown[7:] < ANOTHER) & (grown[7:] > 1 / ANOTHER), grown[7:], 0.0)
+        factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
+        filled = np.where(np.isfinite(sigma), sigma, 0.0) * self._slow(size)
+        was = was * self._slow(size)
+        covariance = before.covariance * np.outer(factor, factor)
+        # What is new of each: all that it has beyond what it keeps of its standard deviation.
+        covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
+        return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
+
+    def _of(self, time_s: float, marks: Marks, forgotten_s: float) -> "Memory":
+        """The same with the landmarks that are new, and without those not seen for too long."""
+        seen, old = marks.landmark.tolist(), self.ids.tolist()
+        staying = [
+            row for row, identity in enumerate(old) if identity in seen or time_s - self.seen_s[row] <= forgotten_s
+        ]
+        new = [row for row, identity in enumerate(seen) if identity not in old]
+        if len(staying) == len(old) and not new:
+            return self
+        from_old = np.concatenate([np.arange(7), *(7 + 2 * row + np.arange(2) for row in staying)]).astype(int)
+        kept = len(from_old)
+        size = kept + 2 * len(new)
+        mean, covariance, sigma = np.zeros(size), np.zeros((size, size)), np.full(size, np.nan)
+        mean[:kept], sigma[:kept] = self.mean[from_old], self.sigma[from_old]
+        covariance[:kept, :kept] = self.covariance[np.ix_(from_old, from_old)]
+        ids = np.concatenate([self.ids[staying], marks.landmark[new]]).astype(np.int64)
+        seen_s = np.concatenate([self.seen_s[staying], np.full(len(new), time_s)])
+        return replace(self, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
+
+    def expected(self, prior: Prior, marks: Marks) -> Expected:
+        """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
+        known, n = np.flatnonzero(prior.known), len(marks)
+        ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
+        theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
+        mean, information = np.zeros(7 + 2 * n), np.zeros((7 + 2 * n, 7 + 2 * n))
+        mean[theirs] = self.mean[ours]
+        inverse = np.linalg.inv(self._seen(ours))
+        information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
+        return Expected(prior.pose, mean, information, prior.known)
+
+    def foretold(self, marks: Marks, glimpse: Glimpse) -> tuple[float, "Memory"]:
+        """How well it foretold a picture, the log of the density of where the landmarks were, and itself after it.
+
+        The telemetry must tell all seven.
+        """
+        ours = np.concatenate([np.arange(7), places_of(self.ids, marks.landmark)])
+        crossed = self.covariance[:, ours] @ glimpse.slopes.T
+        expected = glimpse.slopes @ self._seen(ours) @ glimpse.slopes.T + np.diag(glimpse.variance_px2)
+        surprise = glimpse.shown_px - glimpse.slopes @ self.mean[ours]
+        root = np.linalg.cholesky(expected)
+        white = np.linalg.solve(root, np.column_stack([surprise, crossed.T]))
+        density = -0.5 * float(white[:, 0] @ white[:, 0]) - float(np.log(np.diag(root)).sum())
+        covariance = self.covariance - white[:, 1:].T @ white[:, 1:]
+        mean = self.mean + white[:, 1:].T @ white[:, 0]
+        return density, self._with(mean, covariance, marks.landmark[glimpse.used])
+
+    def after(self, prior: Prior, marks: Marks, used: np.ndarray, solution: Solution) -> "Memory":
+        """With what a frame told: of errors that were not looked at too, as far as they go with those that were."""
+        known, n = np.flatnonzero(prior.known), len(marks)
+        ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
+        theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
+        before = self._seen(ours)
+        gain = np.linalg.solve(before, self.covariance[ours]).T
+        now = solution.correction_covariance[np.ix_(theirs, theirs)]
+        mean = self.mean + gain @ (solution.correction[theirs] - self.mean[ours])
+        covariance = self.covariance + gain @ (now - before) @ gain.T
+        return self._with(mean, covariance, marks.landmark[used])
+
+    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "Memory":
+        ids = set(seen.tolist())
+        seen_s = np.array([self.time_s if i in ids else t for i, t in zip(self.ids.tolist(), self.seen_s, strict=True)])
+        return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
+
+    def anew(self, rows: np.ndarray) -> "Memory":
+        """With some of its errors as if nothing were known of them."""
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[rows] = 0
+        covariance[rows] = 0
+        covariance[:, rows] = 0
+        slow = (self.sigma * self._slow(len(mean)))[rows]
+        covariance[rows, rows] = np.where(np.isfinite(slow), slow, 0.0) ** 2
+        return replace(self, mean=mean, covariance=covariance)
+
+    def _seen(self, rows: np.ndarray) -> np.ndarray:
+        """The covariance of errors as a single frame has them: what lasts, and what is new in every frame."""
+        sigma = self.sigma[rows]
+        return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - self._slow(len(self.mean))[rows] ** 2))
+
+    def _slow(self, size: int) -> np.ndarray:
+        return _slow(self.lasting, size)
+
+
+@lru_cache(maxsize=256)
+def _slow(lasting: Lasting, size: int) -> np.ndarray:
+    """Share of each standard deviation that lasts; a focal length does. It is shared, and not to be written to."""
+    share = np.full(size, np.sqrt(lasting.landmarks))
+    share[:6], share[6] = np.sqrt(lasting.telemetry), 1.0
+    share.flags.writeable = False
+    return share
+
+
+def places_of(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Where the two errors of each wanted landmark stand."""
+    row = {identity: 7 + 2 * k for k, identity in enumerate(ids.tolist())}
+    return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)

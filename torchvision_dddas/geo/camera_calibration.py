@@ -1,0 +1,122 @@
+"""How high a camera stands and where it looks, from upright people all over its picture.
+
+With the camera h above the ground, the slope of the ray to a head is 1 - H / h of that to the feet (see `ranging`). So
+each body's feet and the camera's pitch say where its head is to be, and the pitch and height that fit all heads are
+the camera's. People of different heights average out; the scale is that of the typical person, H.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.ranging import level
+from torchvision_dddas.types import Camera, Float
+
+FEWEST = 20
+"""Boxes that it takes."""
+
+NARROW = 0.3
+"""The rows that hold the feet of all but a tenth on either side must be so many body heights at least."""
+
+BLOCKS = 10
+"""The boxes are left out in so many stretches of time in turn, to learn how much the answer hangs on single people."""
+
+PITCHES = np.radians([0.0, 5.0, 15.0, 30.0, 50.0])
+"""Where the search begins, each with HEIGHTS."""
+
+HEIGHTS = (0.5, 1.2, 2.5, 8.0)
+"""In typical people's heights."""
+
+POOR = 0.5
+"""Where the typical body misses by so many of its heights, nothing was found."""
+
+UNSURE = 0.2
+"""A standard deviation of the height that is a larger share of it is no answer."""
+
+
+@dataclass(frozen=True)
+class Stance:
+    """height_m: of the camera. pitch_rad: down. Each with its standard deviation. miss: a body's typical residual."""
+
+    height_m: float
+    pitch_rad: float
+    height_sigma_m: float
+    pitch_sigma_rad: float
+    miss: float
+
+
+def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: float, height_sigma: float) -> Stance:
+    """The camera's height and pitch, from boxes of upright people that the picture's border does not cut.
+
+    box_px: in the order of time. height_sigma: standard deviation of a box's height, in heights; boxes that miss by
+    much more hardly count. miss: the median residual, in box heights.
+    Raises InputError where there are fewer than FEWEST boxes that the lens can show, or they do not tell, as when all
+    feet are in one row, or no pose fits them.
+    """
+    box = np.asarray(box_px, float).reshape(-1, 4)
+    u = box[:, 0] + box[:, 2] / 2 - 0.5
+    feet, head = (level(u, v - 0.5, camera)[1] for v in (box[:, 1] + box[:, 3], box[:, 1]))
+    seen = np.isfinite(feet) & np.isfinite(head) & (feet > head)
+    box, feet, head = box[seen], feet[seen], head[seen]
+    if len(box) < FEWEST:
+        lost = f" (and {(~seen).sum()} where the lens shows nothing: check k1 and k2)" if not seen.all() else ""
+        raise InputError(
+            f"{len(box)} whole boxes of people{lost}; wanted {FEWEST} at least to tell how the camera stands"
+        )
+    low, high = np.percentile(box[:, 1] + box[:, 3], [10, 90])
+    if high - low < NARROW * np.median(box[:, 3]):
+        raise InputError(
+            f"most feet lie within {high - low:.0f} rows of the picture, which does not tell how the camera stands; "
+            "give people near and far"
+        )
+
+    from scipy.optimize import least_squares  # here, as it takes half a second and 45 MB
+
+    def residual(guess: np.ndarray, here: np.ndarray) -> np.ndarray:
+        pitch, height = guess[0], np.exp(guess[1])
+        slope = np.tan(pitch + np.arctan(feet[here])) * (1 - 1 / height)
+        return (head[here] - np.tan(np.arctan(slope) - pitch)) / (feet[here] - head[here])
+
+    def fit(here: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+        # Beyond the horizon the tangent turns round; the bounds keep feet of most people below it.
+        found = least_squares(
+            residual,
+            start,
+            args=(here,),
+            loss="soft_l1",
+            f_scale=max(height_sigma, 1e-3),
+            bounds=([-0.3, np.log(0.05)], [1.5, np.log(1000)]),
+        )
+        return found.x, float(found.cost)
+
+    everyone = np.ones(len(box), bool)
+    starts = [np.array([pitch, np.log(height)]) for pitch in PITCHES for height in HEIGHTS]
+    best = min((fit(everyone, start) for start in starts), key=lambda found: found[1])[0]
+    block = np.arange(len(box)) * BLOCKS // len(box)
+    without = np.array([fit(block != n, best)[0] for n in range(BLOCKS)])
+    sigma = np.sqrt((BLOCKS - 1) * without.var(axis=0))
+    height = float(np.exp(best[1])) * body_height_m
+    if not sigma[1] < UNSURE:
+        raise InputError(
+            f"these people do not tell how the camera stands: its height would be {height:.2f} m, unsure by "
+            f"{min(sigma[1], 99):.0%}. Give more of them, near and far"
+        )
+    miss = float(np.median(np.abs(residual(best, everyone))))
+    if not miss < POOR:
+        raise InputError(
+            f"no height and pitch fit these boxes: half of them miss by more than {min(miss, 99):.0%} of their height; "
+            "check that they are upright people, and the camera's focal length and size"
+        )
+    return Stance(height, float(best[0]), float(sigma[1]) * height, float(sigma[0]), miss)
+
+
+def stood(camera: Camera, found: Stance) -> Camera:
+    """The camera, with what was found."""
+    return replace(
+        camera,
+        height_m=found.height_m,
+        pitch_rad=found.pitch_rad,
+        height_sigma_m=found.height_sigma_m,
+        pitch_sigma_rad=found.pitch_sigma_rad,
+    )

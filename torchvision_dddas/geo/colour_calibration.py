@@ -1,0 +1,210 @@
+"""Ranges of colour for landmarks from pictures, without a click: patches that stand out from the ground by hue."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.geo.colour_patches import Patches, patches_of
+
+HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
+"""Names of hues, in OpenCV's units."""
+
+# A patch is looked for in windows of hue of this half width and step, above these saturations and this value.
+_HALF, _STEP = 7, 4
+_SATURATIONS, _VALUE = (80, 120, 160), 50
+# It fills so much of its box, which is not longer than so many times its width, and covers no more of the picture.
+_FILL, _LONG, _MOST = 0.4, 3.0, 0.02
+# A hue of which a larger share of the picture is belongs to the ground.
+_GROUND = 0.05
+# Colours are further apart in hue than this.
+_APART = 10
+# From this area on size says nothing; and a clear colour has a score of at least the second.
+_AREA_PX, _CLEAR = 150.0, 0.24
+# Ranges go beyond what was seen by these, hue, saturation and value: the widest that marks the least else is taken.
+_MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
+_LOWEST = (40, 30)
+_ENDS = (2, 98)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A patch of a colour. hue: of most of its pixels. pixels: (P, 3) uint8 hue, saturation, value. score: in [0, 1].
+
+    picture: which it is in, counted from 0. box_px: x, y, width, height.
+    """
+
+    hue: float
+    pixels: np.ndarray
+    score: float
+    picture: int
+    box_px: tuple[int, int, int, int]
+
+
+def hsv_of(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
+    return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+
+
+def marked(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
+    if low[0] <= high[0]:
+        return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
+    below = cv2.inRange(hsv, np.asarray(low, float), np.array([180.0, *high[1:]]))
+    return cv2.bitwise_or(below, cv2.inRange(hsv, np.array([0.0, *low[1:]]), np.asarray(high, float)))
+
+
+def standing_out(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[Sample]:
+    """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
+
+    hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation in the picture and around
+    it: ground and plants, of whatever hue, are in many places.
+    """
+    found: list[Sample] = []
+    counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
+    for saturation in _SATURATIONS:
+        for hue in range(0, 180, _STEP):
+            window = np.arange(hue - _HALF, hue + _HALF + 1) % 180
+            if counts[window, saturation:].sum() > _GROUND * hsv[..., 0].size:
+                continue
+            low = np.array([(hue - _HALF) % 180, saturation, _VALUE])
+            mask = marked(hsv, low, np.array([(hue + _HALF) % 180, 255, 255]))
+            total = int(np.count_nonzero(mask))
+            if total >= least_area_px:
+                patches = patches_of(mask, least_area_px)
+                found += [_sample(hsv, mask, patches, k, total, picture) for k in _compact(patches, mask.size)]
+    return _distinct(sorted(found, key=lambda sample: -sample.score))
+
+
+def in_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0) -> Sample | None:
+    """The saturated colour that most of a box x, y, width, height is of; None where nothing in it is saturated."""
+    x, y, width, height = box_px
+    part = hsv[y : y + height, x : x + width].reshape(-1, 3)
+    vivid = part[(part[:, 1] >= _SATURATIONS[0]) & (part[:, 2] >= _VALUE)]
+    if len(vivid) < max(4, len(part) // 10):
+        return None
+    count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
+    window = np.ones(2 * _HALF + 1)
+    around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], window, "valid")
+    most = vivid[np.abs(hue_apart(vivid[:, 0], float(around.argmax()))) <= _HALF]
+    return Sample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
+
+
+def pooled(samples: Sequence[Sequence[Sample]], count: int | None) -> list[list[Sample]]:
+    """The colours of several pictures, those of one hue together, best first: `count` of them, or those that are clear.
+
+    samples: of each picture.
+    """
+    groups: list[list[Sample]] = []
+    for sample in sorted((one for of in samples for one in of), key=lambda one: -one.score):
+        near = [group for group in groups if abs(hue_apart(group[0].hue, sample.hue)) < _APART]
+        if not near:
+            groups.append([sample])
+        elif all(one.picture != sample.picture for one in near[0]):
+            near[0].append(sample)
+    groups.sort(key=lambda group: -sum(one.score for one in group))
+    if count is not None:
+        return groups[:count]
+    return [group for group in groups if sum(one.score for one in group) >= _CLEAR * len(samples)]
+
+
+def ranges_of(
+    groups: Sequence[Sequence[Sample]], pictures: Sequence[np.ndarray], least_area_px: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
+
+    pictures: (H, W, 3) uint8 in hue, saturation, value. Hues are widened, up to half the gap to the next colour's, as
+    far as the range marks no more patches beside its own; saturations and values likewise.
+    """
+    middle = np.array([group[0].hue for group in groups])
+    ends = []
+    for group, hue in zip(groups, middle, strict=True):
+        pixels = np.concatenate([one.pixels for one in group]).astype(float)
+        away = np.percentile(hue_apart(pixels[:, 0], hue), _ENDS)
+        ends.append((away[0], away[1], *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
+    low, high, others = (np.zeros((len(groups), n), np.int64) for n in (3, 3, 1))
+    for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
+        down, up = _rooms(k, middle, ends)
+        best: int | None = None
+        for hue_margin, saturation_margin, value_margin in _MARGINS:
+            first = int(np.ceil(middle[k] + below - min(hue_margin, down)))
+            last = int(np.floor(middle[k] + above + min(hue_margin, up)))
+            least = (max(saturation - saturation_margin, _LOWEST[0]), max(value - value_margin, _LOWEST[1]))
+            lowest, highest = np.array([first % 180, *map(int, least)]), np.array([max(last, first) % 180, 255, 255])
+            count = sum(_others(hsv, lowest, highest, group, n, least_area_px) for n, hsv in enumerate(pictures))
+            if best is None or count < best:
+                best, low[k], high[k], others[k] = count, lowest, highest, count
+            if count == 0:
+                break
+    return low, high, others[:, 0]
+
+
+def named(hues: Sequence[float]) -> list[str]:
+    """A name for each hue; those of one name are numbered."""
+    words = [min(HUES, key=lambda word: abs(hue_apart(HUES[word], hue))) for hue in hues]
+    return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
+
+
+def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> Sample:
+    x, y, width, height = (int(v) for v in patches.box_px[k])
+    seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
+    hue = _mean_hue(seen[:, 0])
+    # What is rare in the picture, and alone of its kind where it is.
+    around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
+    share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
+    # The middle of the box is all of it, also what the window of hue and saturation left out.
+    inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
+    alike = inner[(np.abs(hue_apart(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
+    pixels = np.concatenate([seen, alike])
+    return Sample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
+
+
+def _mean_hue(hues: np.ndarray) -> float:
+    return float(np.angle(np.exp(1j * np.pi * hues.astype(float) / 90).mean()) * 90 / np.pi % 180)
+
+
+def _compact(patches: Patches, picture_px: int) -> np.ndarray:
+    """The rows of patches like a vehicle's plate."""
+    sides = patches.box_px[:, 2:]
+    fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
+    long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
+    return np.flatnonzero((fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * picture_px))
+
+
+def _distinct(samples: list[Sample]) -> list[Sample]:
+    kept: list[Sample] = []
+    for sample in samples:
+        if all(abs(hue_apart(sample.hue, one.hue)) >= _APART and not _meet(sample.box_px, one.box_px) for one in kept):
+            kept.append(sample)
+    return kept
+
+
+def _meet(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    return all(a[i] < b[i] + b[i + 2] and b[i] < a[i] + a[i + 2] for i in (0, 1))
+
+
+def _rooms(k: int, middle: np.ndarray, ends: Sequence[tuple[float, ...]]) -> tuple[float, float]:
+    """How far a range of hues may be widened down and up: just under half the gap to the next colour's."""
+    down, up = 90.0, 90.0
+    for j in range(len(middle)):
+        if j != k:
+            ahead = (middle[j] - middle[k]) % 180
+            up = min(up, (ahead + ends[j][0] - ends[k][1] - 1) / 2)
+            down = min(down, (180 - ahead - ends[j][1] + ends[k][0] - 1) / 2)
+    return down, up
+
+
+def _others(
+    hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[Sample], picture: int, least_area_px: int
+) -> int:
+    """How many patches a range marks in a picture that are none of the colour's own."""
+    patches = patches_of(marked(hsv, low, high), least_area_px)
+    own = [one.box_px for one in group if one.picture == picture]
+    boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in patches.box_px]
+    return sum(not any(_meet(box, mine) for mine in own) for box in boxes)
+
+
+def hue_apart(hue: np.ndarray | float, other: float) -> np.ndarray:
+    """How far hues are from another, in [-90, 90)."""
+    return (np.asarray(hue, float) - other + 90) % 180 - 90

@@ -1,0 +1,174 @@
+"""Where landmarks are in every frame, from reports that may be slow or drop out, and from the waypoints they plan.
+
+Source: appendix A, IV-A: "a GPS dropout costs nothing", as the vehicles share the waypoints that they mean to pass.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.config import LandmarkKnobs
+from torchvision_dddas.types import Landmarks, Marks
+
+_SLACK = 1.5
+"""Reports that are further apart than this many times their usual distance have a dropout between them."""
+
+_PACE_S = 5.0
+"""The reports of this last time tell how fast a landmark goes."""
+
+
+@dataclass(frozen=True)
+class _Track:
+    """Places over time, sorted: frame (R,), place (R, 2) local metres, sigma_m (R,)."""
+
+    frame: np.ndarray
+    place: np.ndarray
+    sigma_m: np.ndarray
+
+    def at(self, frame: float) -> tuple[np.ndarray, float] | None:
+        """Place and sigma, linear between; None before the first and after the last."""
+        if not len(self.frame) or not self.frame[0] <= frame <= self.frame[-1]:
+            return None
+        after = min(int(np.searchsorted(self.frame, frame, side="right")), len(self.frame) - 1)
+        before = max(after - 1, 0)
+        span = self.frame[after] - self.frame[before]
+        share = (frame - self.frame[before]) / span if span > 0 else 1.0
+        place = (1 - share) * self.place[before] + share * self.place[after]
+        # Not less between two reports than at them: a receiver's error lasts for longer than that.
+        return place, float((1 - share) * self.sigma_m[before] + share * self.sigma_m[after])
+
+
+class Courses:
+    """The places of landmarks over a clip; `at` gives those of one frame.
+
+    Between reports a landmark goes straight on. A gap between them that is unusually long is a dropout: there it
+    follows its planned waypoints, shifted by how far its reports lay from them; without a plan it goes straight from
+    report to report in a gap of up to gap_s, or on as it went for gap_s, its sigma growing by drift_m_s. After that it
+    is absent. A landmark's plan alone, without reports, will do.
+    """
+
+    def __init__(self, landmarks: Landmarks, knobs: LandmarkKnobs, rate_hz: float) -> None:
+        """landmarks: their places in local metres. Raises ValueError for degrees."""
+        if landmarks.geographic:
+            raise ValueError("these landmarks are in degrees; wanted local metres")
+        self.names = landmarks.names
+        self._knobs, self._rate_hz = knobs, rate_hz
+        known = np.isfinite(landmarks.place).all(axis=1)
+        sigma = np.where(np.isfinite(landmarks.sigma_m), landmarks.sigma_m, knobs.sigma_m)
+        reports: list[_Track] = []
+        plans: list[_Track] = []
+        for k in range(len(landmarks.names)):
+            for tracks, planned in ((reports, False), (plans, True)):
+                rows = known & (landmarks.landmark == k) & (landmarks.planned == planned)
+                tracks.append(_Track(landmarks.frame[rows], landmarks.place[rows], sigma[rows]))
+        self._reports, self._plans = reports, plans
+        self._usual = [self._usual_gap(track.frame) for track in reports]
+        seen = np.isfinite(landmarks.image_px).all(axis=1)
+        self._seen_frame = landmarks.frame[seen]
+        self._seen_landmark = landmarks.landmark[seen]
+        self._seen_px = landmarks.image_px[seen]
+
+    @property
+    def pictured(self) -> bool:
+        """Whether the table itself says where pictures show landmarks."""
+        return len(self._seen_frame) > 0
+
+    def at(self, frame: int) -> Marks:
+        """The landmarks of a frame whose places are known.
+
+        Where the table says places in pictures, those that it has for this frame; else all, with image_px NaN.
+        """
+        if self.pictured:
+            first, last = np.searchsorted(self._seen_frame, [frame - 0.5, frame + 0.5])
+            landmark, image = self._seen_landmark[first:last], self._seen_px[first:last]
+        else:
+            landmark = np.arange(len(self.names))
+            image = np.full((len(landmark), 2), np.nan)
+        found = [self._place(int(k), float(frame)) for k in landmark]
+        kept = np.array([place is not None for place in found], bool)
+        known = [place for place in found if place is not None]
+        return Marks(
+            landmark[kept].astype(np.int64),
+            image[kept],
+            np.array([place for place, _ in known], float).reshape(-1, 2),
+            np.array([sigma for _, sigma in known], float),
+            np.full(len(known), self._knobs.pixel_sigma),
+            np.full(len(known), self._knobs.height_m),
+        )
+
+    def speed_m_s(self, frame: int) -> np.ndarray:
+        """(K,) how fast each landmark goes over the ground, over the second around a frame; NaN where unknown."""
+        half = self._rate_hz / 2
+        speeds = np.full(len(self.names), np.nan)
+        for k in range(len(self.names)):
+            ends = [(at, place) for at in (frame - half, frame, frame + half) if (place := self._place(k, at))]
+            if len(ends) > 1:
+                (before, (a, _)), (after, (b, _)) = ends[0], ends[-1]
+                speeds[k] = np.linalg.norm(b - a) / (after - before) * self._rate_hz
+        return speeds
+
+    def _usual_gap(self, frame: np.ndarray) -> float:
+        """Frames between two reports; with two reports alone nothing is usual, and no gap up to gap_s is long."""
+        longest = self._knobs.gap_s * self._rate_hz / _SLACK
+        if len(frame) < 3:
+            return longest
+        return float(np.median(np.diff(frame)))
+
+    def _place(self, k: int, frame: float) -> tuple[np.ndarray, float] | None:
+        reports, near = self._reports[k], _SLACK * self._usual[k]
+        after = int(np.searchsorted(reports.frame, frame))
+        past = frame - reports.frame[after - 1] if after > 0 else np.inf
+        ahead = reports.frame[after] - frame if after < len(reports.frame) else np.inf
+        if ahead == 0 or past + ahead <= near:
+            return reports.at(frame)
+        if planned := self._planned(k, frame, past, ahead):
+            return planned
+        longest = self._knobs.gap_s * self._rate_hz
+        if past + ahead <= longest and (chord := reports.at(frame)):
+            return chord[0], self._grown(chord[1], min(past, ahead))
+        if past <= longest:
+            return self._straight_on(reports, after - 1, frame)
+        # A table that begins a little after the clip.
+        if after == 0 and ahead <= min(near, longest):
+            return self._straight_on(reports, 0, frame)
+        return None
+
+    def _planned(self, k: int, frame: float, past: float, ahead: float) -> tuple[np.ndarray, float] | None:
+        """Along the plan, shifted by how far the reports before and after lay from it."""
+        plan, reports = self._plans[k], self._reports[k]
+        there = plan.at(frame)
+        if there is None:
+            return None
+        place, loose = there
+        offsets, weights, sigmas = [], [], []
+        # The nearer report counts for more, so that nothing jumps where a dropout ends.
+        for distance, weight, at in ((past, ahead, frame - past), (ahead, past, frame + ahead)):
+            if not np.isfinite(distance) or (meant := plan.at(at)) is None:
+                continue
+            report = reports.at(at)
+            if report is not None:
+                offsets.append(report[0] - meant[0])
+                weights.append(weight if np.isfinite(weight) else 1.0)
+                sigmas.append(report[1])
+        if not offsets:
+            return place, loose
+        place = place + np.average(offsets, axis=0, weights=weights)
+        # How far it strays from its plan grows with time, up to how well it keeps to it at all.
+        strayed = min(self._knobs.drift_m_s * min(past, ahead) / self._rate_hz, loose)
+        return place, float(np.hypot(np.average(sigmas, weights=weights), strayed))
+
+    def _straight_on(self, reports: _Track, last: int, frame: float) -> tuple[np.ndarray, float]:
+        """From a report on with the velocity of those around it, before it or after the first."""
+        reach = max(
+            _PACE_S * self._rate_hz, _SLACK * float(np.median(np.diff(reports.frame))) if len(reports.frame) > 1 else 0
+        )
+        away = reports.frame[last] - reports.frame
+        rows = (away >= 0) & (away <= reach) if frame >= reports.frame[last] else (away <= 0) & (-away <= reach)
+        velocity = np.zeros(2)
+        if rows.sum() > 1:
+            velocity = np.polyfit(reports.frame[rows] - reports.frame[last], reports.place[rows], 1)[0]
+        gone = frame - reports.frame[last]
+        return reports.place[last] + velocity * gone, self._grown(float(reports.sigma_m[last]), abs(gone))
+
+    def _grown(self, sigma_m: float, frames: float) -> float:
+        return float(np.hypot(sigma_m, self._knobs.drift_m_s * frames / self._rate_hz))

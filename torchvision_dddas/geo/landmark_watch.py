@@ -1,0 +1,205 @@
+"""Landmarks in the pictures of a clip: found by their colours or by the table's own word, and kept from the targets."""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.aerial_locator import Locator, Look
+from torchvision_dddas.geo.landmark_cutting import cut_out
+from torchvision_dddas.geo.landmark_tracking import LandmarkFollower, Sighted
+from torchvision_dddas.geo.plane import LEAST
+from torchvision_dddas.geo.projection import bent, project
+from torchvision_dddas.geo.solvers import ColourFinder
+from torchvision_dddas.geometry import transfer
+from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
+
+REACH = 0.75
+"""How far from its colour a vehicle reaches, in its lengths: its corners, and its shadow."""
+
+LEAST_M2 = 0.4
+"""What is left of a blob beside a vehicle is a target from so much ground on: a person with a shadow."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A scene without the landmarks, how it lies on the ground, and by what each of its landmarks was seen."""
+
+    scene: Scene
+    look: Look
+    sighted_by: tuple[str, ...]
+
+
+def unpictured(landmarks: Landmarks) -> Landmarks:
+    """Without what the table says of places in pictures: colours tell them."""
+    return replace(landmarks, image_px=np.full_like(landmarks.image_px, np.nan))
+
+
+def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -> None:
+    """Raises InputError where no picture could be laid on the ground by what is given.
+
+    helped: whether telemetry says where the camera is.
+    """
+    if colours is None:
+        if not np.isfinite(landmarks.image_px).all(axis=1).any():
+            raise InputError(
+                f"landmarks {landmarks.path} say no places in pictures (u_px,v_px); give --colours FILE, the colours "
+                "that they wear, as `dddas colours` writes it"
+            )
+        return
+    if strange := [name for name in colours.names if name not in landmarks.names]:
+        raise InputError(
+            f"the colours name {', '.join(strange)}, the landmarks {landmarks.path} {', '.join(landmarks.names)}; "
+            "wanted the same names in both"
+        )
+    if len(colours) < LEAST and not helped:
+        raise InputError(
+            f"locating needs {LEAST} landmarks; colours are given for {len(colours)}: {LEAST - len(colours)} missing. "
+            "Give --telemetry, or more landmarks"
+        )
+
+
+class Watch:
+    """Takes the scenes of a clip in order, and keeps their landmarks from their targets."""
+
+    def __init__(self, locator: Locator, colours: Colours | None, finder: ColourFinder | None) -> None:
+        """colours, finder: None where the table of landmarks says where pictures show them."""
+        self.locator, self._colours, self._finder = locator, colours, finder
+        names = locator.site.landmarks.names
+        self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
+        self._follower = LandmarkFollower(colours.names, locator.settings.landmarks) if colours else None
+        self._fix: Fix | None = None
+
+    def anew(self) -> "Watch":
+        """The same, as before its first scene."""
+        return Watch(self.locator.anew(), self._colours, self._finder)
+
+    def step(self, scene: Scene) -> Watched:
+        """The next scene."""
+        start = time.perf_counter()
+        frame = scene.frame.number
+        marks = self.locator.marks(frame)
+        if self._follower is not None:
+            marks, scene, by = self._found(scene, marks)
+        else:
+            by = ("table",) * len(marks)
+            scene = without(scene, _holding(scene.detections.box_px, marks.image_px))
+        spent = time.perf_counter() - start
+        look = self.locator.look(frame, marks)
+        self._fix = look.fix
+        used = dict(zip(marks.landmark.tolist(), by, strict=True))
+        return Watched(
+            scene,
+            replace(look, seconds={"landmarks": spent, **look.seconds}),
+            tuple(used[which] for which in look.marks.landmark.tolist()),
+        )
+
+    def _found(self, scene: Scene, marks: Marks) -> tuple[Marks, Scene, tuple[str, ...]]:
+        """The landmarks with their places in the picture, the scene without them, and by what each was seen."""
+        assert self._follower is not None
+        assert self._finder is not None
+        assert self._colours is not None
+        image = scene.frame.image
+        if image.ndim == 2:
+            raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
+        step = scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None
+        place = {which: k for k, which in enumerate(self._which.tolist())}
+        expected, length = np.full((len(self._colours), 2), np.nan), np.full(len(self._colours), np.nan)
+        pixels, scale = self._expected(marks, step)
+        for row, which in enumerate(marks.landmark.tolist()):
+            if which in place:
+                expected[place[which]] = pixels[row]
+                length[place[which]] = self.locator.settings.landmarks.length_m * scale[row]
+        masks = self._finder.masks(image, self._colours.low, self._colours.high)
+        seen = self._follower.step(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
+        pixels = np.full((len(marks), 2), np.nan)
+        by = [""] * len(marks)
+        for row, which in enumerate(marks.landmark.tolist()):
+            if which in place:
+                k = place[which]
+                pixels[row], by[row] = seen.image_px[k], seen.by[k]
+                if by[row] == "motion" and _astray(pixels[row], seen.colour_px[k], expected[k], marks.pixel_sigma[row]):
+                    pixels[row], by[row] = seen.colour_px[k], "colour"
+        marks = self._from_bodies(replace(marks, image_px=pixels), np.array([how == "motion" for how in by], bool))
+        return marks, self._cut(scene, seen, length), tuple(by)
+
+    def _from_bodies(self, marks: Marks, moving: np.ndarray) -> Marks:
+        """Blobs (n,) are of whole vehicles and their shadows; colours are at height_m, and stay as they are."""
+        height = self.locator.settings.landmarks.height_m
+        if not height or not moving.any():
+            return marks
+        up_m, pixels = marks.up_m.copy(), marks.image_px.copy()
+        feet = None if self._fix is None else self.locator.feet(pixels[moving], self._fix, height)
+        up_m[moving] -= height / 2 if feet is None else height
+        if feet is not None:
+            pixels[moving] = feet
+        return replace(marks, up_m=up_m, image_px=pixels)
+
+    def _cut(self, scene: Scene, seen: Sighted, length_px: np.ndarray) -> Scene:
+        """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
+        knobs = self.locator.settings.landmarks
+        if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
+            return without(scene, seen.rows)
+        metre = np.nanmedian(length_px) / knobs.length_m if np.isfinite(length_px).any() else np.nan
+        least = max(self.locator.settings.small.min_area_px, LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
+        found, mask = cut_out(scene.detections, scene.mask, seen.rows, seen.colour_px, REACH * length_px, least)
+        return replace(scene, detections=found, mask=mask)
+
+    def _expected(self, marks: Marks, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 2) where the landmarks should be, by how the frame before lay on the ground, and (n,) pixels a metre.
+
+        NaN where unknown.
+        """
+        fix, n = self._fix, len(marks)
+        if fix is None or step is None or (fix.pose is None and fix.image_from_ground is None):
+            return np.full((n, 2), np.nan), np.full(n, np.nan)
+        beside = np.concatenate([marks.east_north_m + metre for metre in ((0, 0), (1, 0), (0, 1))])
+        if fix.pose is not None:
+            before = project(np.c_[beside, np.tile(marks.up_m, 3)], fix.pose, self.locator.camera)
+        else:
+            assert fix.image_from_ground is not None
+            before = transfer(fix.image_from_ground, beside)
+            before = before if fix.by == "paper" else bent(before, self.locator.camera)
+        here, east, north = np.split(transfer(step, before), 3)
+        return here, np.maximum(*(np.linalg.norm(there - here, axis=1) for there in (east, north)))
+
+
+def _astray(
+    blob_px: np.ndarray, colour_px: np.ndarray, expected_px: np.ndarray, sigma_px: float, least_sigmas: float = 3.0
+) -> bool:
+    """Whether a landmark's colour is clearly nearer to where the landmark is expected than the centre of its blob.
+
+    Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the vehicle's.
+    """
+    blob, colour = (float(np.linalg.norm(at - expected_px)) for at in (blob_px, colour_px))
+    return blob > least_sigmas * sigma_px and colour < 0.5 * blob
+
+
+def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether a box is the smallest that holds one of the points."""
+    held = np.zeros(len(box_px), bool)
+    for point in points_px[np.isfinite(points_px).all(axis=1)]:
+        inside = ((point >= box_px[:, :2] - 0.5) & (point <= box_px[:, :2] + box_px[:, 2:] - 0.5)).all(axis=1)
+        if inside.any():
+            held[np.where(inside, box_px[:, 2] * box_px[:, 3], np.inf).argmin()] = True
+    return held
+
+
+def without(scene: Scene, rows: np.ndarray) -> Scene:
+    """A scene without some of its detections."""
+    if not rows.any():
+        return scene
+    kept, found = ~rows, scene.detections
+    value = np.zeros(len(rows) + 1, np.uint16)
+    value[1:][kept] = np.arange(1, kept.sum() + 1)
+    detections = Detections(
+        found.box_px[kept],
+        found.score[kept],
+        found.area_px[kept],
+        found.heading_rad[kept],
+        found.speed_px[kept],
+        found.kind,
+        found.middle_px[kept],
+    )
+    return replace(scene, detections=detections, mask=value[scene.mask])

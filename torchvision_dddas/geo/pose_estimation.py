@@ -1,0 +1,304 @@
+"""Where the camera is: the likeliest pose, given telemetry and landmarks, all with their errors.
+
+Unknown are a small rotation about east, north and up (so that straight down is a view like any other), the place, the
+log of the focal length, and the places of the landmarks themselves: their receivers err too, and a landmark then
+weighs as much as it is known. What is expected of all of them comes as an information matrix, which may know nothing
+of some. Levenberg and Marquardt's steps find the least sum of squares; its inverse curvature is the covariance.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.geo.projection import axes_of, project_with_slopes
+from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
+from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, Marks
+
+HEADING = 2
+"""Which of the seven of a pose turns the heading."""
+
+EXACT_M = 1e-3
+"""A landmark is never known better than this: the curvature would be too steep to invert."""
+
+STEPS = 30
+ENOUGH = 1e-5
+"""A step this small, squared and in standard deviations, is the last."""
+
+
+NO_BETTER = 1e-5
+"""A step that lessens the sum of squares by a smaller share is the last, too."""
+
+SETTLING = 1
+"""Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
+than places that the sum of squares lies in a bent valley, and straight steps along it would be short."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is expected of a pose before any landmark is seen.
+
+    information: (7, 7), in the order of Fix, inverse of its covariance; a row of zeros where nothing is known.
+    """
+
+    pose: CameraPose
+    information: np.ndarray
+
+    @property
+    def known(self) -> Bool[np.ndarray, "7"]:
+        """Of which of the seven something is known."""
+        return np.diag(self.information) > 0
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What is expected of a pose and of n landmarks before they are seen in a picture.
+
+    reference: what telemetry says. mean: (7 + 2n,) what to add to it and to the landmarks' reports.
+    information: (7 + 2n, 7 + 2n) of those sums. known: (7,) of which of the pose something is known.
+    """
+
+    reference: CameraPose
+    mean: np.ndarray
+    information: np.ndarray
+    known: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The likeliest pose. places: (n, 2) of the landmarks. covariance: (7 + 2n, 7 + 2n) of pose and places.
+
+    correction: (7 + 2n,) what was added to what telemetry and the landmarks report, with correction_covariance.
+    cost: the least sum of squares, in standard deviations; chi-square of `freedom` degrees where all is as expected.
+    """
+
+    pose: CameraPose
+    places: np.ndarray
+    covariance: np.ndarray
+    correction: np.ndarray
+    correction_covariance: np.ndarray
+    cost: float
+    freedom: int
+
+
+def prior_of(
+    flight: Flight | None,
+    camera: Camera,
+    knobs: AerialKnobs,
+    ground_up_m: float = 0.0,
+    focal_known: bool = True,
+) -> Prior | None:
+    """What telemetry says of the pose; None where it says neither place nor height nor how the camera looks.
+
+    flight: its place in local metres. ground_up_m: height of the ground below, that the altitude is measured from.
+    focal_known: the camera's focal length is given, not guessed from a field of view.
+    """
+    if flight is None:
+        return None
+    place = np.array([*flight.place, flight.altitude_m + ground_up_m], float)
+    angles = np.array([flight.heading_rad, flight.pitch_rad, flight.roll_rad], float)
+    if not (np.isfinite(place).any() or np.isfinite(angles).any()):
+        return None
+    sigma = np.full(7, np.inf)
+    # A heading without a pitch is no more than a guess of how the camera is tilted, and so is no angle at all.
+    tilt = knobs.tilt_sigma_deg if np.isfinite(angles[1]) else knobs.tilt_guess_sigma_deg
+    sigma[:2] = np.radians(tilt)
+    sigma[2] = np.radians(knobs.heading_sigma_deg) if np.isfinite(angles[0]) else np.inf
+    sigma[3:5] = np.where(np.isfinite(place[:2]), knobs.position_sigma_m, np.inf)
+    if np.isfinite(place[2]):
+        sigma[5] = np.hypot(knobs.altitude_sigma * flight.altitude_m, knobs.altitude_sigma_m)
+    focal, sigma[6] = _focal_of(flight.hfov_rad, camera, knobs, focal_known)
+    angles = np.where(np.isfinite(angles), angles, [0.0, np.radians(knobs.pitch_deg), 0.0])
+    pose = CameraPose(np.where(np.isfinite(place), place, 0.0), axes_of(*angles), focal)
+    return Prior(pose, np.diag(1 / np.maximum(sigma, 1e-6) ** 2))
+
+
+def bare_prior(camera: Camera, knobs: AerialKnobs, focal_known: bool = True) -> Prior:
+    """What is known without telemetry: the focal length."""
+    focal, sigma = _focal_of(float("nan"), camera, knobs, focal_known)
+    pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(knobs.pitch_deg), 0.0), focal)
+    return Prior(pose, np.diag([0.0] * 6 + [1 / max(sigma, 1e-6) ** 2]))
+
+
+def expected_of(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
+    """A pose and landmarks that have nothing to do with each other, as in a single picture."""
+    n = len(sigma_m)
+    information = np.zeros((7 + 2 * n, 7 + 2 * n))
+    information[:7, :7] = prior.information
+    diagonal = np.arange(7, 7 + 2 * n)
+    information[diagonal, diagonal] = 1 / np.maximum(np.repeat(sigma_m, 2), EXACT_M) ** 2
+    return Expected(prior.pose, np.zeros(7 + 2 * n), information, prior.known)
+
+
+def fit_pose(
+    marks: Marks,
+    camera: Camera,
+    expected: Expected,
+    start: CameraPose | None = None,
+    used: Bool[np.ndarray, "n"] | None = None,
+) -> Solution | None:
+    """The likeliest pose and landmarks' places; None where the start has a landmark that the camera cannot show.
+
+    marks: none may lack its pixel or its place. start: where to begin; the expected pose without one. used: the
+    landmarks whose pixels count; all without it.
+    """
+    n = len(marks)
+    problem = _Problem(marks, camera, expected, np.ones(n, bool) if used is None else used)
+    if start is None:
+        start = moved(expected.reference, expected.mean[:7])
+    state = problem.at(start, marks.east_north_m + expected.mean[7:].reshape(n, 2))
+    if state is None:
+        return None
+    damping = 1e-6
+    for _ in range(STEPS):
+        curvature, downhill = state.curvature, state.downhill
+        steeper = curvature.copy()
+        steeper[np.diag_indices(len(steeper))] *= 1 + damping
+        try:
+            step = np.linalg.solve(steeper, downhill)
+        except np.linalg.LinAlgError:
+            damping = max(10 * damping, 1e-6)
+            continue
+        gain = float(step @ downhill)
+        tried = problem.at(moved(state.pose, step[:7]), state.places + step[7:].reshape(n, 2))
+        for _ in range(0 if expected.known.all() else SETTLING):
+            tried = problem.settled(tried)
+        if tried is not None and tried.cost <= state.cost + 1e-9:
+            # What fits badly at best need not be known as finely.
+            gain = min(gain, (state.cost - tried.cost) / (NO_BETTER * (1 + tried.cost)) * ENOUGH)
+            state, damping = tried, damping / 10
+        else:
+            damping = max(10 * damping, 1e-3)
+        if gain < ENOUGH:
+            break
+    try:
+        covariance = np.linalg.inv(state.curvature)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+        return None
+    freedom = 2 * int(problem.used.sum()) + int(expected.known.sum()) - 7
+    by_turn = slope_of_turn(state.correction[:3])
+    corrected = covariance.copy()
+    corrected[:3] = by_turn @ corrected[:3]
+    corrected[:, :3] = corrected[:, :3] @ by_turn.T
+    return Solution(state.pose, state.places, covariance, state.correction, corrected, state.cost, freedom)
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """The sum of squares about a pose and landmarks' places, to first order in a step of the 7 + 2n of them.
+
+    missing: (2m,) px, u and v in turn of the m landmarks used: where the picture has them, less where they should be.
+    slopes: (2m, 7 + 2n) how the latter grow. correction: (7 + 2n,) what pose and places have beyond what telemetry and
+    landmarks report; by_turn: (3, 3) how its first three grow with a small rotation, the others with their own step.
+    """
+
+    missing: np.ndarray
+    slopes: np.ndarray
+    correction: np.ndarray
+    by_turn: np.ndarray
+
+
+def slopes_at(
+    marks: Marks,
+    camera: Camera,
+    expected: Expected,
+    pose: CameraPose,
+    places: Float[np.ndarray, "n 2"],
+    used: Bool[np.ndarray, "n"] | None = None,
+) -> Slopes | None:
+    """What `fit_pose` knows there; None where the camera cannot show a landmark."""
+    return _Problem(marks, camera, expected, np.ones(len(marks), bool) if used is None else used).slopes(pose, places)
+
+
+def moved(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
+    """A pose after a step, in the order of Fix."""
+    return replace(
+        pose,
+        axes=turned(step[:3]) @ pose.axes,
+        place_m=pose.place_m + step[3:6],
+        focal=float(pose.focal * np.exp(np.clip(step[6], -1, 1))),
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    """A guess, and how the sum of squares slopes there: half its negative gradient and half its curvature."""
+
+    pose: CameraPose
+    places: np.ndarray
+    cost: float
+    downhill: np.ndarray
+    curvature: np.ndarray
+    correction: np.ndarray
+
+
+class _Problem:
+    """The sum of squares: what is expected of pose and places, and where the picture shows the landmarks."""
+
+    def __init__(self, marks: Marks, camera: Camera, expected: Expected, used: np.ndarray) -> None:
+        self.marks, self.camera, self.expected, self.used = marks, camera, expected, used
+        self.rows = np.arange(2 * int(used.sum()))[:, None]
+        self.columns = 7 + 2 * np.repeat(np.flatnonzero(used), 2)[:, None] + [0, 1]
+        self.image = marks.image_px[used].ravel()
+        self.weight = 1 / np.repeat(marks.pixel_sigma[used], 2) ** 2
+        self.free_heading = not expected.known[HEADING]
+
+    def settled(self, state: _State | None) -> _State | None:
+        """The same pose, with the places a step nearer to the likeliest that go with it."""
+        if state is None or len(self.used) == 0:
+            return state
+        try:
+            step = np.linalg.solve(state.curvature[7:, 7:], state.downhill[7:])
+        except np.linalg.LinAlgError:
+            # A wild pose has landmarks so near its horizon that nothing else counts.
+            return state
+        nearer = self.at(state.pose, state.places + step.reshape(-1, 2))
+        return nearer if nearer is not None and nearer.cost < state.cost else state
+
+    def slopes(self, pose: CameraPose, places: np.ndarray) -> Slopes | None:
+        points = np.column_stack([places, self.marks.up_m])[self.used]
+        seen, by_pose, by_point = project_with_slopes(points, pose, self.camera)
+        if not np.isfinite(seen).all():
+            return None
+        reference = self.expected.reference
+        turn = pose.axes @ reference.axes.T
+        if self.free_heading:
+            # Where no heading is known the tilt is all that is expected, whichever way the camera looks.
+            turn = turn @ about_up(turn).T
+        turn_rad = turn_of(turn)
+        correction = np.concatenate(
+            [
+                turn_rad,
+                pose.place_m - reference.place_m,
+                [np.log(pose.focal / reference.focal)],
+                (places - self.marks.east_north_m).ravel(),
+            ]
+        )
+        slopes = np.zeros((len(self.rows), len(self.expected.mean)))
+        slopes[:, :7] = by_pose.reshape(-1, 7)
+        slopes[self.rows, self.columns] = by_point[:, :, :2].reshape(-1, 2)
+        return Slopes(self.image - seen.ravel(), slopes, correction, slope_of_turn(turn_rad))
+
+    def at(self, pose: CameraPose, places: np.ndarray) -> _State | None:
+        here = self.slopes(pose, places)
+        if here is None:
+            return None
+        missing, slopes, by_turn = here.missing, here.slopes, here.by_turn
+        information, apart = self.expected.information, here.correction - self.expected.mean
+        pull = information @ apart
+        cost = float(apart @ pull + missing @ (self.weight * missing))
+        bent = information.copy()
+        bent[:3] = by_turn.T @ bent[:3]
+        bent[:, :3] = bent[:, :3] @ by_turn
+        pull[:3] = by_turn.T @ pull[:3]
+        weighed = slopes.T * self.weight
+        return _State(pose, places, cost, weighed @ missing - pull, weighed @ slopes + bent, here.correction)
+
+
+def _focal_of(hfov_rad: float, camera: Camera, knobs: AerialKnobs, known: bool) -> tuple[float, float]:
+    """The focal length as a share of the camera's, and its standard deviation."""
+    if np.isfinite(hfov_rad) and 0 < hfov_rad < np.pi:
+        return float(camera.size_px[0] / 2 / np.tan(hfov_rad / 2) / camera.focal_px[0]), knobs.focal_sigma
+    return 1.0, camera.focal_sigma if known else knobs.focal_guess_sigma

@@ -1,0 +1,140 @@
+"""A camera in the air, in local metres: where its picture shows a point, and the ray through a pixel.
+
+Camera axes are right, down and forward. With heading h, pitch p below the horizon and no roll they are
+    right (cos h, -sin h, 0), down (-sin h sin p, -cos h sin p, -cos p), forward (sin h cos p, cos h cos p, -sin p)
+in east, north and up: straight down (p = 90 deg), h is the heading of the picture's upper edge. Roll turns the camera
+clockwise about forward. The lens bends a radius r to r (1 + k1 r² + k2 r⁴), as OpenCV has it.
+"""
+
+import numpy as np
+
+from torchvision_dddas.types import Camera, CameraPose, Float
+
+NEAREST = 1e-6
+"""A point whose depth is a smaller share of its distance is beside or behind the camera."""
+
+
+def axes_of(heading_rad: float, pitch_rad: float, roll_rad: float) -> Float[np.ndarray, "3 3"]:
+    """The camera's right, down and forward, as columns, in east, north and up."""
+    (sh, sp, sr), (ch, cp, cr) = (f(np.array([heading_rad, pitch_rad, roll_rad])) for f in (np.sin, np.cos))
+    right, down = np.array([ch, -sh, 0.0]), np.array([-sh * sp, -ch * sp, -cp])
+    forward = np.array([sh * cp, ch * cp, -sp])
+    return np.stack([cr * right + sr * down, cr * down - sr * right, forward], axis=1)
+
+
+def project(points_m: Float[np.ndarray, "N 3"], pose: CameraPose, camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """Pixels (u, v) of points in east, north, up; NaN for a point behind the camera, or that the lens cannot show."""
+    return project_with_slopes(points_m, pose, camera)[0]
+
+
+def rays(pixels: Float[np.ndarray, "N 2"], pose: CameraPose, camera: Camera) -> Float[np.ndarray, "N 3"]:
+    """Directions in east, north, up through pixels, a metre of depth long; NaN where the lens has none."""
+    straight_xy = lifted(pixels, pose.focal, camera)
+    return np.c_[straight_xy, np.ones(len(straight_xy))] @ pose.axes.T
+
+
+def lifted(pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """Pixels to metres right and down per metre of depth, distortion undone; focal: as a share of the camera's."""
+    pixels = np.asarray(pixels, float).reshape(-1, 2)
+    bent = (pixels - camera.centre_px) / (np.array(camera.focal_px) * focal)
+    if not (camera.k1 or camera.k2):
+        return bent
+    return np.stack(straight(bent[:, 0], bent[:, 1], camera), axis=1)
+
+
+def unbent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """Where a lens without distortion would show what is at these pixels."""
+    return lifted(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
+
+
+def bent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+    """The other way: where the lens shows what one without distortion would show at these pixels; NaN where nowhere."""
+    flat = (np.asarray(pixels, float).reshape(-1, 2) - camera.centre_px) / camera.focal_px
+    return bend(flat, camera)[0] * camera.focal_px + camera.centre_px
+
+
+def slopes_of_lift(
+    pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`lifted`, and how it grows with the pixel (N, 2, 2) and with the log of the focal length (N, 2)."""
+    flat = lifted(pixels, focal, camera)
+    scale = np.array(camera.focal_px) * focal
+    bent, by_flat = bend(flat, camera)
+    by_bent = inverse_2x2(by_flat)
+    return flat, by_bent / scale, -(by_bent @ bent[:, :, None])[:, :, 0]
+
+
+def project_with_slopes(
+    points_m: Float[np.ndarray, "N 3"], pose: CameraPose, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (N, 2), and their derivatives by the pose (N, 2, 7), in the order of Fix, and by the point (N, 2, 3)."""
+    apart = np.asarray(points_m, float).reshape(-1, 3) - pose.place_m
+    seen = apart @ pose.axes
+    depth = seen[:, 2]
+    ahead = depth > NEAREST * np.abs(seen).sum(axis=1)
+    depth = np.where(ahead, depth, np.nan)
+    flat = seen[:, :2] / depth[:, None]
+    scale = np.array(camera.focal_px) * pose.focal
+    # Derivatives by the point in camera axes.
+    by_seen = np.zeros((len(seen), 2, 3))
+    by_seen[:, 0, 0] = by_seen[:, 1, 1] = 1 / depth
+    by_seen[:, :, 2] = -flat / depth[:, None]
+    if camera.k1 or camera.k2:
+        flat, by_flat = bend(flat, camera)
+        by_seen = by_flat @ by_seen
+    by_point = (scale[:, None] * by_seen) @ pose.axes.T
+    by_pose = np.empty((len(seen), 2, 7))
+    # A rotation w of the camera moves a point by -w x apart, seen from it: gradient . (apart x w).
+    (gx, gy, gz), (x, y, z) = np.moveaxis(by_point, 2, 0), apart.T[:, :, None]
+    by_pose[:, :, 0], by_pose[:, :, 1], by_pose[:, :, 2] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+    by_pose[:, :, 3:6] = -by_point
+    by_pose[:, :, 6] = scale * flat
+    return flat * scale + camera.centre_px, by_pose, by_point
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The lens.
+
+
+def bend(flat: Float[np.ndarray, "N 2"], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What the lens makes of (right, down) per metre of depth (N, 2), and how that grows (N, 2, 2).
+
+    NaN beyond the radius where the lens folds the picture back.
+    """
+    square = (flat**2).sum(axis=1)
+    grown = 1 + camera.k1 * square + camera.k2 * square**2
+    slope = 2 * camera.k1 + 4 * camera.k2 * square
+    grown = np.where((grown + slope * square > 0.05) & (square < _fold(camera)), grown, np.nan)
+    by_flat = slope[:, None, None] * flat[:, :, None] * flat[:, None, :]
+    by_flat += grown[:, None, None] * np.eye(2)
+    return flat * grown[:, None], by_flat
+
+
+def _fold(camera: Camera) -> float:
+    """The square of the radius where the lens begins to fold the picture back: 1 + 3 k1 r² + 5 k2 r⁴ falls to 0.05."""
+    a, b, c = 5 * camera.k2, 3 * camera.k1, 0.95
+    inside = b * b - 4 * a * c
+    if (b >= 0 and a >= 0) or inside < 0:
+        return float("inf")
+    # The smaller positive root, in the form that holds for a = 0 too.
+    return 2 * c / (-b + float(np.sqrt(inside)))
+
+
+def straight(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Undo r -> r (1 + k1 r² + k2 r⁴) by Newton's steps on the radius; NaN where the lens has no such radius."""
+    bent = np.hypot(x, y)
+    radius = bent.copy()
+    for _ in range(20):
+        slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
+        missing = bent - radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
+        # Beyond the radius where the lens folds the picture back nothing is seen twice.
+        radius = np.where(slope > 0.05, radius + missing / np.maximum(slope, 0.05), np.nan)
+    grown = 1 + camera.k1 * radius**2 + camera.k2 * radius**4
+    reached = np.abs(radius * grown - bent) < 1e-6
+    return np.where(reached, x / grown, np.nan), np.where(reached, y / grown, np.nan)
+
+
+def inverse_2x2(matrices: Float[np.ndarray, "N 2 2"]) -> Float[np.ndarray, "N 2 2"]:
+    """Inverses written out: so small, one by one would take longer."""
+    (a, b), (c, d) = np.moveaxis(matrices, (1, 2), (0, 1))
+    return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), (0, 1), (1, 2))

@@ -1,0 +1,204 @@
+"""Landmarks, telemetry and the camera as they are before the first frame: on one plane, in one kind of place."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from torchvision_dddas import geometry
+from torchvision_dddas.config import Settings
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.elevation import up
+from torchvision_dddas.io.landmark_tables import looks_swapped
+from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
+
+_Reports = TypeVar("_Reports", Landmarks, Telemetry)
+
+HOLDS_S = 1.0
+"""So long before its first and after its last sample telemetry holds."""
+
+HIGHEST_DEG = 20.0
+"""No camera that looks higher than this above the horizon, as a rule, shows landmarks: its angles go the other way."""
+
+FARTHEST_M = 100_000.0
+"""No vehicle sees landmarks from further away: then the files are of two flights."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """Landmarks and telemetry in the same local metres, east and north of origin_deg.
+
+    origin_deg: (longitude, latitude); None where all is in local metres from the start. sun_rad: azimuth and height of
+    the sun where that is known beside the telemetry's clock.
+    """
+
+    landmarks: Landmarks
+    telemetry: Telemetry | None
+    origin_deg: tuple[float, float] | None
+    elevation: Elevation | None = None
+    sun_rad: tuple[float, float] | None = None
+
+    @property
+    def places(self) -> np.ndarray:
+        """(N, 2) where landmarks and vehicle were, local metres."""
+        known = [self.landmarks.place, *([self.telemetry.place] if self.telemetry is not None else [])]
+        return np.concatenate([place[np.isfinite(place).all(axis=1)] for place in known])
+
+
+def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
+    """Everything in local metres: those of the landmarks, or east and north of the first place of one.
+
+    Raises InputError where no landmark has a place, degrees and metres are mixed, longitude and latitude look swapped,
+    or the vehicle's altitude is below the ground throughout.
+    """
+    known = np.isfinite(landmarks.place).all(axis=1)
+    if not known.any():
+        raise InputError(f"landmarks {landmarks.path}: no row has a place; wanted longitude_deg,latitude_deg or metres")
+    flown = telemetry is not None and np.isfinite(telemetry.place).all(axis=1).any()
+    if telemetry is not None and flown and telemetry.geographic != landmarks.geographic:
+        kinds = ("longitude and latitude", "local metres")
+        first, second = kinds if landmarks.geographic else kinds[::-1]
+        raise InputError(f"the landmarks are in {first}, the telemetry in {second}; give both in one kind")
+    if telemetry is not None:
+        _above_ground(telemetry)
+        _looks_down(telemetry)
+    if not landmarks.geographic:
+        if telemetry is not None:
+            _near(landmarks, telemetry)
+        return Site(landmarks, telemetry, None)
+    if telemetry is not None and flown:
+        where = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
+        longitude, latitude = (float(v) for v in np.median(where, axis=0))
+        if looks_swapped(landmarks, (longitude, latitude)):
+            raise InputError(
+                f"landmarks {landmarks.path}: longitude and latitude look swapped; the vehicle is at longitude "
+                f"{longitude:.5f}, latitude {latitude:.5f}"
+            )
+    longitude, latitude = landmarks.place[known][0].tolist()
+    origin = (longitude, latitude)
+    landmarks = local(landmarks, origin)
+    if telemetry is not None:
+        telemetry = local(telemetry, origin)
+        _near(landmarks, telemetry)
+    return Site(landmarks, telemetry, origin)
+
+
+def local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
+    """What was reported in degrees, in metres east and north of (longitude, latitude)."""
+    return replace(reports, place=geometry.east_north(reports.place, origin_deg), geographic=False)
+
+
+def _looks_down(telemetry: Telemetry) -> None:
+    """Raises InputError for angles that are counted upward, as some gimbals do."""
+    pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
+    if len(pitch) and np.median(pitch) < -HIGHEST_DEG:
+        raise InputError(
+            f"by the telemetry's pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
+            "below the horizon, 90 for straight down: turn the sign of pitch_deg"
+        )
+
+
+def _above_ground(telemetry: Telemetry) -> None:
+    altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
+    if len(altitude) and (altitude <= 0).all():
+        raise InputError(
+            f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
+            "wanted metres above ground: correct it, or leave --telemetry out"
+        )
+
+
+def _near(landmarks: Landmarks, telemetry: Telemetry) -> None:
+    """Raises InputError for a vehicle that is never near the landmarks; both in local metres."""
+    flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
+    if not len(flown):
+        return
+    away = np.linalg.norm(flown - np.nanmedian(landmarks.place, axis=0), axis=1).min()
+    if away > FARTHEST_M:
+        raise InputError(
+            f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; wanted "
+            f"{FARTHEST_M / 1000:g} km at most: give the telemetry of this flight, its places counted as theirs"
+        )
+
+
+def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> None:
+    """Raises InputError, with both spans, for telemetry that tells nothing of the time that is looked at."""
+    first, last = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
+    if last < from_s - HOLDS_S or first > to_s + HOLDS_S:
+        raise InputError(
+            f"the telemetry covers {first:.1f} to {last:.1f} s, the {what} {from_s:.1f} to {to_s:.1f} s; they do not "
+            "overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
+        )
+
+
+def unknown_heights(site: Site) -> list[str]:
+    """What the user should know where no height is known of the vehicle, or of the ground below it or at landmarks."""
+    telemetry, notes = site.telemetry, []
+    if site.elevation is None:
+        level = telemetry is not None and not np.isfinite(telemetry.altitude_m).any()
+        if telemetry is not None and level and np.isfinite(telemetry.above_sea_m).any():
+            notes.append("the telemetry says heights above sea alone: give --dem, the ground's, or they are of no use")
+        if telemetry is not None and (below := int((telemetry.altitude_m <= 0).sum())):
+            notes.append(
+                f"the altitude is at or below ground in {below} of {len(telemetry.time_s)} samples, the first at "
+                f"{telemetry.time_s[(telemetry.altitude_m <= 0).argmax()]:.1f} s: it is not used there"
+            )
+        return notes
+    for places, what in (
+        (site.landmarks.place, "at {} of {} places of landmarks: they are not used there"),
+        (
+            np.zeros((0, 2)) if telemetry is None else telemetry.place,
+            "below the vehicle in {} of {} samples: its altitude is not used there",
+        ),
+    ):
+        known = places[np.isfinite(places).all(axis=1)]
+        missing = int(np.isnan(up(site.elevation, known)).sum())
+        if missing:
+            notes.append("the elevation has no height " + what.format(missing, len(known)))
+    return notes
+
+
+def camera_of(
+    camera: Camera | None,
+    size: tuple[int, int] | None,
+    telemetry: Telemetry | None,
+    settings: Settings,
+    extent: tuple[float, float] | None = None,
+) -> tuple[Camera, bool, list[str]]:
+    """The camera in the air, whether its focal length is given, and what the user should know of it.
+
+    camera: as its file says, None without one. size: (width, height) of the pictures where the camera does not say.
+    extent: (width, height) that holds the boxes: it stands for the size where nothing depends on that, as when
+    landmarks alone lay pictures on the ground.
+    Raises InputError where the size is not known, or the camera's is another than that of the pictures.
+    """
+    if camera is not None:
+        if size is not None and tuple(camera.size_px) != tuple(size):
+            raise InputError(
+                f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
+                f"{size[0]} x {size[1]}; give the camera's file for this size"
+            )
+        notes = []
+        if math.isfinite(camera.height_m) and telemetry is None:
+            notes.append(f"where camera {camera.name} stands is not looked at from the air: give --telemetry")
+        if settings.aerial.mode == "paper" and (camera.k1 or camera.k2):
+            notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
+        sigma = settings.aerial.focal_sigma
+        # What is set by hand counts for more than the file.
+        return camera if sigma == Settings().aerial.focal_sigma else replace(camera, focal_sigma=sigma), True, notes
+    if size is None and settings.aerial.mode != "pose":
+        size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
+    if size is None:
+        raise InputError(
+            "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
+            "--set aerial.mode=homography, which needs neither"
+        )
+    knobs = settings.aerial
+    wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
+    hfov = float(np.median(wide)) if len(wide) else math.radians(knobs.hfov_deg)
+    focal = size[0] / 2 / math.tan(hfov / 2)
+    made = Camera("camera", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2), focal_sigma=knobs.focal_sigma)
+    if len(wide) or knobs.mode != "pose":
+        return made, bool(len(wide)), []
+    note = f"neither a camera's file nor telemetry says the field of view: {knobs.hfov_deg:g} degrees were taken for it"
+    return made, False, [f"{note} (aerial.hfov_deg)"]

@@ -1,0 +1,321 @@
+"""Small geometry that all fields share: boxes, plane maps, rotations, matching, places on the Earth. NumPy only."""
+
+import sys
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from math import atan2, cos, sin, sqrt
+from typing import Any
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.types import Float, Int
+
+
+def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
+    """(...) area in both of two boxes (..., 4), broadcast against each other; 0 where they lie apart."""
+    low = np.maximum(box_px[..., :2], other_px[..., :2])
+    high = np.minimum(box_px[..., :2] + box_px[..., 2:], other_px[..., :2] + other_px[..., 2:])
+    across, down = np.moveaxis(high - low, -1, 0)
+    return np.maximum(across, 0) * np.maximum(down, 0)
+
+
+_NEAR_PX = 2.0
+"""Boxes that are no further apart than this are beside each other."""
+
+
+def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
+    """(N, 2) of the blobs' mass where the foreground is given, else of their boxes."""
+    centres = boxes[:, :2] + (boxes[:, 2:] - 1) / 2
+    if foreground is None:
+        return centres
+    middles = middles_of(boxes, foreground)
+    return np.where(np.isfinite(middles), middles, centres)
+
+
+def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
+
+    core: (H, W) bool, the pixels that count: of what is between the people of a crowd nothing follows. None: all.
+    """
+    middles = np.full((len(boxes), 2), np.nan)
+    for row, box in enumerate(boxes):
+        left, top, right, bottom = _pixels(box, foreground.shape)
+        mine = foreground[top:bottom, left:right] == row + 1
+        v, u = np.nonzero(mine if core is None else mine & core[top:bottom, left:right])
+        if len(u):
+            middles[row] = left + u.mean(), top + v.mean()
+    return middles
+
+
+def covering(
+    box: np.ndarray | None, boxes: np.ndarray, area_px: np.ndarray, foreground: np.ndarray | None
+) -> np.ndarray:
+    """(N,) bool: the blobs, of areas (N,), that cover a good part of a patch's box, or are covered by it."""
+    if box is None or not len(boxes):
+        return np.zeros(len(boxes), bool)
+    if foreground is not None:
+        left, top, right, bottom = _pixels(box, foreground.shape)
+        part = foreground[top:bottom, left:right]
+        count = np.bincount(part.ravel(), minlength=len(boxes) + 1)[1 : len(boxes) + 1]
+        return count > np.minimum(0.3 * part.size, 0.5 * area_px)
+    common = shared_px(box, boxes)
+    return common > 0.5 * np.minimum(box[2:].prod(), boxes[:, 2:].prod(axis=1))
+
+
+def beside(box: np.ndarray | None, boxes: np.ndarray) -> np.ndarray:
+    """(N,) bool: the blobs whose boxes overlap a patch's or nearly do."""
+    if box is None:
+        return np.zeros(len(boxes), bool)
+    return shared_px(box + _NEAR_PX * np.array([-1, -1, 2, 2]), boxes) > 0
+
+
+def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(P, N) bool: which points lie in which boxes."""
+    offset = points[:, None] - boxes[None, :, :2] + 0.5
+    return ((offset >= 0) & (offset <= boxes[None, :, 2:])).all(axis=2)
+
+
+def _pixels(box: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """left, top, right, bottom of a box inside a picture (H, W)."""
+    left, top, right, bottom = (round(v) for v in (*box[:2], *(box[:2] + box[2:])))
+    return max(left, 0), max(top, 0), min(right, shape[1]), min(bottom, shape[0])
+
+
+Box = tuple[int, int, int, int]
+# Masks are looked over in blocks of this side, px.
+_BLOCK_PX = 16
+
+
+def occupied(mask: np.ndarray, apart: int) -> list[Box]:
+    """Disjoint boxes, x, y, width, height, that hold all pixels set in a (H, W) uint8 mask.
+
+    Set pixels lie at least `apart` / 2 px inside their box, save at the picture's border, and more than `apart` px from
+    those in other boxes.
+    """
+    height, width = mask.shape
+    block = _BLOCK_PX
+    padded = cv2.copyMakeBorder(mask, 0, -height % block, 0, -width % block, cv2.BORDER_CONSTANT, value=0)
+    blocks = cv2.resize(padded, (padded.shape[1] // block, padded.shape[0] // block), interpolation=cv2.INTER_AREA)
+    reach = -(-apart // (2 * block))
+    blocks = cv2.dilate(blocks, np.ones((2 * reach + 1,) * 2, np.uint8))
+    count, _, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(blocks, 0, 255, cv2.THRESH_BINARY)[1])
+    boxes = _disjoint([(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()])
+    return [
+        (block * x0, block * y0, min(block * x1, width) - block * x0, min(block * y1, height) - block * y0)
+        for x0, y0, x1, y1 in boxes
+    ]
+
+
+def _disjoint(boxes: list[Box]) -> list[Box]:
+    """Boxes (left, top, right, bottom) that overlap are joined until none do."""
+    apart: list[Box] = []
+    while boxes:
+        box = boxes.pop()
+        over = [b for b in apart if b[0] < box[2] and box[0] < b[2] and b[1] < box[3] and box[1] < b[3]]
+        if over:
+            apart = [b for b in apart if b not in over]
+            boxes.append(
+                (
+                    min(box[0], *(b[0] for b in over)),
+                    min(box[1], *(b[1] for b in over)),
+                    max(box[2], *(b[2] for b in over)),
+                    max(box[3], *(b[3] for b in over)),
+                )
+            )
+        else:
+            apart.append(box)
+    return apart
+
+
+def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
+    """(N, 2) points through a (3, 3) homography. A point on the horizon goes to infinity, not to an error."""
+    points = np.asarray(points_px, np.float64).reshape(-1, 2)
+    homogeneous = np.ones((len(points), 3))
+    homogeneous[:, :2] = points
+    mapped = homogeneous @ to_from.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return mapped[:, :2] / mapped[:, 2:]
+
+
+def chain(steps: Sequence[np.ndarray]) -> np.ndarray:
+    """The homography from the first frame to the last, from those of successive frames; scaled so that [2, 2] is 1."""
+    total = np.eye(3)
+    for later_from_earlier in steps:
+        total = later_from_earlier @ total
+        total = total / total[2, 2]
+    return total
+
+
+def background_flow(later_from_earlier: np.ndarray, size: tuple[int, int], samples: int = 9) -> float:
+    """Median displacement in pixels of a grid of points over a (width, height) image."""
+    grid = _grid(size, samples)
+    return float(np.median(np.linalg.norm(transfer(later_from_earlier, grid) - grid, axis=1)))
+
+
+@lru_cache(maxsize=4)
+def _grid(size: tuple[int, int], samples: int) -> np.ndarray:
+    u, v = np.meshgrid(np.linspace(0, size[0] - 1, samples), np.linspace(0, size[1] - 1, samples))
+    return np.c_[u.ravel(), v.ravel()]
+
+
+def corner_error(a: np.ndarray, b: np.ndarray, size: tuple[int, int]) -> float:
+    """How far two homographies differ, at most, at the corners of a (width, height) image, in pixels."""
+    width, height = size
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
+    return float(np.linalg.norm(transfer(a, corners) - transfer(b, corners), axis=1).max())
+
+
+def cross(vector: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) matrices that multiply like the cross product with (..., 3) vectors."""
+    matrices = np.zeros((*np.shape(vector), 3))
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0] = x, y, z
+    matrices[..., 1, 2], matrices[..., 2, 0], matrices[..., 0, 1] = -x, -y, -z
+    return matrices
+
+
+def _polynomial(vector: np.ndarray, first: float, second: float) -> np.ndarray:
+    """I + first K + second K², with K the matrix of the cross product with a vector."""
+    x, y, z = vector.tolist()
+    fx, fy, fz, sx, sy, sz = first * x, first * y, first * z, second * x, second * y, second * z
+    return np.array(
+        [
+            [1 - sy * y - sz * z, sx * y - fz, sx * z + fy],
+            [sx * y + fz, 1 - sx * x - sz * z, sy * z - fx],
+            [sx * z - fy, sy * z + fx, 1 - sx * x - sy * y],
+        ]
+    )
+
+
+def turned(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation about a vector by its length in radians (Rodrigues)."""
+    angle = sqrt(vector @ vector)
+    if angle < 1e-6:
+        return _polynomial(vector, 1.0, 0.5)
+    return _polynomial(vector, sin(angle) / angle, (1 - cos(angle)) / angle**2)
+
+
+def turn_of(rotation: np.ndarray) -> np.ndarray:
+    """(3,) the vector about which a rotation turns, by its length in radians: the inverse of `turned`."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    x, y, z = h - f, c - g, d - b
+    sine, cosine = sqrt(x * x + y * y + z * z) / 2, (a + e + i - 1) / 2
+    angle = atan2(sine, cosine)
+    if sine > 1e-7:
+        return np.array([x, y, z]) * (angle / (2 * sine))
+    if cosine > 0:
+        return np.array([x, y, z]) / 2
+    # Half a turn: the axis is what the symmetric part leaves in place, its sign is free.
+    symmetric = (rotation + np.eye(3)) / 2
+    axis = symmetric[:, int(np.argmax(np.diag(symmetric)))]
+    return angle * axis / np.linalg.norm(axis)
+
+
+def slope_of_turn(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) how `turn_of(turned(small) @ turned(vector))` grows with the small rotation."""
+    angle = sqrt(vector @ vector)
+    if angle < 1e-3:
+        return _polynomial(vector, -0.5, 1 / 12)
+    # Bounded below half a turn, where the vector changes its sign.
+    return _polynomial(vector, -0.5, 1 / angle**2 - (1 + cos(angle)) / (2 * angle * max(sin(angle), 1e-6)))
+
+
+def about_up(rotation: np.ndarray) -> np.ndarray:
+    """(3, 3) the rotation about up that leaves, undone first, only a tilt: rotation = tilt @ about_up."""
+    angle = atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
+    return turned(np.array([0.0, 0.0, angle]))
+
+
+def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
+    """Rows, ascending, and the column of each: min(N, M) pairs of the least sum of finite costs."""
+    cost = np.asarray(cost, float)
+    # Where nobody's best is anyone else's, no sum is less. SciPy's `optimize` takes 0.5 s and 45 MB to load, as much as
+    # the rest of a run onboard: it waits until two want the same.
+    tall = cost.shape[0] > cost.shape[1]
+    best = (cost.T if tall else cost).argmin(axis=1) if cost.size else np.zeros(0, np.int64)
+    if len(np.unique(best)) == len(best):
+        if not tall:
+            return np.arange(len(best)), best
+        order = np.argsort(best)
+        return best[order], order
+    from scipy.optimize import linear_sum_assignment
+
+    return linear_sum_assignment(cost)
+
+
+def namespace(x: Any) -> Any:
+    """NumPy for an array, torch for a tensor; nothing is imported: who has a tensor has torch."""
+    return np if isinstance(x, np.ndarray) else sys.modules["torch"]
+
+
+Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
+"""Longitude and latitude."""
+
+DEGREE_M = 111_320.0
+"""Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m."""
+
+
+# So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
+_PART = 1 << 14
+
+
+def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
+    """Metres east and north of an origin, both as (longitude, latitude)."""
+    import pymap3d  # here, as most runs have places in metres, or none
+
+    def of_part(lonlat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
+        return east, north
+
+    return _by_parts(of_part, lonlat_deg)
+
+
+def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
+    """(longitude, latitude) of local metres."""
+    import pymap3d
+
+    def of_part(metres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        latitude, longitude, _ = pymap3d.enu2geodetic(
+            metres[:, 0], metres[:, 1], 0.0, origin_deg[1], origin_deg[0], 0.0
+        )
+        return longitude, latitude
+
+    return _by_parts(of_part, east_north_m)
+
+
+def _by_parts(of_part: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], pairs: np.ndarray) -> np.ndarray:
+    """(N, 2) of what a function makes of (n, 2) at a time."""
+    given = np.asarray(pairs, float).reshape(-1, 2)
+    found = np.empty_like(given)
+    for begin in range(0, len(given), _PART):
+        part = slice(begin, begin + _PART)
+        found[part, 0], found[part, 1] = of_part(given[part])
+    return found
+
+
+def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
+    """(longitude, latitude) as the source has them, eq. (14): K = 111 320 m a degree, K cos(latitude) of longitude.
+
+    0.3 m off in 150 m. Longitudes go on over 180 degrees at -180.
+    """
+    origin = np.asarray(origin_deg, float)
+    found = origin + np.asarray(east_north_m, float) / _degree_m(origin)
+    beyond = np.abs(found[..., 0]) > 180
+    found[..., 0] = np.where(beyond, (found[..., 0] + 180) % 360 - 180, found[..., 0])
+    return found
+
+
+def plain_east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
+    """Metres east and north, the other way round."""
+    origin = np.asarray(origin_deg, float)
+    apart = np.asarray(lonlat_deg, float) - origin
+    far = np.abs(apart[..., 0]) > 180
+    apart[..., 0] = np.where(far, (apart[..., 0] + 180) % 360 - 180, apart[..., 0])
+    return apart * _degree_m(origin)
+
+
+def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
+    """(..., 2) metres a degree of longitude and of latitude."""
+    latitude = origin_deg[..., 1]
+    return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)

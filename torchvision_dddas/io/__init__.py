@@ -1,0 +1,1 @@
+"""Files in and out: video, telemetry, tables, maps, overlays, streams, reports."""

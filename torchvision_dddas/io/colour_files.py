@@ -1,0 +1,77 @@
+"""The colours that landmarks wear, from a TOML file: ranges of hue (0 to 180), saturation and value (0 to 255).
+
+[red]                     # the landmark's name; `dddas colours` finds the ranges in a picture
+low = [172, 90, 60]       # a hue above the one of `high`: the range goes over 0
+high = [8, 255, 255]
+"""
+
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.toml_text import toml_of
+from torchvision_dddas.types import Colours
+
+HIGHEST = (180, 255, 255)
+"""Of hue, saturation and value; the lowest is 0. A hue of 180 is that of 0."""
+
+_AXES = ("hue", "saturation", "value")
+
+
+def read_colours(path: str | Path) -> Colours:
+    """Read the ranges, in the file's order.
+
+    Raises InputError with the file and the name: unreadable, no TOML, no colours, low or high missing or no three whole
+    numbers in range, lowest saturation or value above the highest, two ranges that overlap.
+    """
+    content = toml_of(path, "colours")
+    if not content:
+        raise InputError(f"colours {path} names no colour; wanted [name] with low and high, as `dddas colours` writes")
+    ends = np.array([_range(name, given, path) for name, given in content.items()], np.int64).reshape(-1, 2, 3)
+    names, low, high = tuple(content), ends[:, 0], ends[:, 1]
+    for a, b in overlapping(low, high):
+        raise InputError(
+            f"colours {path}: {names[a]} and {names[b]} overlap in hue, saturation and value; wanted ranges of their "
+            "own, so that each landmark is told from the others"
+        )
+    return Colours(names, low, high)
+
+
+def overlapping(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
+    """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
+    return [
+        (a, b)
+        for a, b in combinations(range(len(low)), 2)
+        if _hues(low[a, 0], high[a, 0]) & _hues(low[b, 0], high[b, 0])
+        and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
+    ]
+
+
+def _hues(low: int, high: int) -> set[int]:
+    """The hues from 0 to 179 that a range holds."""
+    return {hue % 180 for hue in range(low, high + 1 if low <= high else high + 181)}
+
+
+def _range(name: str, given: Any, path: str | Path) -> list[list[int]]:
+    if not isinstance(given, dict) or {"low", "high"} - given.keys():
+        raise InputError(f"colours {path}: {name} lacks low or high; wanted both, each [hue, saturation, value]")
+    if more := sorted(given.keys() - {"low", "high"}):
+        raise InputError(f"colours {path}: {name} has {more[0]}, which no colour has; there are low and high")
+    for end in ("low", "high"):
+        values = given[end]
+        whole = isinstance(values, list) and all(type(v) is int for v in values)
+        if not whole or len(values) != 3 or not all(0 <= v <= h for v, h in zip(values, HIGHEST, strict=True)):
+            raise InputError(
+                f"colours {path}: {name}.{end} is {str(values)[:60]}; wanted [hue, saturation, value], whole numbers "
+                "from 0 to 180, 255 and 255"
+            )
+    for axis in (1, 2):
+        if given["low"][axis] > given["high"][axis]:
+            raise InputError(
+                f"colours {path}: {name}'s lowest {_AXES[axis]} {given['low'][axis]} is above its highest "
+                f"{given['high'][axis]}; only a hue may go over 0"
+            )
+    return [given["low"], given["high"]]

@@ -1,0 +1,103 @@
+"""The folder of one live session: nothing of an earlier one is touched, and all in it is valid at every moment.
+
+results.jsonl grows by a line a frame, events.log by a line an event, run.json is replaced whole.
+"""
+
+import json
+import os
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.atomic_files import write_whole
+from torchvision_dddas.io.maps.ground_tracks import iso_utc
+from torchvision_dddas.io.output.run_record import NAME as RECORD
+from torchvision_dddas.io.output.run_record import finite, versions
+
+RESULTS, EVENTS = "results.jsonl", "events.log"
+
+
+class Told(Protocol):
+    """Something that happened, as `live.Event` tells it."""
+
+    @property
+    def utc_s(self) -> float:
+        """Seconds since 1970."""
+        ...
+
+    @property
+    def frame(self) -> int:
+        """0 where it belongs to none."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """One word."""
+        ...
+
+    @property
+    def text(self) -> str:
+        """What it was, in words."""
+        ...
+
+
+def claim(out: Path, utc_s: float | None = None) -> Path:
+    """A new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError where none can be made."""
+    name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for k in range(1, 1000):
+            folder = out / (name if k == 1 else f"{name}-{k}")
+            try:
+                folder.mkdir()
+            except FileExistsError:  # a supervisor may start it twice within a second
+                continue
+            return folder
+    except OSError as error:
+        raise InputError(
+            f"cannot write into {out}: {error.strerror or error}. Choose another folder with --out"
+        ) from None
+    raise InputError(f"{out} holds a thousand sessions that began at {name}; choose another folder with --out")
+
+
+class SessionLog:
+    """events.log and run.json of a session. Every method raises OSError where the disk refuses, and may be tried again.
+
+    facts: what is known before the run.
+    """
+
+    def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
+        self.folder, self.facts = folder, facts
+        self._events = os.open(folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+
+    def tell(self, events: Iterable[Told]) -> None:
+        """Append events, a line each: UTC time, frame or -, kind, words."""
+        told = list(events)
+        stamps = iso_utc(np.array([event.utc_s for event in told]))
+        lines = "".join(
+            f"{stamp} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n"
+            for stamp, e in zip(stamps, told, strict=True)
+        )
+        size, rest = os.fstat(self._events).st_size, lines.encode()
+        try:
+            while rest:
+                rest = rest[os.write(self._events, rest) :]
+        except OSError:
+            with suppress(OSError):  # what a full disk broke off comes again whole
+                os.ftruncate(self._events, size)
+            raise
+
+    def state(self, state: str, now: dict[str, Any]) -> None:
+        """Replace run.json. state: running, complete, stopped or failed."""
+        record = {"state": state, "versions": versions(), **self.facts, **now}
+        write_whole(self.folder / RECORD, (json.dumps(finite(record), indent=2) + "\n").encode())
+
+    def close(self) -> None:
+        """Nothing follows."""
+        os.close(self._events)

@@ -1,0 +1,125 @@
+"""What a user asks for in one word, `json:-` or `cot:udp://239.2.3.1:6969`, as a stream."""
+
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.streams.about import About
+from torchvision_dddas.io.streams.outlet import Outlet
+from torchvision_dddas.io.streams.stream import Encoder, Stream, Tell
+
+WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
+
+_BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
+_MOST_WAIT_S = 2.0  # a datagram costs nothing to try
+
+
+def open_stream(
+    text: str, about: About, tell: Tell, retry_s: float = 0.5, retry_most_s: float = 30.0, option: str = "--emit"
+) -> Stream:
+    """The stream that a user asks for. tell: called with `sink` and words when something is wrong, and when it is well.
+
+    retry_s, retry_most_s: a broken outlet is tried again after the first, then twice that, up to the second.
+    Raises InputError with one line: not such a word, a file that cannot be written or holds something else, a host that
+    is not known, events for which there are no places or no clock.
+    """
+    kind, colon, place = text.partition(":")
+    datagrams = _is_address(place)
+    if kind not in _BEGINS or not colon or not place or ("://" in place and not datagrams):
+        raise InputError(f"{option} {text!r} is no stream; {WANTED}")
+    encode = _encoder(kind, about, f"{option} {text}")
+    try:
+        outlet = _datagrams(place, f"{option} {text}") if datagrams else _lines(place, kind, f"{option} {text}")
+    except OSError as error:
+        raise InputError(f"{option} {text}: {error.strerror or error}; choose another place") from None
+    return Stream(text, encode, outlet, tell, retry_s, min(retry_most_s, _MOST_WAIT_S) if datagrams else retry_most_s)
+
+
+def open_streams(
+    texts: Sequence[str],
+    about: About,
+    tell: Tell,
+    retry_s: float = 0.5,
+    retry_most_s: float = 30.0,
+    option: str = "--emit",
+) -> list[Stream]:
+    """Several, all or none. Raises InputError as open_stream does, and where two would write to one file."""
+    places: dict[str, str] = {}
+    for text in texts:
+        place = text.partition(":")[2]
+        if _is_address(place):
+            continue
+        real = place if place == "-" else os.path.realpath(_path(place, f"{option} {text}"))
+        if real in places:
+            raise InputError(
+                f"{option} {places[real]} and {option} {text} go to the same place; choose another for one"
+            )
+        places[real] = text
+    with ExitStack() as opened:
+        streams = []
+        for text in texts:
+            streams.append(open_stream(text, about, tell, retry_s, retry_most_s, option))
+            opened.callback(streams[-1].close)
+        opened.pop_all()
+    return streams
+
+
+def _is_address(place: str) -> bool:
+    return place.lower().startswith("udp:")
+
+
+def _path(place: str, asked: str) -> Path:
+    try:
+        if "\0" in place:
+            raise ValueError("a zero byte is in no file's name")
+        return Path(place).expanduser()
+    except (RuntimeError, ValueError) as error:  # ~nobody
+        raise InputError(f"{asked!r}: {error}; choose another place") from None
+
+
+def _encoder(kind: str, about: About, asked: str) -> Encoder:
+    # Each is loaded only when asked for.
+    if kind == "json":
+        from torchvision_dddas.io.streams.json_lines import json_lines
+
+        return lambda surveyed, people, age_s, most_bytes: json_lines(surveyed, people, about, age_s, most_bytes)
+    if kind == "mot":
+        from torchvision_dddas.io.streams.mot_rows import mot_rows
+
+        return lambda surveyed, people, age_s, most_bytes: mot_rows(surveyed, people, most_bytes)
+    if not about.geographic:
+        raise InputError(
+            f"{asked}: such events need longitudes and latitudes; give --landmarks or --telemetry in degrees, or "
+            "emit json instead"
+        )
+    if not about.clock:
+        raise InputError(f"{asked}: such events need the time of day, and neither input nor telemetry tells it")
+    from torchvision_dddas.io.streams.cot_events import CotEvents
+
+    events = CotEvents(about)
+    return lambda surveyed, people, age_s, most_bytes: events(surveyed)
+
+
+def _datagrams(place: str, asked: str) -> Outlet:
+    from torchvision_dddas.io.streams.datagrams import DatagramOutlet, address
+
+    return DatagramOutlet(address(place, asked))
+
+
+def _lines(place: str, kind: str, asked: str) -> Outlet:
+    from torchvision_dddas.io.streams.line_outlet import LineOutlet
+
+    if place == "-":
+        if sys.__stdout__ is None:
+            raise OSError("standard output is closed")
+        return LineOutlet(None)
+    path = _path(place, asked)
+    if path.is_file() and os.access(path, os.R_OK):
+        with path.open("rb") as file:
+            first = file.read(1)
+        if first not in _BEGINS[kind]:  # of an empty file nothing is in all
+            raise InputError(f"{asked}: the file holds something else than {kind}; choose another file")
+    return LineOutlet(path)

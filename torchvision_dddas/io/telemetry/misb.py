@@ -1,0 +1,120 @@
+"""MISB ST 0601 metadata beside a video in an MPEG transport stream, or alone, as telemetry."""
+
+import bisect
+import math
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.io.telemetry.attitude import angles, axes
+from torchvision_dddas.io.telemetry.klv import LocalSet, imap, local_sets, mapped, stamp_s
+from torchvision_dddas.io.telemetry.log import Log
+from torchvision_dddas.io.telemetry.record import assembled
+from torchvision_dddas.io.telemetry.transport import Piece, Stream, read_stream
+from torchvision_dddas.types import Telemetry
+
+_STAMP = 2
+
+
+def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float) -> Telemetry:
+    """layout: of the transport stream, as `spacing` tells it; None for local sets alone.
+
+    Times are those of the stream since its first picture; where it tells none, the sets' own stamps, the first of which
+    is laid on the picture sent before it.
+    Raises InputError where there is no metadata, or none of it is whole.
+    """
+    log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0)
+    content = path.read_bytes()
+    if layout is None:
+        pieces = [Piece(math.nan, 0.0, content)]
+    else:
+        stream = read_stream(content, *layout)
+        _note_damage(log, stream, len(content))
+        if stream.metadata is None:
+            kinds = ", ".join(f"0x{kind:02x}" for kind in stream.kinds) or "none"
+            raise log.refuse(f"this MPEG-TS carries no KLV metadata; its streams are of the types {kinds}")
+        pieces = stream.pieces
+    joined = b"".join(piece.content for piece in pieces)
+    starts = [0, *accumulate(len(piece.content) for piece in pieces)]
+    found = list(local_sets(joined))
+    whole = [one for one in found if one.whole]
+    if not found:
+        raise log.refuse("its metadata has no MISB ST 0601 packet, nothing begins with the key of one")
+    if not whole:
+        raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: their checksums are wrong")
+    if len(whole) < len(found):
+        log.note(f"{len(found) - len(whole)} of {len(found)} packets are damaged or cut off and left out")
+    belonging = [pieces[bisect.bisect_right(starts, one.place) - 1] for one in whole]
+    times, start_utc_s = _times(log, whole, belonging)
+    _say(log, times, whole)
+    return assembled(log, clock_offset_s, start_utc_s)
+
+
+def _note_damage(log: Log, stream: Stream, size: int) -> None:
+    if stream.damaged is not None:
+        log.note(f"byte {stream.damaged[0]}: the transport stream is out of step, {stream.damaged[1]} times in all")
+    if stream.cut:
+        log.note(f"the file ends within a transport packet, at byte {size}: it was cut off")
+
+
+def _times(log: Log, whole: list[LocalSet], belonging: list[Piece]) -> tuple[np.ndarray, float]:
+    """Seconds since the first picture, and the clock at it."""
+    told = np.array([piece.time_s for piece in belonging])
+    stamps = np.array([stamp_s(one.tags.get(_STAMP)) for one in whole])
+    clocked = np.isfinite(stamps)
+    if np.isfinite(told).mean() > 0.5:
+        apart = (stamps - told)[clocked & np.isfinite(told)]
+        return told, float(np.median(apart)) if len(apart) else math.nan
+    if not clocked.any():
+        raise log.refuse("neither the stream nor its metadata tells times")
+    first = int(np.argmax(clocked))
+    start = float(stamps[first]) - belonging[first].seen_s
+    if belonging[first].seen_s:
+        log.note("the stream tells no times of its metadata: the first lies on the picture sent before it")
+    return stamps - start, start
+
+
+def _say(log: Log, times: np.ndarray, whole: list[LocalSet]) -> None:
+    def column(tag: int, low: float, high: float, signed: bool = False) -> np.ndarray:
+        return np.array([mapped(one.tags.get(tag), low, high, signed) for one in whole])
+
+    above_sea = column(15, -900, 19000)
+    ground = column(25, -900, 19000)
+    agl = np.array([imap(one.tags.get(113), -900, 40000) for one in whole])
+    if not np.isfinite(agl).any() and np.isfinite(ground).any():
+        log.note("the altitude above ground is that above the ground in the picture's middle")
+    full = [column(tag, -90, 90, True) for tag in (90, 91)]
+    platform = [
+        column(5, 0, 360),
+        np.where(np.isfinite(full[0]), full[0], column(6, -20, 20, True)),
+        np.where(np.isfinite(full[1]), full[1], column(7, -50, 50, True)),
+    ]
+    roll = column(20, 0, 360)
+    sensor = [column(18, 0, 360), column(19, -180, 180, True), np.where(np.isfinite(roll), roll, 0.0)]
+    heading, pitch, rolled = angles(_turned(platform) @ _turned(sensor))
+    longitude, latitude = column(14, -180, 180, True), column(13, -90, 90, True)
+    said = {
+        "longitude_deg": longitude,
+        "latitude_deg": latitude,
+        "above_sea_m": above_sea,
+        "altitude_m": np.where(np.isfinite(agl), agl, above_sea - ground),
+        "speed_m_s": column(56, 0, 255),
+        "heading_rad": heading,
+        "pitch_rad": pitch,
+        "roll_rad": rolled,
+        "hfov_rad": np.radians(column(16, 0, 180)),
+        "vehicle_heading_rad": np.radians(platform[0]),
+    }
+    for number, (time_s, one) in enumerate(zip(times.tolist(), whole, strict=True)):
+        if math.isfinite(time_s):
+            log.moments.append((time_s, one.place))
+            for name, values in said.items():
+                if math.isfinite(values[number]):
+                    log.say(name, time_s, float(values[number]), one.place)
+
+
+def _turned(degrees: list[np.ndarray]) -> np.ndarray:
+    """The axes of heading, pitch up and roll."""
+    heading, pitch_up, roll = (np.radians(part) for part in degrees)
+    return axes(heading, -pitch_up, roll)

@@ -1,0 +1,288 @@
+"""A camera or stream that may fall silent, hang or come back as another, and is opened again whenever it is lost."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from torchvision_dddas.config import LiveKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.stream_capture import Stream, first_picture, scaled
+from torchvision_dddas.live.capture_log import Diary
+from torchvision_dddas.live.clock import Clock
+from torchvision_dddas.live.frame_queue import Inbox
+from torchvision_dddas.live.health import Health
+from torchvision_dddas.types import Frame
+
+# To open a stream takes longer than to read from it: it is looked at for a while before its first picture.
+OPENING = 2.0
+# What the driver is told to give up after stall_s is given up by us after so many times that.
+_GRACE = 1.25
+# Reads that may fail in a row before a stream counts as lost.
+_MOST_FAILED = 10
+# A stream that sends more than it announced is thinned once it is ahead of the clock by this.
+_AHEAD_S = 0.5
+# A rate that differs from what was announced by more than this share is told.
+_OFF = 0.2
+# A thread that hangs in a driver cannot be ended; no more than so many are left behind.
+_MOST_HUNG = 4
+# Pictures by which the rate is measured where none is announced, and what is taken where they come all at once.
+_MEASURED = 12
+_FALLBACK_HZ = 10.0
+
+
+class _GivenUp(Exception):
+    """Another thread took the place of this one while it hung."""
+
+
+class Receiver:
+    """Reads a stream in a thread of its own, from the start on; hands pictures on once somebody takes them.
+
+    rate_hz: as given, else as announced, else as the first pictures come. size: of the first picture; a stream that
+    comes back with larger or smaller pictures is scaled to it. Raises InputError where no first picture comes.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        opener: Callable[[], Stream],
+        rate_hz: float | None,
+        knobs: LiveKnobs,
+        inbox: Inbox,
+        diary: Diary,
+        health: Health,
+        clock: Clock,
+    ) -> None:
+        self.name, self.rate_hz, self.size = name, rate_hz or 0.0, (0, 0)
+        self._opener, self._knobs, self._inbox, self._diary = opener, knobs, inbox, diary
+        self._health, self._clock = health, clock
+        self._failure: InputError | None = None
+        self._ready = False
+        self._turn = 0  # of the thread that counts
+        self._call: tuple[float, float] | None = None  # since when it is in the driver, and how long it may be
+        self._pause_s = knobs.retry_s
+        self._lost_s: float | None = None
+        self._tries = 0
+        self._start_s = float("nan")
+        self._odd: tuple[tuple[int, ...], float] | None = None  # what does not fit: its shape, since when
+        self._off = False  # it was told that the rate is not as announced
+        self.threads: list[threading.Thread] = []
+        self._at_work: threading.Thread | None = None  # the one that counts; None where all that there are hang
+        self._spawn()
+        try:
+            self._await_first()
+        except BaseException:
+            inbox.close()
+            raise
+
+    @property
+    def apart_s(self) -> float:
+        """Seconds from picture to picture, as they really come."""
+        return 1 / (self._diary.sent_hz or self.rate_hz)
+
+    def begin(self) -> None:
+        """Nothing: it reads already, so that the first picture taken is a fresh one."""
+
+    def check(self) -> float:
+        """Asked by who waits for a picture: gives up a thread that hangs. Returns when to ask again."""
+        with self._inbox.changed:
+            now_s = self._clock.now()
+            if self._call is not None:
+                since_s, allowed_s = self._call
+                if now_s < since_s + allowed_s:
+                    return since_s + allowed_s
+                self._turn += 1
+                self._call = self._at_work = None
+                self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
+            elif self._at_work is not None and self._at_work.is_alive():
+                return now_s + self._knobs.stall_s
+            self.threads = [thread for thread in self.threads if thread.is_alive()]
+            if len(self.threads) < _MOST_HUNG:
+                self._spawn()
+            return now_s + self._knobs.stall_s
+
+    # -- beginning ---------------------------------------------------------------------------------------------------
+
+    def _spawn(self) -> None:
+        thread = threading.Thread(target=self._work, args=(self._turn,), name="receiving", daemon=True)
+        self.threads.append(thread)
+        self._at_work = thread
+        thread.start()
+
+    def _await_first(self) -> None:
+        allowed_s = 2 * _GRACE * OPENING * self._knobs.stall_s
+        with self._inbox.changed:
+            until_s = self._clock.now() + allowed_s
+            while not self._ready and self._failure is None:
+                if (left := until_s - self._clock.now()) <= 0:
+                    self._turn += 1
+                    self._failure = InputError(f"{self.name} sends nothing for {allowed_s:.0f} s; is it there?")
+                    break
+                self._clock.wait(self._inbox.changed, left)
+        if self._failure is not None:
+            raise self._failure
+
+    def _first(self, stream: Stream) -> None:
+        """Learn the size and the rate. Raises InputError."""
+        image = first_picture(stream, self.name)
+        self.size = (image.shape[1], image.shape[0])
+        self.rate_hz = self.rate_hz or stream.rate_hz or self._measured(stream)
+
+    def _measured(self, stream: Stream) -> float:
+        times_s = [self._clock.now() for _ in range(_MEASURED) if stream.grab()]
+        apart_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
+        return 1 / apart_s if 0.001 < apart_s < 10 else _FALLBACK_HZ
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _work(self, turn: int) -> None:
+        try:
+            while not self._inbox.closed and turn == self._turn:
+                if self._ready:
+                    self._inbox.sleep(self._clock.now() + self._pause_s)
+                    self._pause_s = min(2 * self._pause_s, self._knobs.retry_most_s)
+                    if self._inbox.closed or turn != self._turn:
+                        return
+                self._connected(turn)
+        except _GivenUp:
+            return
+
+    def _connected(self, turn: int) -> None:
+        """Open the stream, read it until it is lost, let go of it."""
+        self._tries += 1
+        stream: Stream | None = None
+        why, since_s = "", self._clock.now()
+        try:
+            with self._driver(turn, OPENING):
+                stream = self._opener()
+            if not self._ready:
+                # The driver's own limits apply; who waits for the first picture has one for all of it.
+                self._first(stream)
+                with self._inbox.changed:
+                    self._ready = turn == self._turn
+                    self._inbox.changed.notify_all()
+            why = self._read(stream, turn)
+        except _GivenUp:
+            raise
+        except Exception as error:  # whatever a driver may raise: the thread lives on
+            why = f"{error}"
+            if not self._ready:
+                failure = error if isinstance(error, InputError) else InputError(f"{self.name} cannot be read: {error}")
+                with self._inbox.changed:
+                    self._turn += 1
+                    self._failure = failure
+                    self._inbox.changed.notify_all()
+                raise _GivenUp from None
+        finally:
+            if stream is not None:
+                with self._driver(turn):
+                    stream.release()
+        if self._clock.now() - since_s > max(self._knobs.stall_s, self._pause_s):
+            self._pause_s = self._knobs.retry_s  # it held
+        if not self._inbox.closed:
+            self._lost(why)
+
+    @contextmanager
+    def _driver(self, turn: int, times: float = 1.0) -> Iterator[None]:
+        """A call that may never return."""
+        with self._inbox.changed:
+            if turn == self._turn:
+                self._call = (self._clock.now(), _GRACE * times * self._knobs.stall_s)
+        try:
+            yield
+        finally:
+            with self._inbox.changed:
+                mine = turn == self._turn
+                if mine:
+                    self._call = None
+        if not mine:
+            raise _GivenUp
+
+    def _read(self, stream: Stream, turn: int) -> str:
+        """Read until the stream is lost; returns why it is."""
+        failed, came_s = 0, self._clock.now()
+        good_s = came_s
+        while not self._inbox.closed:
+            with self._driver(turn):
+                came = stream.grab()
+            if not came:
+                failed += 1
+                # A driver's own limit may pass again and again: one is enough.
+                if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._knobs.stall_s:
+                    return "it sends no more pictures"
+                continue
+            failed, came_s = 0, self._clock.now()
+            taken_s = came_s
+            if self._picture(stream, taken_s):
+                good_s = taken_s
+            elif taken_s - good_s > self._knobs.stall_s:
+                return f"none of its pictures could be decoded for {taken_s - good_s:.1f} s"
+        return ""
+
+    def _picture(self, stream: Stream, taken_s: float) -> bool:
+        """Number the picture that was grabbed, and hand it on if it is wanted. Returns whether it was well."""
+        if not self._inbox.begun:
+            return True
+        diary, rate_hz = self._diary, self.rate_hz
+        self._start_s = taken_s if np.isnan(self._start_s) else self._start_s
+        place = (taken_s - self._start_s) * rate_hz
+        diary.captured(taken_s, self._compare)
+        if diary.number - place > max(_AHEAD_S * rate_hz, 2):
+            self._health.count("dropped")
+            return True
+        # Never before its time, so that what comes in bursts is not numbered back and forth.
+        diary.number = max(diary.number + 1, 1 + round(place))
+        if not self._inbox.wanted(diary.number):
+            return True
+        image = stream.retrieve()
+        if image is None:
+            self._health.count("undecoded")
+            diary.tell(f"frame {diary.number} could not be decoded and was left out", topic="undecoded")
+            return False
+        if (fitted := self._fitted(image, taken_s)) is not None:
+            self._found()
+            self._inbox.put(Frame(diary.number, taken_s - self._start_s, fitted, 0, taken_s))
+        return True
+
+    def _fitted(self, image: np.ndarray, taken_s: float) -> np.ndarray | None:
+        """A picture of the run's size; None for one that is left out."""
+        width, height = self.size
+        if image.shape[:2] == (height, width):
+            self._odd = None
+            return image
+        self._health.count("wrong_size")
+        what = f"pictures are {image.shape[1]}x{image.shape[0]} in place of {width}x{height}"
+        if self._odd is None or self._odd[0] != image.shape:
+            self._odd = (image.shape, taken_s)
+            self._diary.tell(f"{what}: they are left out", topic="size")
+        # One is a slip; a camera that was set otherwise is another matter, as long as it shows the same.
+        same = abs(image.shape[1] * height - image.shape[0] * width) <= 0.02 * image.shape[1] * height
+        if taken_s - self._odd[1] < self._knobs.stall_s or not same:
+            return None
+        self._diary.tell(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
+        return scaled(image, self.size)
+
+    # -- what is told ------------------------------------------------------------------------------------------------
+
+    def _lost(self, why: str) -> None:
+        self._diary.restart()
+        if self._lost_s is None:
+            self._lost_s, self._tries = self._clock.now(), 0
+            self._health.gauge("connected", 0)
+            self._diary.tell(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
+
+    def _found(self) -> None:
+        self._health.gauge("connected", 1)
+        if self._lost_s is None:
+            return
+        gone_s, self._lost_s = self._clock.now() - self._lost_s, None
+        self._health.count("reconnects")
+        tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
+        self._diary.tell(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
+
+    def _compare(self, sent_hz: float) -> None:
+        """Tell once where it sends many more or fewer pictures than it announced."""
+        if not self._off and abs(sent_hz / self.rate_hz - 1) > _OFF:
+            self._off = True
+            self._diary.tell(f"{self.name} sends {sent_hz:.1f} pictures a second, not {self.rate_hz:g}")

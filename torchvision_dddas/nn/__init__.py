@@ -1,0 +1,1 @@
+"""torch modules made of `functional`."""

@@ -1,0 +1,164 @@
+"""What moves, softly: from differences of registered pictures to a mask with a gradient in the knobs.
+
+Up to the differences no knob that can be tuned has a say: registration, warps and exposure are done once, hard. After
+them every step is that of the hard pipeline, by the same functions of `ops`:
+
+    noise units -> blur -> largest over the pairs -> margin over the threshold -> erode -> close -> soft threshold
+
+Thresholds and extrema commute, so the margin goes through the morphology, whose extrema stay hard, and the threshold is
+softened last: the outline lies where the hard one does, whatever the softness. Whole grey levels are rounded straight
+through. Regions are labelled hard and gated softly; a hull is the hard one of a region, and is there as far as its
+region is. What then acts on single blobs (persistence, outlines by colour, shadows, small targets) has no useful
+gradient, and is given as two masks: what it takes away, and what it adds.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from torch import Tensor, nn
+
+from torchvision_dddas.config import Settings
+from torchvision_dddas.functional import blur, difference
+from torchvision_dddas.functional.soft import fractional_size as sizes
+from torchvision_dddas.functional.soft import morphology as extremum
+from torchvision_dddas.functional.soft import regions
+from torchvision_dddas.functional.soft import straight_through as passing
+from torchvision_dddas.functional.threshold import step
+
+Values = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Differences:
+    """A batch of windows as far as no tunable knob has a say.
+
+    least: (B, P, H, W) uint8, the difference that both neighbours of each near pair show, grey levels. both: where both
+    are seen. texture: (B, 1, H, W), 4 x grey levels a pixel, and textured: where it is enough to tell how well the
+    registration fits. steps: evidence is kept in so many steps a noise unit, up to `highest` of them.
+    """
+
+    least: UInt8[Tensor, "B P H W"]
+    both: Bool[Tensor, "B P H W"]
+    texture: Float[Tensor, "B 1 H W"]
+    textured: Bool[Tensor, "B 1 H W"]
+    steps: float
+    highest: float
+
+
+class Core(NamedTuple):
+    """Where targets are certain.
+
+    mask: 0 to 1. margin: by how much evidence is above the threshold, cleaned; noise units, or grey levels. evidence:
+    the largest over the near pairs, same unit.
+    """
+
+    mask: Float[Tensor, "B 1 H W"]
+    margin: Float[Tensor, "B 1 H W"]
+    evidence: Float[Tensor, "B 1 H W"]
+
+
+@dataclass(frozen=True)
+class Regions:
+    """What hangs together in a core, by labelling it hard: 0 nothing, else a region's number, up to `count`.
+
+    near: the regions, and the pixels about them that may come to them. filled: their hulls, or themselves.
+    """
+
+    near: Int64[Tensor, "B 1 H W"]
+    filled: Int64[Tensor, "B 1 H W"]
+    count: int
+
+
+class SoftMotion(nn.Module):
+    """The steps from differences to a mask, with some knobs given as tensors and the others as the settings have them.
+
+    whole: round where the back ends do, straight through; False leaves numbers whole nowhere, for gradient checks.
+    """
+
+    def __init__(self, settings: Settings, whole: bool = True) -> None:
+        super().__init__()
+        self.knobs = settings
+        self.whole = whole
+
+    def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
+        """The core mask. values: by name, those that are tuned. softness: a share of the settings' threshold."""
+        threshold = self._knob("difference.threshold", values)
+        evidence = self.evidence(differences, values)
+        margin = evidence - threshold
+        margin = sizes.between(
+            self._knob("morphology.erode_px", values), lambda side: extremum.erode(margin, side, "ellipse")
+        )
+        eroded = margin
+        margin = sizes.between(
+            self._knob("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
+        )
+        return Core(step(margin, softness * self.knobs.difference.threshold), margin, evidence)
+
+    def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
+        """The largest difference over the near pairs, in noise units or grey levels."""
+        normalized = self.knobs.difference.kind == "normalized"
+        weight: Tensor | None = None
+        if normalized:
+            noise_levels = self._knob("difference.noise_levels", values)
+            gradient_share = self._knob("difference.gradient_share", values)
+            weight = difference.noise_weight(differences.texture, noise_levels, gradient_share) * differences.steps
+        largest: Tensor | None = None
+        for k in range(differences.least.shape[1]):
+            least, both = differences.least[:, k : k + 1], differences.both[:, k : k + 1]
+            if weight is None:
+                z = self._blurred(least.to(differences.texture.dtype), values) * both
+            else:
+                z = self._rounded(least * both * weight).clamp(max=differences.highest)
+                z = self._in_units(self._blurred(z, values), differences.textured & both, differences.steps)
+            largest = z if largest is None else torch.maximum(largest, z)
+        assert largest is not None, "a window has a pair"
+        return largest / differences.steps if normalized else largest
+
+    def outlined(self, core: Core, found: Regions, values: Values, softness: float = 0.0) -> Float[Tensor, "B 1 H W"]:
+        """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
+        gate = regions.gates(
+            core.mask,
+            core.evidence,
+            found.near,
+            found.count,
+            self._knob("gates.min_area_px", values),
+            self._knob("difference.peak", values),
+            softness,
+        )
+        drawn = core.mask * regions.of_pixels(gate, found.near)
+        # In the hull of a region, a hole or a speck is foreground as far as that region is: its evidence has no say.
+        carried = (core.margin <= 0) | (found.filled != found.near)
+        return torch.maximum(drawn, regions.of_pixels(gate, found.filled) * carried)
+
+    def _knob(self, name: str, values: Values) -> float | Tensor:
+        if name in values:
+            return values[name]
+        group, key = name.split(".")
+        return float(getattr(getattr(self.knobs, group), key))
+
+    def _blurred(self, levels: Tensor, values: Values) -> Tensor:
+        def of_size(side: int) -> Tensor:
+            if side == 1:
+                return levels
+            smooth = blur.gaussian(levels, side)
+            return passing.through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
+
+        return sizes.between(self._knob("difference.blur_px", values), of_size, pitch=2)
+
+    def _in_units(self, z: Tensor, textured: Tensor, steps: float) -> Tensor:
+        """Evidence by its median over textured pixels, where that is above one noise unit."""
+        units = difference.noise_units(z.detach().round().to(torch.uint8), textured, steps)
+        if bool((units == 1.0).all()):
+            return z
+        # Counted in whole numbers, as the hard pipeline counts; the gradient is that of the pixel in the middle.
+        median = difference.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / steps
+        per_unit = units.reciprocal().to(z.dtype)
+        slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
+        per_unit = passing.through(per_unit, slope) if self.whole else slope
+        return self._rounded(z * per_unit.reshape(-1, 1, 1, 1))
+
+    def _rounded(self, x: Tensor) -> Tensor:
+        return passing.rounded(x) if self.whole else x

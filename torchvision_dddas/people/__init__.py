@@ -1,0 +1,1 @@
+"""People in pictures from the ground, by HOG and a linear SVM."""

@@ -1,0 +1,235 @@
+"""Which windows of a picture are scored: the levels of its pyramid, all of them or parts of few, and where they lie.
+
+Levels and windows are those of OpenCV's `HOGDescriptor::detectMultiScale`, so that parts of the pyramid, asked for
+around what is expected, have the scores of a search everywhere.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Float, Part
+
+# To make a pixel of a level takes so much of the time that it takes to search one (5 ms and 140 ms for 1634 x 919).
+_RESIZED = 0.04
+_FEWEST_ALONG = 16
+
+
+@dataclass(frozen=True)
+class Level:
+    """A level of the pyramid. size: (width, height) in its own pixels. scale: picture px for one of them."""
+
+    size: tuple[int, int]
+    scale: float
+
+
+def levels(size: tuple[int, int], knobs: PeopleKnobs) -> list[Level]:
+    """The levels of a picture of (width, height) px, largest first; they end where the window no longer fits.
+
+    The picture itself is one of them, so that all that OpenCV's levels show is seen; those before it are the enlarged
+    ones. A level of the same rounded size as the one before is left out: it shows nothing new.
+    Raises InputError if not even the first holds a window.
+    """
+    width, height = knobs.window_width_px, knobs.window_height_px
+    found: list[Level] = []
+    scale = first = 1 / enlarged(knobs)
+    for _ in range(knobs.max_levels):
+        level = round(size[0] / scale), round(size[1] / scale)
+        if level[0] < width or level[1] < height:
+            break
+        if not found or found[-1].size != level:
+            found.append(Level(level, scale))
+        scale *= knobs.scale_step
+    if not found:
+        raise InputError(
+            f"a picture of {size[0]} x {size[1]} px, enlarged {1 / first:.3g} times, is smaller than the window of "
+            f"{width} x {height} px; give a larger picture, or raise people.enlarge"
+        )
+    return found
+
+
+def enlarged(knobs: PeopleKnobs) -> float:
+    """How many times larger than the picture the first level is: whole scale steps, `people.enlarge` at most."""
+    return float(knobs.scale_step ** np.floor(np.log(knobs.enlarge) / np.log(knobs.scale_step) + 1e-9))
+
+
+def smallest_body_px(knobs: PeopleKnobs) -> float:
+    """Height of the smallest body that a pyramid shows, in the picture's pixels."""
+    return knobs.height_share * knobs.window_height_px / enlarged(knobs)
+
+
+def _padding(knobs: PeopleKnobs) -> int:
+    """Of each level, in px: raised to a multiple of what windows and blocks lie on, as OpenCV does."""
+    grid = math.gcd(knobs.window_stride_px, knobs.block_stride_px)
+    return -(-knobs.padding_px // grid) * grid
+
+
+def everywhere(size: tuple[int, int], knobs: PeopleKnobs) -> list[Part]:
+    """Every level as one part, with its padding."""
+    pad = _padding(knobs)
+    return [
+        Part(level.size, -pad, -pad, level.size[0] + 2 * pad, level.size[1] + 2 * pad) for level in levels(size, knobs)
+    ]
+
+
+def tiles(parts: Sequence[Part], most_px: float, knobs: PeopleKnobs) -> list[Part]:
+    """The parts, cut where they have more pixels than this, but into no less than some windows along each side."""
+    stride, cut = knobs.window_stride_px, []
+    for part in parts:
+        across, down = _windows(part, knobs)
+        high = _along(most_px / part.width, knobs.window_height_px, down, stride)
+        wide = _along(most_px / (knobs.window_height_px + (high - 1) * stride), knobs.window_width_px, across, stride)
+        for top, bottom in _cut(down, high):
+            for left, right in _cut(across, wide):
+                x, y = part.x + left * stride, part.y + top * stride
+                width = (right - left - 1) * stride + knobs.window_width_px
+                height = (bottom - top - 1) * stride + knobs.window_height_px
+                cut.append(Part(part.level, x, y, width, height))
+    return cut
+
+
+def _along(room_px: float, window_px: int, all_of_them: int, stride: int) -> int:
+    """How many windows in a row fit, all of them at most; a row of fewer would be mostly border of what lies beside."""
+    return min(max(int((room_px - window_px) // stride) + 1, _FEWEST_ALONG), all_of_them)
+
+
+def _cut(length: int, most: int) -> list[tuple[int, int]]:
+    count = math.ceil(length / most)
+    return [(length * i // count, length * (i + 1) // count) for i in range(count)]
+
+
+def within(
+    regions_px: Float[np.ndarray, "R 4"],
+    heights_px: Float[np.ndarray, "R 2"],
+    size: tuple[int, int],
+    knobs: PeopleKnobs,
+) -> list[Part]:
+    """The parts whose windows show a body that lies in a region: few of them, merged where they overlap.
+
+    regions_px: x, y, width, height in the picture. heights_px: least and largest height of the body that is looked for
+    there; NaN: any that the region holds. Half a scale step more is allowed, so that there is always a level for a body
+    that the pyramid reaches. Windows stand where a search everywhere has them.
+    """
+    regions_px, heights_px = np.asarray(regions_px, float).reshape(-1, 4), np.asarray(heights_px, float).reshape(-1, 2)
+    slack = knobs.scale_step**0.5
+    least = np.where(np.isnan(heights_px[:, 0]), 0.0, heights_px[:, 0]) / slack
+    largest = np.where(np.isnan(heights_px[:, 1]), regions_px[:, 3], heights_px[:, 1]) * slack
+    parts: list[Part] = []
+    for level in levels(size, knobs):
+        body = knobs.height_share * knobs.window_height_px * level.scale
+        wanted = regions_px[(least <= body) & (body <= largest)]
+        spans = [span for region in wanted if (span := _span(region, level, knobs)) is not None]
+        parts += [_part(span, level, knobs) for span in _merged(spans, knobs)]
+    return parts
+
+
+def windows(
+    parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], knobs: PeopleKnobs
+) -> tuple[np.ndarray, np.ndarray]:
+    """The windows that score the threshold or more, each once: x, y, width, height in the picture (N, 4), scores (N,).
+
+    maps: (ny, nx) scores of each part. With OpenCV's grouping the windows are rounded to whole pixels, as there.
+    """
+    scale_of = {level.size: level.scale for level in levels(size, knobs)}
+    width, height, stride = knobs.window_width_px, knobs.window_height_px, knobs.window_stride_px
+    boxes, scores, seen = [], [], []
+    for part, scored in zip(parts, maps, strict=True):
+        row, column = np.nonzero(scored >= knobs.threshold)
+        x, y = part.x + column * stride, part.y + row * stride
+        if knobs.suppression == "opencv":
+            scale = scale_of[part.level]
+            box = np.stack([x, y, np.full_like(x, width), np.full_like(y, height)], axis=1) * scale
+            box = np.rint(box)
+        else:  # the level's pixels are not exactly `scale` of the picture's, as its size was rounded
+            across, down = size[0] / part.level[0], size[1] / part.level[1]
+            box = np.stack([x * across, y * down, np.full(len(x), width * across), np.full(len(y), height * down)], 1)
+        boxes.append(box)
+        scores.append(scored[row, column].astype(np.float64))
+        seen.append(np.stack([np.full_like(x, part.level[0]), np.full_like(x, part.level[1]), x, y], axis=1))
+    if not boxes:
+        return np.zeros((0, 4)), np.zeros(0)
+    _, first = np.unique(np.concatenate(seen), axis=0, return_index=True)
+    first.sort()
+    return np.concatenate(boxes)[first].astype(np.float64), np.concatenate(scores)[first]
+
+
+def cost(parts: Sequence[Part], knobs: PeopleKnobs) -> int:
+    """How many windows the parts hold."""
+    return sum(across * down for across, down in (_windows(part, knobs) for part in parts))
+
+
+def pixels(parts: Sequence[Part]) -> float:
+    """What the parts cost to search: their pixels, and a share of each level's that any of them is on."""
+    made = sum(width * height for width, height in {part.level for part in parts})
+    return sum(part.width * part.height for part in parts) + _RESIZED * made
+
+
+def _windows(part: Part, knobs: PeopleKnobs) -> tuple[int, int]:
+    """How many windows a part holds, across and down."""
+    stride = knobs.window_stride_px
+    across = max((part.width - knobs.window_width_px) // stride + 1, 0)
+    return across, max((part.height - knobs.window_height_px) // stride + 1, 0)
+
+
+# Spans count windows of a level: (first column, first row, last column, last row).
+_Span = tuple[int, int, int, int]
+
+
+def _span(region: np.ndarray, level: Level, knobs: PeopleKnobs) -> _Span | None:
+    """The windows whose body lies in the region, and the next ones outwards; None where the region is off the level."""
+    width, height, stride = knobs.window_width_px, knobs.window_height_px, knobs.window_stride_px
+    side = (1 - knobs.width_share) / 2 * width
+    above, below = (knobs.feet_share - knobs.height_share) * height, (1 - knobs.feet_share) * height
+    low = region[:2] / level.scale - (side, above)
+    high = (region[:2] + region[2:]) / level.scale + (side, below) - (width, height)
+    high = np.maximum(low, high)  # a region smaller than the body still has the window that begins with it
+    pad = _padding(knobs)
+    last = (np.array(level.size) + 2 * pad - (width, height)) // stride
+    begin = np.floor((low + pad) / stride).astype(int)
+    end = np.ceil((high + pad) / stride).astype(int)
+    if (end < 0).any() or (begin > last).any():
+        return None
+    begin, end = np.maximum(begin, 0), np.minimum(end, last)
+    return int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
+
+
+def _area(span: _Span, knobs: PeopleKnobs) -> int:
+    """Pixels that the windows of a span cover: what it costs."""
+    stride = knobs.window_stride_px
+    return ((span[2] - span[0]) * stride + knobs.window_width_px) * (
+        (span[3] - span[1]) * stride + knobs.window_height_px
+    )
+
+
+def _merged(spans: list[_Span], knobs: PeopleKnobs) -> list[_Span]:
+    """Spans joined as long as one around two costs no more than the two."""
+    spans = sorted(set(spans))
+    joined = True
+    while joined:
+        joined = False
+        for i, one in enumerate(spans):
+            for j in range(i + 1, len(spans)):
+                other = spans[j]
+                both = min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+                if _area(both, knobs) <= _area(one, knobs) + _area(other, knobs):
+                    spans = sorted({*spans[:i], *spans[i + 1 : j], *spans[j + 1 :], both})
+                    joined = True
+                    break
+            if joined:
+                break
+    return spans
+
+
+def _part(span: _Span, level: Level, knobs: PeopleKnobs) -> Part:
+    stride, pad = knobs.window_stride_px, _padding(knobs)
+    return Part(
+        level.size,
+        span[0] * stride - pad,
+        span[1] * stride - pad,
+        (span[2] - span[0]) * stride + knobs.window_width_px,
+        (span[3] - span[1]) * stride + knobs.window_height_px,
+    )

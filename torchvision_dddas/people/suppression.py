@@ -1,0 +1,123 @@
+"""One box a person: many windows around each score, and either the best of them stays, or OpenCV's grouping decides."""
+
+import numpy as np
+
+from torchvision_dddas.geometry import shared_px
+from torchvision_dddas.types import Float, Int
+
+# A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.
+_WHOLE = 1 - 1e-9
+
+
+def nms(
+    box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], overlap: float, contained: float = 1.0
+) -> Int[np.ndarray, " K"]:
+    """Rows of the boxes that stay, best first; of equal scores the first row.
+
+    A box goes where a better one that stays shares more than `overlap` of their union with it, or more than `contained`
+    of the smaller of the two: legs and heads score as small people inside the box of the whole one.
+    """
+    order = np.argsort(-np.asarray(score, float), kind="stable")
+    box = np.asarray(box_px, float).reshape(-1, 4)[order]
+    area = box[:, 2] * box[:, 3]
+    left = np.ones(len(order), bool)
+    kept = []
+    for i in range(len(order)):
+        if not left[i]:
+            continue
+        kept.append(i)
+        rest = slice(i + 1, None)
+        shared = shared_px(box[i], box[rest]) * _WHOLE
+        left[rest] &= shared <= overlap * (area[i] + area[rest] - shared)
+        left[rest] &= shared <= contained * np.minimum(area[i], area[rest])
+    return order[np.array(kept, np.int64)]
+
+
+def settled(
+    box_px: Float[np.ndarray, "N 4"],
+    weight: Float[np.ndarray, " N"],
+    kept: Int[np.ndarray, " K"],
+    overlap: float,
+) -> Float[np.ndarray, "K 4"]:
+    """The kept boxes, each moved to the weighted mean of all those that share `overlap` of the union with it, or more.
+
+    Windows stand on a grid, 6 % of their height and a step of scale apart; a person's is between several that score.
+    Centres are averaged, and logarithms of sizes. A kept box without weight stays where it is.
+    """
+    box_px, weight = np.asarray(box_px, float).reshape(-1, 4), np.asarray(weight, float)
+    area = box_px[:, 2:].prod(axis=1)
+    place = np.concatenate([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)
+    mean = place[kept]
+    for k, row in enumerate(kept):
+        shared = shared_px(box_px[row], box_px)
+        near = shared >= overlap * (area[row] + area - shared)
+        total = weight[near].sum()
+        if total > 0:
+            mean[k] = weight[near] @ place[near] / total
+    size = np.exp(mean[:, 2:])
+    return np.concatenate([mean[:, :2] - size / 2, size], axis=1)
+
+
+def group(
+    box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], least: int, distance: float = 0.2
+) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, " G"]]:
+    """OpenCV's grouping of HOG detections: means of boxes that are alike, in whole pixels, and their best score.
+
+    box_px: whole numbers. least: groups of no more boxes are dropped; 0 leaves everything as it is. distance: boxes are
+    alike whose four edges differ by no more than this share of the mean of their smaller width and height; so are those
+    that a chain of such boxes links. A group inside another, which is larger and of more than three boxes, or itself of
+    less than three, is dropped.
+    Source: OpenCV, HOGDescriptor::groupRectangles (modules/objdetect, hog.cpp); detectMultiScale uses distance 0.2.
+    """
+    box_px, score = np.asarray(box_px, float), np.asarray(score, float)
+    if least <= 0 or not len(box_px):
+        return box_px, score
+    label = _alike(box_px, distance)
+    groups = int(label.max()) + 1
+    number = np.bincount(label, minlength=groups)
+    mean = np.stack([np.bincount(label, weights=part, minlength=groups) for part in box_px.T], axis=1)
+    mean = np.rint(mean * (1.0 / number)[:, None])
+    best = np.full(groups, -np.inf)
+    np.maximum.at(best, label, score)
+    large = number > least
+    mean, best, number = mean[large], best[large], number[large]
+    margin = np.rint(mean[:, 2:] * distance)
+    inside = (
+        (mean[:, None, :2] >= mean[None, :, :2] - margin).all(-1)
+        & (mean[:, None, :2] + mean[:, None, 2:] <= mean[None, :, :2] + mean[None, :, 2:] + margin).all(-1)
+        & ((number[None, :] > np.maximum(3, number[:, None])) | (number[:, None] < 3))
+    )
+    np.fill_diagonal(inside, False)
+    stays = ~inside.any(axis=1)
+    return mean[stays], best[stays]
+
+
+def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
+    """(N,) the group of each box, numbered as they first appear."""
+    from scipy.sparse import coo_array  # here, as it takes 40 MB, and only OpenCV's grouping needs it
+    from scipy.sparse.csgraph import connected_components
+
+    order = np.argsort(box_px[:, 3], kind="stable")
+    box = box_px[order]
+    low, high, height, around = box[:, :2], box[:, :2] + box[:, 2:], box[:, 3], box[:, 2:].sum(axis=1)
+    # Top and bottom both near: no box is alike that is taller by more than twice what an edge may be off.
+    ends = np.searchsorted(height, height + distance * around, side="right")
+    one, two = [], []
+    for start in range(0, len(box), rows):  # strips of the table of pairs, which may be large
+        here = slice(start, start + rows)
+        others = slice(start, int(ends[here].max()))
+        size = np.minimum(box[here, None, 2:], box[None, others, 2:])
+        reach = distance * (size[..., 0] + size[..., 1]) * 0.5
+        near = np.ones(reach.shape, bool)
+        for edge in (low[:, 0], low[:, 1], high[:, 0], high[:, 1]):
+            near &= np.abs(edge[here, None] - edge[None, others]) <= reach
+        i, j = np.nonzero(near)
+        one.append(order[i + start])
+        two.append(order[j + start])
+    i, j = np.concatenate(one), np.concatenate(two)
+    table = coo_array((np.ones(len(i), bool), (i, j)), shape=(len(box), len(box)))
+    label = connected_components(table, directed=False)[1]
+    _, first, of_label = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[of_label]

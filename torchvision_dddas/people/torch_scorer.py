@@ -1,0 +1,123 @@
+"""Scores of windows by `ops.hog`: batched over pictures of one size, differentiable, on a CPU or GPU."""
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.functional import hog
+from torchvision_dddas.functional.resize import reflected, resize
+from torchvision_dddas.types import LinearSvm, Part
+
+# So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
+_PIXELS = {"cpu": 1 << 18, "cuda": 1 << 24}
+
+
+class TorchRecognizer:
+    """Implements `Recognizer`."""
+
+    name = "torch"
+
+    def __init__(self, knobs: PeopleKnobs, svm: LinearSvm, device: str | torch.device | None = None) -> None:
+        """device: by default the GPU where there is one.
+
+        Raises InputError where cells, blocks and window do not fit one another, or the SVM is of another length.
+        """
+        self.knobs, self.svm = knobs, svm
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.layout = layout(knobs)
+        if svm.weights.size != self.layout.features:
+            raise InputError(
+                f"the classifier {svm.origin} has {svm.weights.size} weights; "
+                f"a window of these settings has {self.layout.features}"
+            )
+        weights = torch.from_numpy(np.array(svm.weights, np.float32))
+        self.weights = hog.arranged(weights, self.layout).to(self.device)
+        self.bias = torch.tensor(svm.bias, dtype=torch.float32, device=self.device)
+
+    def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
+        """The score map of each part of each picture. Pictures of one size that want the same part share a batch."""
+        maps = [[np.zeros(self._windows(part)[::-1], np.float32) for part in wanted] for wanted in parts]
+        places: dict[tuple[tuple[int, ...], Part], list[tuple[int, int]]] = defaultdict(list)
+        for picture, wanted in enumerate(parts):
+            for index, part in enumerate(wanted):
+                if min(self._windows(part)):
+                    places[images[picture].shape, part].append((picture, index))
+        # A picture goes to the device once, for all its parts.
+        held: dict[int, Tensor] = {}
+        for (_, part), where in places.items():
+            some = max(1, _PIXELS.get(self.device.type, 1 << 22) // (part.width * part.height))
+            for begin in range(0, len(where), some):
+                chunk = where[begin : begin + some]
+                for picture, _ in chunk:
+                    if picture not in held:
+                        held[picture] = self._tensor(images[picture])
+                with torch.inference_mode():
+                    found = self.score(torch.stack([held[picture] for picture, _ in chunk]), part)
+                for (picture, index), scored in zip(chunk, found.cpu().numpy(), strict=True):
+                    maps[picture][index] = scored
+        return maps
+
+    def score(self, levels: Tensor, part: Part) -> Tensor:
+        """(B, ny, nx) scores of one part of pictures of one size, with gradients to their levels and to the weights.
+
+        levels: (B, C, H, W) floats 0 .. 255, BGR.
+        """
+        width, height = part.level
+        rows = reflected(part.y - 1, part.y + part.height + 1, height, levels.device)
+        columns = reflected(part.x - 1, part.x + part.width + 1, width, levels.device)
+        bordered = resize(levels, (height, width), rows, columns)
+        return strided_scores(bordered, self.weights, self.bias, self.layout, self.knobs.window_stride_px)
+
+    def _windows(self, part: Part) -> tuple[int, int]:
+        """Windows of a part, (across, down)."""
+        stride, (width, height) = self.knobs.window_stride_px, self.layout.window
+        return max(0, (part.width - width) // stride + 1), max(0, (part.height - height) // stride + 1)
+
+    def _tensor(self, image: np.ndarray) -> Tensor:
+        # A copy: torch warns of memory that must not be written to.
+        channels = torch.tensor(np.ascontiguousarray(np.atleast_3d(image)))
+        return channels.to(self.device).permute(2, 0, 1).float().contiguous()
+
+
+def layout(knobs: PeopleKnobs) -> hog.Layout:
+    """The descriptor of the settings. Raises InputError where they do not fit one another."""
+    return hog.Layout(
+        (knobs.window_width_px, knobs.window_height_px),
+        knobs.cell_px,
+        knobs.block_px,
+        knobs.block_stride_px,
+        knobs.bins,
+        knobs.signed,
+        knobs.clip,
+        knobs.gamma,
+    )
+
+
+def strided_scores(bordered: Tensor, weights: Tensor, bias: Tensor, layout: hog.Layout, stride: int) -> Tensor:
+    """(B, ny, nx) scores of windows every `stride` pixels, which need not be a multiple of the block stride.
+
+    bordered: as in `hog.gradient`. Blocks are then computed at the common divisor of both strides, and the windows that
+    share blocks are scored together: one phase of the block stride after the other.
+    """
+    step = math.gcd(stride, layout.stride)
+    hop, skip = layout.stride // step, stride // step
+    finer = hog.Layout(
+        layout.window, layout.cell, layout.block, step, layout.bins, layout.signed, layout.clip, layout.gamma
+    )
+    found = hog.blocks(bordered, finer)
+    if hop == 1:
+        return hog.scores(found, weights, bias)[:, ::skip, ::skip]
+    height, width = bordered.shape[-2] - 2, bordered.shape[-1] - 2
+    ny, nx = ((have - need) // step + 1 for have, need in zip((height, width), layout.window[::-1], strict=True))
+    dense = bordered.new_empty(len(bordered), ny, nx)
+    for down in range(min(hop, ny)):
+        for across in range(min(hop, nx)):
+            phase = hog.scores(found[..., down::hop, across::hop], weights, bias)
+            dense[:, down::hop, across::hop] = phase
+    return dense[:, ::skip, ::skip]

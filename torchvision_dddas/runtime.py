@@ -1,0 +1,118 @@
+"""What computes: torch, or ONNX graphs, opened only where they are what the manifest of `dddas export` says.
+
+A folder of graphs has one manifest.json. It holds each file's SHA-256, inputs, outputs and knobs, the version of this
+package that made it, and a seal: the SHA-256 of everything else in it. This tells damage, edits and mixed-up versions
+from the graphs that were checked; it is no signature, which would need a key.
+"""
+
+import hashlib
+import json
+import os
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from torchvision_dddas import __version__
+from torchvision_dddas.errors import InputError
+
+SHIPPED = Path(__file__).parent / "graphs"
+MANIFEST = "manifest.json"
+
+
+def opened(folder: Path, name: str, **options: Any) -> Any:
+    """An ONNX Runtime session of a graph, on one thread of this process's own.
+
+    options: further attributes of SessionOptions. Raises InputError as `verified`, and where the runtime refuses.
+    """
+    content = verified(folder, name)
+    import onnxruntime
+
+    chosen = onnxruntime.SessionOptions()
+    chosen.intra_op_num_threads = chosen.inter_op_num_threads = 1
+    for option, value in options.items():
+        setattr(chosen, option, value)
+    try:
+        # The bytes that were verified, not the file, which may change meanwhile.
+        return onnxruntime.InferenceSession(content, chosen, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own classes have no common ancestor but this
+        first = str(error).partition("\n")[0]
+        raise InputError(
+            f"onnxruntime {onnxruntime.__version__} cannot open {folder / name}: {first}; a newer one may"
+        ) from None
+
+
+def verified(folder: Path, name: str) -> bytes:
+    """A graph's bytes. Raises InputError where it is not there, not listed, or not the one that is listed."""
+    held = manifest(folder)["graphs"]
+    if name not in held:
+        raise InputError(f"{folder / MANIFEST} lists no {name}; {_again(folder)}")
+    try:
+        content = (folder / name).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {folder / name}: {error.strerror or error}; {_again(folder)}") from None
+    if hashlib.sha256(content).hexdigest() != held[name].get("sha256"):
+        raise InputError(
+            f"{folder / name} is not the graph that its {MANIFEST} lists: damaged or changed; {_again(folder)}"
+        )
+    return content
+
+
+def manifest(folder: Path) -> dict[str, Any]:
+    """What a folder's manifest says. Raises InputError for none, a changed one, or another version's."""
+    path = folder / MANIFEST
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{folder} holds no graphs with their {MANIFEST} ({error.strerror}); {_again(folder)}"
+        ) from None
+    return _checked(path, text)
+
+
+@cache
+def _checked(path: Path, text: bytes) -> dict[str, Any]:
+    try:
+        held = json.loads(text)
+        made_by = held["package"]
+        intact = isinstance(held["graphs"], dict) and held["seal"] == seal(held)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        intact, held, made_by = False, {}, __version__
+    # Before the seal, which another version may make in another way.
+    if isinstance(made_by, str) and made_by != __version__:
+        raise InputError(
+            f"the graphs in {path.parent} were made by torchvision-dddas {made_by}, "
+            f"and this is {__version__}; {_again(path.parent)}"
+        )
+    if not intact:
+        raise InputError(f"{path} is not as `dddas export` wrote it: damaged or changed; {_again(path.parent)}")
+    return dict(held)
+
+
+def seal(content: dict[str, Any]) -> str:
+    """The SHA-256 of a manifest without its seal, however it is laid out."""
+    rest = {name: value for name, value in content.items() if name != "seal"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _again(folder: Path) -> str:
+    """What to do."""
+    if folder == SHIPPED:
+        return "install torchvision-dddas anew"
+    return f"make the graphs again with `dddas export --out {folder}`"
+
+
+def wants_torch(backend: str) -> bool:
+    """Whether the back end is torch, which is then made ready to be imported."""
+    if backend in ("auto", "onboard"):
+        return False
+    if backend != "torch":
+        raise InputError(f"no back end is named '{backend}'; give auto, torch or onboard")
+    if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
+        raise InputError(
+            f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
+            "or take --backend onboard"
+        )
+    # Waiting threads that spin take the cores from the threads they wait for, minutes a frame on a busy machine.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    return True

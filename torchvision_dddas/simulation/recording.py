@@ -1,0 +1,303 @@
+"""What the instruments of a simulated run give, as files that the tools take: pictures, telemetry, reports, poses."""
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.colour_output import colours_toml
+from torchvision_dddas.io.output.detection_output import RunFolder
+from torchvision_dddas.io.output.run_record import NAME, Record
+from torchvision_dddas.io.overlay.detection_overlay import Overlay
+from torchvision_dddas.io.tables import TextFiles
+from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput
+from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
+
+SAVED = ("frames", "video", "masks", "ground")
+"""What --save may name. The tables are always written."""
+
+PLAIN = ("frames", "masks", "ground")
+"""What is saved where --save is not given."""
+
+TELEMETRY = (
+    *("time_s", "altitude_m", "speed_m_s", "longitude_deg", "latitude_deg", "above_sea_m"),
+    *("heading_deg", "pitch_deg", "roll_deg", "hfov_deg", "vehicle_heading_deg"),
+)
+REPORTS = ("frame", "landmark", "longitude_deg", "latitude_deg", "sigma_m", "planned")
+POSES = ("frame", "longitude_deg", "latitude_deg", "heading_deg", "pitch_deg", "aerial_frame")
+QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A report of a ground vehicle: its name, frame (may be broken), longitude and latitude, standard deviation."""
+
+    vehicle: str
+    frame: float
+    lonlat_deg: np.ndarray
+    sigma_m: float
+    planned: bool = False
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """All that a frame of a simulated run gives. image: None where the camera dropped it.
+
+    flights: what the UAV said since the frame before, and when. heard: what the ground vehicles did.
+    ground: what they saw. seconds: spent on it, per stage.
+    """
+
+    truth: Truth
+    image: np.ndarray | None
+    flights: tuple[tuple[float, Flight], ...] = ()
+    heard: tuple[Heard, ...] = ()
+    ground: tuple[GroundPicture, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class FilmedOutput(RunFolder[Filmed]):
+    """Everything that `dddas simulate` writes. Raises InputError as RunFolder does."""
+
+    files: ClassVar[tuple[str, ...]] = (
+        *("frames/000001.jpg", "clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif"),
+        *("scenario.toml", *TruthOutput.files, NAME),
+    )
+
+    def begin(
+        self,
+        facts: dict[str, Any],
+        rate_hz: float,
+        camera: Camera,
+        colours: Colours,
+        scenario: str,
+        lonlat: LonLat,
+    ) -> Record:
+        """Say what the run is, for run.json.
+
+        scenario: the text of scenario.toml. lonlat: (N, 2) longitudes and latitudes of (N, 2) local metres.
+        """
+        self.journal = kept = Record(self.folder, {**facts, "outputs": ["tables", *self._save]})
+        texts = {"camera.toml": camera_toml(camera), "scenario.toml": scenario}
+        if len(colours):
+            texts["colours.toml"] = colours_toml(colours)
+        self._sinks = [_Kept(kept), _Texts(self.folder, texts), _Reports(self.folder), _Truth(self, lonlat)]
+        if "frames" in self._save:
+            self._sinks.append(_Frames(self.folder / "frames"))
+        if "video" in self._save:
+            self._sinks.append(_Video(self.folder, rate_hz, camera.size_px))
+        if "ground" in self._save:
+            self._sinks.append(_Ground(self.folder / "ground", colours.names))
+        return kept
+
+    @property
+    def masks(self) -> bool:
+        """Whether masks are to be written."""
+        return "masks" in self._save
+
+
+class _Kept:
+    """The record of the run: frames, events, dropped frames."""
+
+    def __init__(self, record: Record) -> None:
+        self._record = record
+        self._events: list[dict[str, Any]] = []
+        record.counts = {"events": self._events, "dropped": 0}
+
+    def write(self, item: Filmed) -> None:
+        truth = item.truth
+        self._events += [{"frame": truth.frame, "time_s": truth.time_s, "what": what} for what in truth.events]
+        self._record.counts["dropped"] += item.image is None
+        targets = len(np.unique(truth.bodies.target[truth.bodies.kind != "ugv"]))
+        self._record.note(truth.frame, targets, item.seconds, cause="dropped" if item.image is None else None)
+
+    def close(self, complete: bool) -> None:
+        self._record.close(complete)
+
+    def discard(self) -> None:
+        self._record.discard()
+
+
+class _Texts:
+    """Files that are known from the start, written with the first frame."""
+
+    def __init__(self, folder: Path, texts: dict[str, str]) -> None:
+        self._folder, self._texts = folder, texts
+        self._begun = False
+
+    def write(self, item: Filmed) -> None:
+        if not self._begun:
+            for name, text in self._texts.items():
+                write_whole(self._folder / name, text.encode())
+        self._begun = True
+
+    def close(self, complete: bool) -> None:
+        pass
+
+    def discard(self) -> None:
+        pass
+
+
+class _Reports:
+    """telemetry.csv and landmarks.csv. Of what a vehicle plans for a frame the newest counts: plans come at the end."""
+
+    def __init__(self, folder: Path) -> None:
+        content = {"telemetry.csv": TELEMETRY, "landmarks.csv": REPORTS}
+        self._files = TextFiles({folder / name: ",".join(columns) + "\n" for name, columns in content.items()})
+        self._plans: dict[tuple[str, float], str] = {}
+
+    def write(self, item: Filmed) -> None:
+        said = [_flight_line(time_s, flight) for time_s, flight in item.flights]
+        self._plans |= {(h.vehicle, round(h.frame, 6)): _report_line(h) for h in item.heard if h.planned}
+        heard = [_report_line(h) for h in item.heard if not h.planned]
+        self._files.write("".join(said), "".join(heard))
+
+    def close(self, complete: bool) -> None:
+        self._files.write("", "".join(self._plans.values()))
+        self._files.close()
+
+    def discard(self) -> None:
+        self._files.discard()
+
+
+class _Truth:
+    """truth/, of the frames that are there or were dropped."""
+
+    def __init__(self, output: FilmedOutput, lonlat: LonLat) -> None:
+        self._sink = TruthOutput(output.folder, lonlat, output.masks)
+        self.close, self.discard = self._sink.close, self._sink.discard
+
+    def write(self, item: Filmed) -> None:
+        self._sink.write(item.truth)
+
+
+class _Frames:
+    """frames/000001.jpg and so on; a dropped frame is a file without content, so that the others keep their numbers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._last = 0
+
+    def write(self, item: Filmed) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._last = item.truth.frame
+        write_whole(self._folder / f"{self._last:06d}.jpg", b"" if item.image is None else jpeg(item.image))
+
+    def close(self, complete: bool) -> None:
+        clear_after(self._folder, self._last)
+
+    def discard(self) -> None:
+        pass
+
+
+class _Video(Overlay[np.ndarray]):
+    """clip.mp4, H.264 where PyAV is installed; in place of a dropped frame the one before is there again."""
+
+    def __init__(self, folder: Path, rate_hz: float, size: tuple[int, int]) -> None:
+        super().__init__(folder, rate_hz, lambda image: image, "clip.mp4")
+        self._before = np.zeros((*size[::-1], 3), np.uint8)
+
+    def write(self, item: Any) -> None:
+        if item.image is not None:
+            self._before = item.image
+        super().write(self._before)
+
+
+class _Ground:
+    """ground/ugv1/000001.jpg and so on, poses.csv and camera.toml beside them."""
+
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        self._folders = {name: folder / name for name in names}
+        self._count = dict.fromkeys(names, 0)
+        self._poses: dict[str, TextFiles] = {}
+
+    def write(self, item: Filmed) -> None:
+        for picture in item.ground:
+            name, camera = picture.vehicle, picture.camera
+            folder = self._folders[name]
+            if not self._count[name]:
+                folder.mkdir(parents=True, exist_ok=True)
+                write_whole(folder / "camera.toml", camera_toml(camera, standing=True).encode())
+                self._poses[name] = TextFiles({folder / "poses.csv": ",".join(POSES) + "\n"})
+            number = self._count[name] = self._count[name] + 1
+            write_whole(folder / f"{number:06d}.jpg", jpeg(picture.image))
+            angles = f"{math.degrees(camera.heading_rad) % 360:.4f},{math.degrees(camera.pitch_rad):.4f}"
+            place = f"{camera.place[0]:.9f},{camera.place[1]:.9f}"
+            self._poses[name].write(f"{number},{place},{angles},{picture.frame}\n")
+
+    def close(self, complete: bool) -> None:
+        for name, folder in self._folders.items():
+            clear_after(folder, self._count[name])
+            if name in self._poses:
+                self._poses[name].close()
+            else:
+                remove(folder / "poses.csv")
+
+    def discard(self) -> None:
+        for poses in self._poses.values():
+            poses.discard()
+
+
+def jpeg(image: np.ndarray) -> bytes:
+    """A picture as a JPEG that adds next to nothing to it. Raises OSError where it cannot be encoded."""
+    ok, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not ok:
+        raise OSError("a picture could not be encoded")
+    return content.tobytes()
+
+
+def clear_after(folder: Path, last: int) -> None:
+    """Remove the pictures of an earlier, longer run, so that the folder speaks of one run only."""
+    for path in folder.glob("*.jpg"):
+        if path.stem.isdecimal() and int(path.stem) > last:
+            with suppress(OSError):
+                path.unlink()
+
+
+def camera_toml(camera: Camera, standing: bool = False) -> str:
+    """A camera's file. standing: with height, pitch, roll and how well it knows its place, as one on the ground has."""
+    lines = [
+        f'name = "{camera.name}"',
+        f"width_px = {camera.size_px[0]}",
+        f"height_px = {camera.size_px[1]}",
+        f"focal_px = {float(camera.focal_px[0])!r}",
+        f"focal_v_px = {float(camera.focal_px[1])!r}",
+        f"centre_px = [{camera.centre_px[0]}, {camera.centre_px[1]}]",
+        f"k1 = {camera.k1}",
+        f"k2 = {camera.k2}",
+    ]
+    if standing:
+        lines += [
+            f"height_m = {camera.height_m}",
+            f"pitch_deg = {math.degrees(camera.pitch_rad):.6g}",
+            f"roll_deg = {math.degrees(camera.roll_rad):.6g}",
+            f"focal_sigma = {camera.focal_sigma}",
+            f"height_sigma_m = {camera.height_sigma_m}",
+            f"pitch_sigma_deg = {math.degrees(camera.pitch_sigma_rad):.6g}",
+            f"heading_sigma_deg = {math.degrees(camera.heading_sigma_rad):.6g}",
+            f"position_sigma_m = {camera.position_sigma_m:.6g}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _report_line(heard: Heard) -> str:
+    """A line of landmarks.csv."""
+    lon, lat = heard.lonlat_deg
+    return f"{_short(heard.frame, 6)},{heard.vehicle},{lon:.9f},{lat:.9f},{heard.sigma_m:.6g},{heard.planned:d}\n"
+
+
+def _flight_line(time_s: float, flight: Flight) -> str:
+    """A line of telemetry.csv; a cell is empty where the UAV does not say."""
+    angles = (flight.heading_rad, flight.pitch_rad, flight.roll_rad, flight.hfov_rad, flight.vehicle_heading_rad)
+    cells = [_short(time_s, 6), _short(flight.altitude_m, 4), _short(flight.speed_m_s, 4)]
+    cells += [_short(v, 9) for v in flight.place] + [_short(flight.above_sea_m, 4)]
+    return ",".join(cells + [_short(math.degrees(v), 5) for v in angles]) + "\n"
+
+
+def _short(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".rstrip("0").rstrip(".") if math.isfinite(value) else ""

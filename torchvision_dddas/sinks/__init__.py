@@ -1,5 +1,0 @@
-"""Where scenes go: tables, masks, an overlay video, and the record of the run."""
-
-from torchvision_dddas.sinks.output import SAVED, Output, Sink, saved
-
-__all__ = ["SAVED", "Output", "Sink", "saved"]

@@ -1,0 +1,1 @@
+"""Targets over time: detections to identities."""

@@ -1,0 +1,237 @@
+"""What is true of a picture from the air: landmarks, telemetry and targets whose places are known, and their spreads.
+
+Which variances a knob adds to is asked of `targets.pose.prior_of` itself, with one knob at a time: the formulas stay
+there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchvision_dddas.config import AerialKnobs, LandmarkKnobs, Settings
+from torchvision_dddas.geo.ground_rays import met_with_slopes
+from torchvision_dddas.geo.initial_pose import find_pose
+from torchvision_dddas.geo.landmark_faults import passes
+from torchvision_dddas.geo.pose_estimation import EXACT_M, Prior, bare_prior, expected_of, prior_of, slopes_at
+from torchvision_dddas.geo.terrain_intersection import Surface
+from torchvision_dddas.tuning.soft_places import Linear, Spread
+from torchvision_dddas.types import Camera, CameraPose, Flight, Marks
+
+PRIOR = (
+    "focal_sigma",
+    "focal_guess_sigma",
+    "tilt_sigma_deg",
+    "tilt_guess_sigma_deg",
+    "heading_sigma_deg",
+    "altitude_sigma",
+    "altitude_sigma_m",
+    "position_sigma_m",
+)
+"""Knobs of the group `aerial` that say how well telemetry is known."""
+
+NO_NOISE = 3.0
+"""Landmarks that would not fit were all errors so many times as large are not where they are said to be: an identity
+swapped, a place far off. No noise level explains them, and none is learned from them."""
+
+_FLOOR = 1e-12  # of a variance: `prior_of` takes no standard deviation below 1e-6
+
+
+@dataclass(frozen=True)
+class Look:
+    """One picture. Metres are local, in one frame of reference.
+
+    reference: what telemetry says of the pose, with known: (7,) of which something is. prior: variances (7,) of that.
+    marks: n landmarks, all with pixel and place; places: variances (n,) m² of those, pixels: (n,) px² of the pixels.
+    targets_px: (T, 2), up_m: (T,) how high above the ground that is; spot: variances (T,) px² of it. true_m: (T, 2).
+    surface: the ground, if not flat.
+    """
+
+    camera: Camera
+    reference: CameraPose
+    known: np.ndarray
+    prior: Spread
+    marks: Marks
+    places: Spread
+    pixels: Spread
+    targets_px: np.ndarray
+    up_m: np.ndarray
+    spot: Spread
+    true_m: np.ndarray
+    surface: Surface | None = None
+
+
+@dataclass(frozen=True)
+class Laid:
+    """A look at the likeliest pose under some variances, with what `modules.places` goes on from."""
+
+    problem: Linear
+    off_m: torch.Tensor
+    by_pose: torch.Tensor
+    by_pixel: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A look as an example has it: what its loss is taken from. settings: with what it was prepared.
+
+    fit: to go on from in place of a hard fit with the knobs of the moment (see `kept`); None: fit anew each time.
+    """
+
+    look: Look
+    settings: Settings
+    fit: Laid | None = None
+
+
+def kept(seen: Seen) -> Seen | None:
+    """The same with its fit at the settings kept: some hundred times as quick, and right to first order about these.
+
+    None where no pose shows the landmarks.
+    """
+    fit = laid(seen.look, of_settings(seen.settings))
+    return None if fit is None else Seen(seen.look, seen.settings, fit)
+
+
+def look_at(
+    camera: Camera,
+    flight: Flight | None,
+    marks: Marks,
+    targets_px: np.ndarray,
+    true_m: np.ndarray,
+    settings: Settings,
+    own: np.ndarray,
+    up_m: np.ndarray | None = None,
+    side_px: np.ndarray | None = None,
+    focal_known: bool = True,
+    surface: Surface | None = None,
+) -> Look:
+    """A look whose knobs count for the rest.
+
+    marks: with the standard deviations of the settings. own: (n,) bool, which landmarks' reports do not say how well
+    they are known, so that landmarks.sigma_m counts. side_px: (T,) of the boxes that aerial.own_sigma counts for.
+    """
+    aerial, landmarks = settings.aerial, settings.landmarks
+    of_knobs = _prior(flight, camera, aerial, focal_known)
+    share = landmarks.sigma_m**2
+    told = marks.sigma_m**2 - np.where(own, share, 0.0)
+    count = len(targets_px)
+    side = np.zeros(count) if side_px is None else side_px
+    return Look(
+        camera,
+        of_knobs.pose,
+        of_knobs.known,
+        _spread_of(flight, camera, focal_known),
+        marks,
+        Spread(_column(np.maximum(told, 0)), {"landmarks.sigma_m": _column(own)}),
+        Spread(_column(np.zeros(len(marks))), {"landmarks.pixel_sigma": _column(np.ones(len(marks)))}),
+        np.asarray(targets_px, float).reshape(-1, 2),
+        np.zeros(count) if up_m is None else up_m,
+        Spread(
+            _column(np.zeros(count)),
+            {"aerial.target_sigma_px": _column(np.ones(count)), "aerial.own_sigma": _column(side**2)},
+        ),
+        np.asarray(true_m, float).reshape(-1, 2),
+        surface,
+    )
+
+
+def laid(look: Look, knobs: dict[str, torch.Tensor]) -> Laid | None:
+    """The hard fit with these knobs, detached; None where no pose shows the landmarks, or a ray meets no ground."""
+    n = len(look.marks)
+    prior, sigma_m, pixel_sigma = _hard(look, knobs)
+    marks = Marks(
+        look.marks.landmark,
+        look.marks.image_px,
+        look.marks.east_north_m,
+        sigma_m,
+        pixel_sigma,
+        look.marks.up_m,
+    )
+    expected = expected_of(prior, sigma_m)
+    solution = find_pose(marks, look.camera, expected)
+    if solution is None:
+        return None
+    here = slopes_at(marks, look.camera, expected, solution.pose, solution.places)
+    if here is None:
+        return None
+    place, by_pose, by_pixel = met_with_slopes(solution.pose, look.camera, look.targets_px, look.up_m, look.surface)
+    if not all(np.isfinite(found).all() for found in (place, by_pose, by_pixel)):
+        return None
+    by_turn = np.eye(7 + 2 * n)
+    by_turn[:3, :3] = here.by_turn
+    known = np.concatenate([look.known, np.ones(2 * n)])
+    problem = Linear(*(_column(part) for part in (here.missing, here.slopes, here.correction, by_turn, known)))
+    return Laid(problem, _column(place - look.true_m), _column(by_pose), _column(by_pixel))
+
+
+def only_noise(look: Look, knobs: dict[str, torch.Tensor], probability: float) -> bool:
+    """Whether landmarks and telemetry agree, if not by what is said of their errors then by NO_NOISE times as much."""
+    prior, sigma_m, pixel_sigma = _hard(look, knobs)
+    wide = Prior(prior.pose, prior.information / NO_NOISE**2)
+    marks = Marks(
+        look.marks.landmark,
+        look.marks.image_px,
+        look.marks.east_north_m,
+        NO_NOISE * sigma_m,
+        NO_NOISE * pixel_sigma,
+        look.marks.up_m,
+    )
+    return passes(find_pose(marks, look.camera, expected_of(wide, marks.sigma_m)), probability)
+
+
+def joined(parts: Sequence[Spread]) -> Spread:
+    """Spreads of equal length and knobs, one above the other."""
+    gain = {name: torch.stack([part.gain[name] for part in parts]) for name in parts[0].gain}
+    return Spread(torch.stack([part.base for part in parts]), gain)
+
+
+def _hard(look: Look, knobs: dict[str, torch.Tensor]) -> tuple[Prior, np.ndarray, np.ndarray]:
+    """What is expected under these knobs: the prior, and standard deviations of landmarks' places and pixels."""
+    with torch.no_grad():
+        variance = look.prior.variance(knobs).numpy()
+        sigma_m = look.places.variance(knobs).clamp(min=EXACT_M**2).sqrt().numpy()
+        pixel_sigma = look.pixels.variance(knobs).sqrt().numpy()
+    return Prior(look.reference, np.diag(look.known / np.maximum(variance, _FLOOR))), sigma_m, pixel_sigma
+
+
+def _prior(flight: Flight | None, camera: Camera, knobs: AerialKnobs, focal_known: bool) -> Prior:
+    return prior_of(flight, camera, knobs, focal_known=focal_known) or bare_prior(camera, knobs, focal_known)
+
+
+def _spread_of(flight: Flight | None, camera: Camera, focal_known: bool) -> Spread:
+    """What each knob adds to the variances of the prior."""
+
+    def variance(**knobs: float) -> np.ndarray:
+        prior = _prior(flight, camera, AerialKnobs().model_copy(update=dict.fromkeys(PRIOR, 0.0) | knobs), focal_known)
+        return np.where(prior.known, 1 / np.maximum(np.diag(prior.information), 1e-300), 0.0)
+
+    base = variance()
+    gain = {f"aerial.{name}": np.maximum(variance(**{name: 1.0}) - base, 0.0) for name in PRIOR}
+    base = np.where(base <= 2 * _FLOOR, 0.0, base)
+    return Spread(_column(base), {name: _column(np.where(part < 1e-9, 0.0, part)) for name, part in gain.items()})
+
+
+def _column(array: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(array, float))
+
+
+SPREADS = (
+    *(f"aerial.{name}" for name in PRIOR),
+    "aerial.target_sigma_px",
+    "aerial.own_sigma",
+    "landmarks.pixel_sigma",
+    "landmarks.sigma_m",
+    "landmarks.common_sigma_m",
+)
+"""All knobs that have a say in where ellipses from the air lie and how large they are."""
+
+
+def of_settings(settings: Settings) -> dict[str, torch.Tensor]:
+    """The values of SPREADS."""
+    groups: dict[str, AerialKnobs | LandmarkKnobs] = {"aerial": settings.aerial, "landmarks": settings.landmarks}
+    values = {}
+    for name in SPREADS:
+        group, _, knob = name.partition(".")
+        values[name] = torch.tensor(float(getattr(groups[group], knob)), dtype=torch.float64)
+    return values

@@ -1,0 +1,199 @@
+"""Knobs as parameters: which ones gradients can move, and the transforms that keep them in their ranges."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.errors import InputError
+
+Family = Literal["motion", "registration", "tracking", "paper", "people", "location"]
+Rounding = Literal["none", "whole", "odd"]
+
+# A value on the very edge of its range has no slope; it starts this share of the range away from it.
+_EDGE = 1e-3
+_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class Tunable:
+    """One knob that gradients can move, between low and high of its field in `settings`.
+
+    log: steps are factors, not amounts; with an offset, of the value plus this, so that 0 can be reached.
+    rounding: what the knob is once it is a setting; while it is tuned any number between will do.
+    """
+
+    name: str
+    family: Family
+    low: float
+    high: float
+    unit: str = "-"
+    log: bool = False
+    offset: float = 0.0
+    rounding: Rounding = "none"
+
+    def value(self, free: Tensor) -> Tensor:
+        """The knob's value for an unconstrained number; mid-range, one free unit is a factor e (or 1)."""
+        low, span = self._scaled(self.low), self._span
+        scaled = low + span * torch.sigmoid(free * (4.0 / span))
+        return scaled.exp() - self.offset if self.log else scaled
+
+    def free(self, value: float) -> float:
+        """The unconstrained number of a value; one on the edge of the range is moved in by a thousandth of it."""
+        share = (self._scaled(value) - self._scaled(self.low)) / self._span
+        share = min(max(share, _EDGE), 1.0 - _EDGE)
+        return math.log(share / (1.0 - share)) * self._span / 4.0
+
+    def rounded(self, value: float) -> float | int:
+        """As the settings want it: whole, odd, or with four digits; within the range."""
+        value = min(max(value, self.low), self.high)
+        if self.rounding == "none":
+            return min(max(float(f"{value:.{_DIGITS}g}"), self.low), self.high)
+        if self.rounding == "whole":
+            return round(value)
+        return min(2 * math.floor(value / 2) + 1, int(self.high) - 1 + int(self.high) % 2)
+
+    @property
+    def range(self) -> str:
+        """In words: `0.1 to 255`, `1 to 31, odd`."""
+        return f"{self.low:g} to {self.high:g}" + (", odd" if self.rounding == "odd" else "")
+
+    @property
+    def _span(self) -> float:
+        return self._scaled(self.high) - self._scaled(self.low)
+
+    def _scaled(self, value: float) -> float:
+        return math.log(value + self.offset) if self.log else float(value)
+
+
+def _from_settings(
+    family: Family, group: str, names: str, log: bool = True, offset: float = 0.0, rounding: Rounding = "none"
+) -> dict[str, Tunable]:
+    """Tunables with the ranges and units of their fields."""
+    found = {}
+    for key in names.split():
+        field = type(Settings.model_fields[group].default).model_fields[key]
+        low = next(rule.ge for rule in field.metadata if getattr(rule, "ge", None) is not None)
+        high = next(rule.le for rule in field.metadata if getattr(rule, "le", None) is not None)
+        extra = field.json_schema_extra
+        unit = str(extra["unit"]) if isinstance(extra, dict) else "-"
+        name = f"{group}.{key}"
+        found[name] = Tunable(name, family, float(low), float(high), unit, log, offset, rounding)
+    return found
+
+
+# Not here: switches and choices; scores from which detections count, which decide what there is to link; what decides
+# how many points, levels or frames are looked at, which changes the graph; and what acts on single blobs by counting
+# (persistence), for which a mask's pixels give no slope.
+TUNABLE: dict[str, Tunable] = {
+    **_from_settings("motion", "difference", "noise_levels threshold"),
+    **_from_settings("motion", "difference", "gradient_share", offset=0.02),
+    **_from_settings("motion", "difference", "peak", offset=1.0),
+    **_from_settings("motion", "difference", "blur_px", rounding="odd"),
+    **_from_settings("motion", "morphology", "erode_px close_px", rounding="whole"),
+    **_from_settings("motion", "gates", "min_area_px", rounding="whole"),
+    **_from_settings("registration", "registration", "ransac_px"),
+    **_from_settings("registration", "registration", "forward_backward_px", offset=0.01),
+    **_from_settings("tracking", "track", "speed agility scatter size_scatter"),
+    **_from_settings("tracking", "track", "tail upright rest_drift"),
+    **_from_settings("tracking", "track", "births appearance_weight", offset=0.1),
+    **_from_settings("tracking", "track", "rest_price missed border left", offset=0.1),
+    **_from_settings("tracking", "track", "prior appearance_offset", log=False),
+    **_from_settings("paper", "paper", "weight lowest_dispersion", log=False),
+    **_from_settings("paper", "paper", "threshold location_cut appearance_cut", offset=0.05),
+    **_from_settings("people", "people", "threshold probability_even height_share width_share feet_share", log=False),
+    **_from_settings("people", "people", "probability_slope"),
+    **_from_settings("location", "ground", "body_height_sigma_m height_sigma feet_sigma", offset=1e-3),
+    **_from_settings("location", "landmarks", "pixel_sigma"),
+    **_from_settings("location", "landmarks", "sigma_m common_sigma_m", offset=0.01),
+    **_from_settings("location", "aerial", "focal_sigma focal_guess_sigma altitude_sigma", offset=1e-3),
+    **_from_settings("location", "aerial", "tilt_sigma_deg tilt_guess_sigma_deg heading_sigma_deg", offset=0.01),
+    **_from_settings("location", "aerial", "altitude_sigma_m position_sigma_m target_sigma_px", offset=0.01),
+    **_from_settings("location", "aerial", "own_sigma", offset=1e-3),
+}
+
+
+def chosen(names: Iterable[str]) -> list[str]:
+    """The names of tunable knobs, where `difference.*` stands for all of a group; in the order given, each once.
+
+    Raises InputError for a name that is none, with all that are and their ranges.
+    """
+    found: dict[str, None] = {}
+    for name in names:
+        fitting = [known for known in TUNABLE if fnmatchcase(known, name)]
+        if not fitting:
+            known = ", ".join(f"{tunable.name} ({tunable.range})" for tunable in TUNABLE.values())
+            raise InputError(f"'{name}' is no knob that can be tuned by gradient; wanted of: {known}")
+        found |= dict.fromkeys(fitting)
+    if not found:
+        raise InputError("no knob to tune; name some, such as difference.threshold")
+    return list(found)
+
+
+class Knobs(nn.Module):
+    """The knobs that are tuned, as parameters without bounds; the others stay as the settings have them."""
+
+    def __init__(self, settings: Settings, names: Iterable[str]) -> None:
+        """names: as `chosen` takes them. Raises InputError for one that cannot be tuned."""
+        super().__init__()
+        self.base = settings
+        self.names = chosen(names)
+        starts = [TUNABLE[name].free(float(_of(settings, name))) for name in self.names]
+        # In double precision, for geometry; a number without axes leaves a picture's own precision alone.
+        self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in starts])
+        self._starts = starts
+
+    def values(self, whole: bool = False) -> dict[str, Tensor]:
+        """Each knob's value with its gradient: numbers without axes, float64.
+
+        whole: sizes as the settings round them, without a gradient; where all knobs are sizes they go on as they are.
+        """
+        found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
+        if whole and self._held:
+            settled = self.settled()
+            found |= {name: settled[name] for name in self._held}
+        return found
+
+    @property
+    def _held(self) -> tuple[str, ...]:
+        """What is without a gradient where sizes are whole: they, beside others."""
+        sizes = tuple(name for name in self.names if TUNABLE[name].rounding != "none")
+        return sizes if len(sizes) < len(self.names) else ()
+
+    def moved(self, whole: bool = False) -> Tensor:
+        """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient.
+
+        whole: without that of sizes, as in `values`.
+        """
+        held = self._held if whole else ()
+        ways = [
+            ((free.detach() if name in held else free) - start) ** 2
+            for name, free, start in zip(self.names, self.free, self._starts, strict=True)
+        ]
+        return torch.stack(ways).sum()
+
+    def settled(self) -> dict[str, Tensor]:
+        """Each knob's value as the settings would have it, without a gradient: as `values` else."""
+        settings = self.settings()
+        return {
+            name: free.new_tensor(float(_of(settings, name))) for name, free in zip(self.names, self.free, strict=True)
+        }
+
+    def settings(self) -> Settings:
+        """The settings with these values, whole and odd ones rounded; knobs that have not moved stay as they were."""
+        moved = {
+            name: TUNABLE[name].rounded(float(value.detach()))
+            for (name, value), free, start in zip(self.values().items(), self.free, self._starts, strict=True)
+            if float(free.detach()) != start
+        }
+        return with_knobs(self.base, moved, origin="the tuned knobs")
+
+
+def _of(settings: Settings, name: str) -> float:
+    group, key = name.split(".")
+    return float(getattr(getattr(settings, group), key))

@@ -1,0 +1,146 @@
+"""The knobs of registration: how far the background's motion is off where masks say that nothing moves.
+
+Examples are points followed from a labelled frame to the next, and the loss is the mean distance, in pixels, by which
+the motion that the pipeline finds misses those on background. What is too wide takes in what moves slowly; what is too
+narrow leaves few points, or a registration that is not believed. Points are looked for anew in each frame, as at a cold
+start: with registration.redetect_frames above 1 the pipeline carries them on.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchvision_dddas.config import RegistrationKnobs, Settings
+from torchvision_dddas.detection.engine import Vision, load_engine
+from torchvision_dddas.detection.exposure import in_one_light
+from torchvision_dddas.detection.opencv_registration import LAST_TOLERANCE, fit, keypoints, there_and_back
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.functional import affine, homography
+from torchvision_dddas.functional.threshold import step
+from torchvision_dddas.tuning.clip_masks import check_masks, labels_at
+from torchvision_dddas.tuning.family import Example, Tick
+from torchvision_dddas.tuning.soft_registration import Followed, refitted
+from torchvision_dddas.types import Frame
+
+RANSAC, CHECK = "registration.ransac_px", "registration.forward_backward_px"
+
+LOST_PX = 2.0
+"""What a registration costs that is not believed: the frames about it show nothing."""
+
+_FEWEST = 8
+"""Points on background from which on a frame says something."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A pair of frames: its points, and the knobs of what is not tuned."""
+
+    points: Followed
+    knobs: RegistrationKnobs
+
+
+class Registering:
+    """Implements `Family` for the knobs of registration."""
+
+    name = "registration"
+    task: Task = "motion"
+    measure = "motion.pixels.f"
+    softness = (0.3, 0.02)
+    """Shares of the tolerances."""
+
+    def check(self, names: Sequence[str], settings: Settings) -> None:
+        """Raises InputError for settings that cannot be tuned. See `family.Particular`."""
+        if settings.registration.halved:
+            raise InputError("registration.halved = true cannot be tuned by gradient; set it to false")
+        if CHECK in names and settings.registration.forward_backward_px == 0:
+            raise InputError(f"{CHECK} = 0 leaves the check out, which cannot be tuned; set it above 0")
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """The frames with masks that have a next one. Raises InputError for a clip without any."""
+        check_masks(clips)
+        found: list[Example] = []
+        for clip in clips:
+            before = len(found)
+            for example in _examples(clip, settings):
+                found.append(example)
+                tick()
+            if len(found) == before:
+                raise InputError(f"{clip.name}: no two frames after each other have background that can be followed")
+        return found
+
+    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,) px by which each pair's motion misses the background. On the CPU, where points are few."""
+        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
+        here = {name: value.cpu() for name, value in knobs.items()}
+        return torch.stack([_lost(example.content, here, softness) for example in batch]).to(device)
+
+
+def family() -> Registering:
+    """See `family.family_of`."""
+    return Registering()
+
+
+def followed(vision: Vision, earlier: np.ndarray, later: np.ndarray, labels: np.ndarray) -> Followed:
+    """The points of a picture, (H, W, 3) or (H, W) uint8, that are found in the next. labels: (H, W), 0 background."""
+    knobs = vision.knobs.registration
+    # Whatever the way back misses by: how much it may is tuned.
+    freely = knobs.model_copy(update={"forward_backward_px": np.inf})
+    views = vision.prepare(earlier), vision.prepare(later)
+    start = keypoints(views[0].grey, knobs, halved=knobs.redetect_frames > 1)
+    if not len(start):
+        end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
+    else:
+        end, found, missed_px = there_and_back(*in_one_light(*views), start, freely)
+    # A point whose search window meets what moves is drawn along by it.
+    near = cv2.dilate((labels != 0).astype(np.uint8), np.ones((knobs.window_px, knobs.window_px), np.uint8))
+    column, row = start[found].astype(int).T
+    still = near[row, column] == 0
+    return Followed(
+        torch.from_numpy(start[found].astype(float)),
+        torch.from_numpy(end[found].astype(float)),
+        torch.from_numpy(missed_px[found].astype(float)),
+        torch.from_numpy(still),
+    )
+
+
+def _examples(clip: Clip, settings: Settings) -> Iterator[Example]:
+    truth, vision = clip.truth, load_engine("onboard", settings)
+    assert truth is not None, "asked for clips with masks alone"
+    frames: Iterator[tuple[Frame, Frame]] = pairwise(opened(clip))
+    for frame, later in frames:
+        if frame.number not in truth.masks or later.number != frame.number + 1:
+            continue
+        labels = labels_at(truth, frame.number, frame.image.shape)
+        points = followed(vision, frame.image, later.image, labels)
+        if int(points.still.sum()) >= _FEWEST:
+            yield Example(clip.name, frame.number, Step(points, settings.registration))
+
+
+def _lost(pair: Step, knobs: Mapping[str, Tensor], softness: float) -> Tensor:
+    fixed, points = pair.knobs, pair.points
+    tolerance_px = knobs.get(RANSAC, torch.tensor(fixed.ransac_px, dtype=torch.float64))
+    check_px = knobs.get(CHECK, torch.tensor(fixed.forward_backward_px, dtype=torch.float64))
+    kept = (points.missed_px <= check_px).numpy() if fixed.forward_backward_px else np.ones(len(points.still), bool)
+    guess = np.eye(3)
+    if kept.sum() >= 4:
+        start, end = (side.numpy()[kept].astype(np.float32) for side in (points.earlier_px, points.later_px))
+        guess = fit(start, end, fixed.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
+    found = refitted(
+        points,
+        torch.from_numpy(guess),
+        tolerance_px,
+        check_px if fixed.forward_backward_px else None,
+        LAST_TOLERANCE,
+        affine.fit if fixed.model == "affine" else homography.fit,
+        softness,
+    )
+    least = max(fixed.min_inlier_share, 1e-3)
+    return found.off_px + LOST_PX * step(1 - found.share / least, softness)
