@@ -1,4 +1,4 @@
-"""Tuning in small: scenes are filmed, a knob is put wrong, its gradient brings it back. No data needed.
+"""Tuning in small: scenes are filmed, a parameter is put wrong, its gradient brings it back. No data needed.
 
 .venv/bin/python docs/tuning.py [FOLDER]
 """
@@ -31,7 +31,7 @@ def main(folder: Path) -> None:
 
     # 3. Twelve steps down the slope of 1 - F of soft masks.
     found = descend(
-        ready.family, ready.knobs, ready.examples, Plan(steps=12, batch=4, rate=0.2, look_every=3), tell=told
+        ready.family, ready.parameters, ready.examples, Plan(steps=12, batch=4, rate=0.2, look_every=3), tell=told
     )
     print(f"difference.threshold: 12 -> {found.settings.difference.threshold:g} ({found.ended})")
 

@@ -28,7 +28,7 @@ from torchvision_dddas.evaluation.metrics.windows import Windows
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.sequence import Follower
-from torchvision_dddas.types import Detections, Followed, Tracks
+from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 SAME = 0.9
 PAPER = ["track.mode=paper"]
@@ -92,9 +92,9 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
     truth = truth.at(order[np.argsort(truth.frame[order], kind="stable")])
     last, source = int(truth.frame.max()), open_source(str(clip)) if clip else None
     size = source.size if source else tuple((truth.box_px[:, :2] + truth.box_px[:, 2:]).max(axis=0).tolist())
-    vision = load_engine("onboard", settings) if source else None
+    engine = load_engine("onboard", settings) if source else None
     followers = [Follower(settings, interval, size) for _ in range(interval)]
-    cameras = [Camera(vision) for _ in range(interval)] if vision else []
+    cameras = [Camera(engine) for _ in range(interval)] if engine else []
     looked = 0
 
     def counted(look: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable:
@@ -115,7 +115,7 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
         phase = (number - 1) % interval
         picture = None if isinstance(frame, int) else frame
         step = cameras[phase].step(picture.image)[0] if picture else None
-        given = Followed(number, picture, boxes(truth, number), Tracks(number), step)
+        given = TrackedFrame(number, picture, boxes(truth, number), Tracks(number), step)
         settled[phase] += [f.tracks for f in followers[phase].take(given)]
     for phase, follower in enumerate(followers):
         settled[phase] += [f.tracks for f in follower.end()]

@@ -31,7 +31,7 @@ import association_data as data
 import association_plots as plots
 import footage
 
-from torchvision_dddas.config import PaperKnobs
+from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
 from torchvision_dddas.tracking import jaccard
 from torchvision_dddas.tracking.dispersion import location_weight, of_window
@@ -98,12 +98,12 @@ def main() -> None:
         plots.draw(found, options.out)
 
 
-def ratios(windows: data.Windows, knobs: PaperKnobs, weight: float | None) -> np.ndarray:
+def ratios(windows: data.Windows, parameters: PaperParameters, weight: float | None) -> np.ndarray:
     """AR_K of every window; weight None: as the dispersions choose it."""
-    chosen = weights(windows, knobs) if weight is None else np.full(len(windows.frames), weight)
+    chosen = weights(windows, parameters) if weight is None else np.full(len(windows.frames), weight)
     return np.array(
         [
-            accuracy_ratio(assign(location, appearance, float(w), knobs), identities)
+            accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
             for location, appearance, identities, w in zip(
                 windows.location, windows.appearance, windows.identities, chosen, strict=True
             )
@@ -111,22 +111,22 @@ def ratios(windows: data.Windows, knobs: PaperKnobs, weight: float | None) -> np
     )
 
 
-def weights(windows: data.Windows, knobs: PaperKnobs) -> np.ndarray:
+def weights(windows: data.Windows, parameters: PaperParameters) -> np.ndarray:
     """The weight of location that the source's rule gives each window."""
     found = []
     for of_frames, known in zip(windows.dispersions.tolist(), windows.identities, strict=True):
         counts = [len(k) for k in known]
-        location, appearance = (of_window([frame[n] for frame in of_frames], counts, knobs) for n in (0, 1))
-        found.append(location_weight(location, lambda a=appearance: a, knobs.lowest_dispersion)[0])
+        location, appearance = (of_window([frame[n] for frame in of_frames], counts, parameters) for n in (0, 1))
+        found.append(location_weight(location, lambda a=appearance: a, parameters.lowest_dispersion)[0])
     return np.array(found)
 
 
 def _windows(
     place: Path, count: int, interval: int, pictures: str = "video", every: int = 1, **how: Any
 ) -> data.Windows:
-    knobs = PaperKnobs()
+    parameters = PaperParameters()
     truth = data.read(place, pictures, **how)
-    found = data.windows(truth, count, interval, (knobs.location_cut, knobs.appearance_cut), every)
+    found = data.windows(truth, count, interval, (parameters.location_cut, parameters.appearance_cut), every)
     if not len(found.frames) and pictures == "video":
         sys.exit(f"{place} has no {count} frames {interval} apart with boxes; give a shorter --interval")
     return found
@@ -136,8 +136,8 @@ def _words(values: np.ndarray) -> str:
     return f"{100 * values.mean():.1f}/{100 * values.std(ddof=1):.1f}"
 
 
-def _knobs(**values: object) -> PaperKnobs:
-    return PaperKnobs.model_validate(values)
+def _parameters(**values: object) -> PaperParameters:
+    return PaperParameters.model_validate(values)
 
 
 # -- the studies: a sequence -> figures, printed as they come --------------------------------------------------------
@@ -156,7 +156,7 @@ def by_reference(place: Path, interval: int, _: int) -> Figures:
     found: Figures = {}
 
     def row(name: str, windows: data.Windows, which: np.ndarray) -> None:
-        words = [_words(ratios(windows, _knobs(window=2, gate=g), w)[which]) for g, w in columns]
+        words = [_words(ratios(windows, _parameters(window=2, gate=g), w)[which]) for g, w in columns]
         print(f"| {name} | {len(which)} | " + " | ".join(words) + " |", flush=True)
         found[name] = dict(zip(heads, words, strict=True))
 
@@ -181,8 +181,8 @@ def by_weight(place: Path, interval: int, every: int) -> Figures:
     for count in (2, 3):
         windows = _windows(place, count, interval, every=every if count == 3 else 1)
         for gate in ("one_dummy", "off"):
-            knobs = _knobs(window=count, gate=gate)
-            values = [ratios(windows, knobs, weight) for weight in [*WEIGHTS, None]]
+            parameters = _parameters(window=count, gate=gate)
+            values = [ratios(windows, parameters, weight) for weight in [*WEIGHTS, None]]
             print(f"| {count} | {len(windows.frames)} | {gate} | " + " | ".join(map(_words, values)) + " |", flush=True)
             found[f"{count} {gate}"] = {"mean": [v.mean() for v in values], "sd": [v.std(ddof=1) for v in values]}
     return found
@@ -196,17 +196,17 @@ def by_threshold(place: Path, interval: int, _: int) -> Figures:
     print("| --- " + "| ---: " * len(WEIGHTS) + "|")
     table = []
     for threshold in WEIGHTS:
-        table.append([ratios(windows, _knobs(window=2, threshold=threshold), w).mean() for w in WEIGHTS])
+        table.append([ratios(windows, _parameters(window=2, threshold=threshold), w).mean() for w in WEIGHTS])
         print(f"| {threshold:g} | " + " | ".join(f"{100 * mean:.1f}" for mean in table[-1]) + " |", flush=True)
     return {"mean": table}
 
 
 def by_dispersion(place: Path, interval: int, _: int) -> Figures:
     """The dispersions of a window and the weight over time, with AR_2 by that weight and by fixed ones."""
-    windows, knobs = _windows(place, 2, interval), _knobs(window=2)
-    chosen = weights(windows, knobs)
-    fixed = np.stack([ratios(windows, knobs, weight) for weight in WEIGHTS])
-    ruled = ratios(windows, knobs, None)
+    windows, parameters = _windows(place, 2, interval), _parameters(window=2)
+    chosen = weights(windows, parameters)
+    fixed = np.stack([ratios(windows, parameters, weight) for weight in WEIGHTS])
+    ruled = ratios(windows, parameters, None)
     best = int(fixed.mean(axis=1).argmax())
     smallest = windows.dispersions.min(axis=1)
     rows = [
@@ -229,7 +229,7 @@ def by_dispersion(place: Path, interval: int, _: int) -> Figures:
         "ruled": ruled.tolist(),
         "fixed": fixed[best].tolist(),
         "best": WEIGHTS[best],
-        "lowest": knobs.lowest_dispersion,
+        "lowest": parameters.lowest_dispersion,
     }
 
 
@@ -238,8 +238,8 @@ def by_cuts(place: Path, interval: int, _: int) -> Figures:
     windows, truth = _windows(place, 2, interval), data.read(place, "video")
     found: Figures = {}
     for gate in ("one_dummy", "off"):
-        knobs = _knobs(window=2, gate=gate)
-        fixed = {weight: ratios(windows, knobs, weight) for weight in WEIGHTS}
+        parameters = _parameters(window=2, gate=gate)
+        fixed = {weight: ratios(windows, parameters, weight) for weight in WEIGHTS}
         best = max(fixed, key=lambda weight: fixed[weight].mean())
         print(f"\n{place.name}, K = 2, gate {gate}: best fixed weight {best:g}, {_words(fixed[best])}\n")
         print("| G of locations | " + " | ".join(f"G of histograms {cut:g}" for cut in APPEARANCE_CUTS) + " |")
@@ -248,7 +248,7 @@ def by_cuts(place: Path, interval: int, _: int) -> Figures:
             words = []
             for appearance_cut in APPEARANCE_CUTS:
                 at = data.dispersions(truth, windows.frames, (location_cut, appearance_cut))
-                chosen = weights(replace(windows, dispersions=at), knobs)
+                chosen = weights(replace(windows, dispersions=at), parameters)
                 words.append(
                     _words(np.select([chosen == w for w in (0.0, 0.5, 1.0)], [fixed[w] for w in (0.0, 0.5, 1.0)]))
                 )
@@ -274,8 +274,8 @@ def by_readings(place: Path, interval: int, every: int) -> Figures:
     found: Figures = {}
     for name, table in tables.items():
         for gate, gated in gates if "3" in name else [pair for pair in gates if pair[0] != "every_dummy"]:
-            knobs = _knobs(window=int(name[0]), gate=gate, gated=gated)
-            words = [_words(ratios(table, knobs, weight)) for weight in (0.0, 0.5, 0.7, 1.0)]
+            parameters = _parameters(window=int(name[0]), gate=gate, gated=gated)
+            words = [_words(ratios(table, parameters, weight)) for weight in (0.0, 0.5, 0.7, 1.0)]
             print(f"| {name} | {len(table.frames)} | {gate} | {gated} | " + " | ".join(words) + " |", flush=True)
             found[f"{name}, {gate}, {gated}"] = words
     return found

@@ -116,8 +116,8 @@ def alone(batch: int) -> Way:
     """One clip after the other."""
 
     def way(clips: dict[str, Clip], settings: Settings, backend: str) -> dict[str, list[bytes]]:
-        vision = load_engine(backend, settings)
-        return {name: [digits(s) for s in run(clip, vision, settings, batch=batch)] for name, clip in clips.items()}
+        engine = load_engine(backend, settings)
+        return {name: [digits(s) for s in run(clip, engine, settings, batch=batch)] for name, clip in clips.items()}
 
     return way
 

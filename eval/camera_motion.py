@@ -34,7 +34,7 @@ from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scene import LEAST_PX, SIZE, render
 from torchvision_dddas.tracking.sequence import Follower, follow_clip, follow_scenes
-from torchvision_dddas.types import Followed, Frame, Scene, Tracks
+from torchvision_dddas.types import Frame, Scene, TrackedFrame, Tracks
 
 Step = np.ndarray | None
 Told = Callable[[Step, tuple[int, int]], Step]
@@ -80,7 +80,7 @@ def of_sequences(folder: Path) -> list[str]:
         for name, camera in CAMERAS.items():
             maps = flight(int(truth.frame.max()), size, camera)
             table = _detections(seen(truth, maps))
-            runs: list[Iterable[Followed]] = [_told(table, maps, told, size) for told in TOLD.values()]
+            runs: list[Iterable[TrackedFrame]] = [_told(table, maps, told, size) for told in TOLD.values()]
             runs.append(_measured(table, Filmed(video, maps)))
             cells = [_switches_and_idf1(seen(truth, maps).every(INTERVAL), _table(run)) for run in runs]
             rows.append(f"| {place.name} | {name} | {' | '.join(cells)} |")
@@ -88,15 +88,15 @@ def of_sequences(folder: Path) -> list[str]:
     return rows
 
 
-def _told(table: DetectionTable, maps: np.ndarray, told: Told, size: tuple[int, int]) -> Iterator[Followed]:
+def _told(table: DetectionTable, maps: np.ndarray, told: Told, size: tuple[int, int]) -> Iterator[TrackedFrame]:
     follower = Follower(_NO_LOOKS, INTERVAL, size)
     for number in range(1, table.last + 1, INTERVAL):
         step = maps[number - 1] @ np.linalg.inv(maps[number - 1 - INTERVAL]) if number > 1 else None
-        yield from follower.take(Followed(number, None, table.at(number), Tracks(number), told(step, size)))
+        yield from follower.take(TrackedFrame(number, None, table.at(number), Tracks(number), told(step, size)))
     yield from follower.end()
 
 
-def _measured(table: DetectionTable, source: Filmed) -> Iterator[Followed]:
+def _measured(table: DetectionTable, source: Filmed) -> Iterator[TrackedFrame]:
     return follow_clip(source, table, load_engine("onboard", _NO_LOOKS), _NO_LOOKS, INTERVAL)
 
 
@@ -175,7 +175,7 @@ def _boxes(masks: dict[int, np.ndarray]) -> TrackTable:
     return TrackTable(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
 
 
-def _table(followed: Iterable[Followed]) -> TrackTable:
+def _table(followed: Iterable[TrackedFrame]) -> TrackTable:
     tracks = [f.tracks for f in followed]
     frame = np.repeat([t.frame for t in tracks], [len(t) for t in tracks])
     return TrackTable(

@@ -21,7 +21,7 @@ from films import Size, there_and_back
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.detector import Loop
-from torchvision_dddas.detection.engine import Foreground, View, Vision, Window, load_engine
+from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Frame, Registration
 
@@ -59,25 +59,25 @@ def _now() -> np.ndarray:
 
 
 class Clocked:
-    """A back end whose stages are clocked: a `Vision` itself."""
+    """A back end whose stages are clocked: a `Engine` itself."""
 
-    def __init__(self, vision: Vision, watch: Stopwatch) -> None:
-        self.vision, self.watch, self.name = vision, watch, vision.name
+    def __init__(self, engine: Engine, watch: Stopwatch) -> None:
+        self.engine, self.watch, self.name = engine, watch, engine.name
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.vision, name)
+        return getattr(self.engine, name)
 
     def prepare(self, image: np.ndarray) -> View:
         """As the back end's own, and so the next two."""
-        return self._clocked("prepare", self.vision.prepare, image)
+        return self._clocked("prepare", self.engine.prepare, image)
 
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
         """Motion of the camera."""
-        return self._clocked("register", self.vision.register, pairs)
+        return self._clocked("register", self.engine.register, pairs)
 
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """What differs."""
-        return self._clocked("foreground", self.vision.foreground, windows)
+        return self._clocked("foreground", self.engine.foreground, windows)
 
     def _clocked(self, stage: str, call: Callable[[Any], Any], argument: Any) -> Any:
         self.watch.start()
@@ -105,8 +105,8 @@ class Chain:
             return
         backend, config, *batch = name.split()
         settings = load_config(None if config == "default" else config)
-        vision = Clocked(load_engine(backend, settings), self.watch)
-        self.loop = Loop(vision, settings, 10.0, batch=int(batch[0][1:]) if batch else 1)
+        engine = Clocked(load_engine(backend, settings), self.watch)
+        self.loop = Loop(engine, settings, 10.0, batch=int(batch[0][1:]) if batch else 1)
         self._one = self._ours
 
     def turn(self, frames: list[np.ndarray], start: int, count: int = TURN) -> None:

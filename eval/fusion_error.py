@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.geo.fusion import associate, together
 from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.types import Camera, Poses, Sightings
 
-KNOBS = GroundKnobs()
+KNOBS = GroundParameters()
 RING_M = 15.0
 
 

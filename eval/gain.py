@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas import config as knobs
+from torchvision_dddas import config as parameters
 from torchvision_dddas.detection import detector as loop
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.metrics import truth as truths
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--only", help="clips whose name contains this")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    settings = knobs.load_config(chosen.config)
+    settings = parameters.load_config(chosen.config)
     print("clip | F as it is | " + " | ".join(f"{kind}: F, lost" for kind in KINDS[1:]) + " | frames not trusted")
     rows = []
     for clip in sorted(chosen.folder.iterdir()):
@@ -74,7 +74,9 @@ def lit(frames: Sequence[Frame], gain: np.ndarray) -> list[Frame]:
     return [replace(f, image=np.clip(np.round(f.image * g), 0, 255).astype(np.uint8)) for f, g in pairs]
 
 
-def score(frames: Sequence[Frame], truth: truths.Truth, backend: str, settings: knobs.Settings) -> tuple[float, int]:
+def score(
+    frames: Sequence[Frame], truth: truths.Truth, backend: str, settings: parameters.Settings
+) -> tuple[float, int]:
     """F over the labelled frames, and how many frames were not to be trusted."""
     pixels, untrusted = Pixels(), 0
     for scene in loop.scenes(frames, load_engine(backend, settings), settings):

@@ -43,13 +43,13 @@ from geo_scene import (
     swapped,
 )
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.plane import absolute, ground_points, homography_fix
 from torchvision_dddas.geo.pose_estimation import expected_of, fit_pose, prior_of
 from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.types import Fix, Flight, Marks
+from torchvision_dddas.types import Fix, Flight, LandmarkObservations
 
 METHODS = ("pose", "homography", "paper")
 ORIGIN = (-110.9, 32.2)
@@ -79,13 +79,13 @@ class Found:
 
 def settings_for(method: str) -> Settings:
     """Frames stand alone; the rest are the defaults, which the simulated telemetry keeps to."""
-    return with_knobs(Settings(), {"aerial.mode": method, "aerial.correlation_s": 0.0})
+    return with_parameters(Settings(), {"aerial.mode": method, "aerial.correlation_s": 0.0})
 
 
-def marks_of(batch: Scenes, s: int) -> Marks:
+def marks_of(batch: Scenes, s: int) -> LandmarkObservations:
     """The landmarks of one scene as the package has them."""
     n = batch.case.landmarks
-    return Marks(
+    return LandmarkObservations(
         np.arange(n),
         batch.marks_px[s],
         batch.marks[s],
@@ -166,7 +166,7 @@ PARTS = {"crowd": slice(0, TARGETS // 2), "disc": slice(TARGETS // 2, TARGETS)}
 
 def shared(case: Case, seeds: int) -> dict[str, object]:
     """What becomes of places where all receivers share an error: relative to the team, and on the Earth."""
-    batch, settings = scenes(case, seeds, TARGETS), with_knobs(Settings(), {"aerial.correlation_s": 0.0})
+    batch, settings = scenes(case, seeds, TARGETS), with_parameters(Settings(), {"aerial.correlation_s": 0.0})
     off, inside = {"relative": [], "absolute": []}, {"relative": [], "absolute": []}
     for s in range(seeds):
         fix = Registrar(CAMERA, settings, load_solver("onboard")).step(
@@ -328,7 +328,7 @@ def over_time(
     found: dict[str, object] = asdict(case) | {"flights": seeds, "alike_s": true_alike_s}
     alone, by_flight = load_solver("onboard"), {}
     for name, alike_s in (("single frames", 0.0), ("over time", ALIKE_S)):
-        settings = with_knobs(settings_for("pose"), {"aerial.correlation_s": alike_s})
+        settings = with_parameters(settings_for("pose"), {"aerial.correlation_s": alike_s})
         far, inside = np.full((2, seeds, frames, batches[0].targets_px.shape[1]), np.nan)
         for s in range(seeds):
             registrar = Registrar(CAMERA, settings, alone)

@@ -27,11 +27,11 @@ from geo_error import INSIDE, flight_of
 from geo_scene import ALTITUDE_SIGMA, FOCAL_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, TILT_SIGMA, looking, turned
 from ranging_error import SIZES, People, detected, fitted, identities, read_truth, tsai
 
-from torchvision_dddas.config import GroundKnobs, Settings, with_knobs
+from torchvision_dddas.config import GroundParameters, Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.plane import ground_points
 from torchvision_dddas.geo.solvers import load_solver
-from torchvision_dddas.types import Camera, Flight, Marks
+from torchvision_dddas.types import Camera, Flight, LandmarkObservations
 
 RATE_HZ = {"PETS09-S2L1": 7.0, "TUD-Stadtmitte": 25.0}
 SIGMA_M = 0.02
@@ -68,7 +68,7 @@ def crowd_of(people: People, truth: People, who: np.ndarray, sigma_px: float | N
         people.frame,
         np.array([known[f, *p] for f, p in zip(people.frame, people.east_north_m, strict=True)]),
         box[:, :2] + box[:, 2:] * (0.5, 1.0) - 0.5,
-        np.full(len(box), sigma_px) if sigma_px else np.hypot(GroundKnobs().feet_sigma * box[:, 3], 0.5),
+        np.full(len(box), sigma_px) if sigma_px else np.hypot(GroundParameters().feet_sigma * box[:, 3], 0.5),
         people.east_north_m,
     )
 
@@ -115,11 +115,11 @@ def follow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors in metres of all who are no landmarks, NaN where nothing was said, and whether ellipses hold them."""
     mode, has_telemetry, alike_s = WAYS[way]
-    settings = with_knobs(Settings(), {"aerial.mode": mode, "aerial.correlation_s": alike_s})
+    settings = with_parameters(Settings(), {"aerial.mode": mode, "aerial.correlation_s": alike_s})
     registrar, far, inside = Registrar(camera, settings, load_solver("onboard")), [], []
     for number, some in rows.items():
         n = len(some)
-        marks = Marks(
+        marks = LandmarkObservations(
             crowd.who[some], crowd.foot_px[some], crowd.east_north_m[some], np.full(n, SIGMA_M), crowd.sigma_px[some],
             np.zeros(n),
         )  # fmt: skip

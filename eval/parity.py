@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas import config as knobs
+from torchvision_dddas import config as parameters
 from torchvision_dddas.detection import detector as loop
 from torchvision_dddas.detection import windows
-from torchvision_dddas.detection.engine import View, Vision, Window, load_engine
+from torchvision_dddas.detection.engine import Engine, View, Window, load_engine
 from torchvision_dddas.geometry import chain, corner_error
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame, Registration
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--only", help="clips whose name contains this")
     parser.add_argument("--no-masks", action="store_true", help="leave the final masks out")
     chosen = parser.parse_args()
-    settings = knobs.load_config(chosen.config)
+    settings = parameters.load_config(chosen.config)
     print(
         "clip | corner error px: median worst, one-sided | core IoU: mean least | mask IoU: pooled least | time: b1 b8"
     )
@@ -45,7 +45,7 @@ def main() -> None:
         print(path.name, "|", *compare(frames, settings, not chosen.no_masks), flush=True)
 
 
-def compare(frames: Sequence[Frame], settings: knobs.Settings, masks: bool) -> list[str]:
+def compare(frames: Sequence[Frame], settings: parameters.Settings, masks: bool) -> list[str]:
     """The figures of one clip, as words."""
     engines = [load_engine("onboard", settings), load_engine("torch", settings)]
     images = [frame.image for frame in frames]
@@ -74,9 +74,9 @@ class Look:
     steps: registrations of successive frames. cores: by frame index. seconds: median a frame, for each stage.
     """
 
-    def __init__(self, vision: Vision, images: Sequence[np.ndarray], batch: int) -> None:
-        settings: knobs.Settings = vision.knobs  # type: ignore[attr-defined]
-        views = [vision.prepare(image) for image in images]
+    def __init__(self, engine: Engine, images: Sequence[np.ndarray], batch: int) -> None:
+        settings: parameters.Settings = engine.parameters  # type: ignore[attr-defined]
+        views = [engine.prepare(image) for image in images]
         pairs = list(pairwise(views))
         self.steps: list[Registration] = []
         self.cores: dict[int, np.ndarray] = {}
@@ -84,13 +84,13 @@ class Look:
         for first in range(0, len(pairs), batch):
             some = pairs[first : first + batch]
             start = time.perf_counter()
-            self.steps += vision.register(some)
+            self.steps += engine.register(some)
             spent["register"].append((time.perf_counter() - start) / len(some))
         made = [(t, window) for t in range(len(views)) if (window := _window(views, self.steps, t, settings))]
         for first in range(0, len(made), batch):
             part = made[first : first + batch]
             start = time.perf_counter()
-            found = vision.foreground([window for _, window in part])
+            found = engine.foreground([window for _, window in part])
             spent["foreground"].append((time.perf_counter() - start) / len(part))
             self.cores |= {t: foreground.core > 0 for (t, _), foreground in zip(part, found, strict=True)}
         self.seconds = {name: float(np.median(times)) if times else np.nan for name, times in spent.items()}
@@ -103,7 +103,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _window(
-    views: Sequence[View], steps: Sequence[Registration], at: int, settings: knobs.Settings, interval: int = 3
+    views: Sequence[View], steps: Sequence[Registration], at: int, settings: parameters.Settings, interval: int = 3
 ) -> Window | None:
     first = last = at
     while first and steps[first - 1].reliable:

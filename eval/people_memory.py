@@ -25,13 +25,13 @@ def held_mb():
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 width, height, frames, threads, *chosen = sys.argv[1:]
-size, knobs = (int(width), int(height)), load_config(None, chosen).people
+size, parameters = (int(width), int(height)), load_config(None, chosen).people
 cv2.setNumThreads(int(threads))
 held = [held_mb()]
-recognizer = recognizer_of(knobs, "onboard")
+recognizer = recognizer_of(parameters, "onboard")
 for frame in range(int(frames)):
     image = np.random.default_rng(frame).integers(0, 256, (size[1], size[0], 3), np.uint8)
-    recognizer.scores([image], [scan.everywhere(size, knobs)])
+    recognizer.scores([image], [scan.everywhere(size, parameters)])
     held.append(held_mb())
 print(json.dumps({"held": held, "torch": "torch" in sys.modules}))
 """

@@ -5,8 +5,9 @@ HOGDescriptor: its own defaults; the best of all its settings, chosen for each c
 (`--grid-frames`) by recall at one false positive an image, with the body's box fitted to that clip; and its rectangles
 as they are. A detection is right at an IoU of 0.5, each true box once.
 
---calibrate prints what the knobs height_share, width_share, feet_share, probability_slope and probability_even should
-be by these clips, and how far heights, foot rows and probabilities are right with those in force. Prints Markdown.
+--calibrate prints what the parameters height_share, width_share, feet_share, probability_slope and probability_even
+should be by these clips, and how far heights, foot rows and probabilities are right with those in force. Prints
+Markdown.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from people_curves import CLIPS, Clip, Curve, Found, curve, matched, plot, read
 from people_opencv import Setting
 from scipy.optimize import minimize
 
-from torchvision_dddas.config import PeopleKnobs, load_config
+from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.people.boxes import probability
 from torchvision_dddas.people.detector import people_in, recognizer_of
 from torchvision_dddas.types import People
@@ -49,18 +50,18 @@ def main() -> None:
     places = [options.data / name for name in CLIPS if (options.data / name / "gt/gt.txt").is_file()]
     if not places:
         sys.exit(f"{options.data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
-    knobs = load_config(overrides=options.set).people
+    parameters = load_config(overrides=options.set).people
     clips = [read(place, options.every) for place in places]
-    ours = [recognized(clip, knobs) for clip in clips]
+    ours = [recognized(clip, parameters) for clip in clips]
     if options.calibrate:
-        print("\n".join(calibration(clips, ours, knobs)))
+        print("\n".join(calibration(clips, ours, parameters)))
         return
     curves: dict[str, dict[str, Curve]] = {}
     lines = ["| clip | detector | recall at 1 | at 0.1 | log-average miss rate |", "| --- | --- | ---: | ---: | ---: |"]
     for clip, people in zip(clips, ours, strict=True):
         found: dict[str, Curve] = {"ours": curve({n: (p.box_px, p.margin) for n, p in people.items()}, clip)}
         if not options.no_opencv:
-            found |= opencv(clip, knobs, max(1, len(clip.frames) // options.grid_frames))
+            found |= opencv(clip, parameters, max(1, len(clip.frames) // options.grid_frames))
         curves[clip.name] = found
         for name, line in found.items():
             figures = f"{line.recall_at(1):.3f} | {line.recall_at(0.1):.3f} | {line.log_average_miss_rate:.3f}"
@@ -76,24 +77,26 @@ def main() -> None:
         report.put(options.write, "people_miss_rate", "\n".join(lines))
 
 
-def recognized(clip: Clip, knobs: PeopleKnobs) -> dict[int, People]:
+def recognized(clip: Clip, parameters: PeopleParameters) -> dict[int, People]:
     """The people of every frame, by the onboard back end."""
-    recognizer = recognizer_of(knobs, "onboard")
+    recognizer = recognizer_of(parameters, "onboard")
     found = {}
     for i, (number, image) in enumerate(clip.frames.items(), start=1):
-        (found[number],) = people_in([image], recognizer, knobs)
+        (found[number],) = people_in([image], recognizer, parameters)
         print(f"\r{clip.name}: {i} of {len(clip.frames)} frames", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     return found
 
 
-def opencv(clip: Clip, knobs: PeopleKnobs, every: int) -> dict[str, Curve]:
+def opencv(clip: Clip, parameters: PeopleParameters, every: int) -> dict[str, Curve]:
     """OpenCV's curves on all frames: at its defaults, at its best setting, and the raw rectangles of that."""
     first = next(iter(clip.frames.values()))
     if not people_opencv.check(first, DEFAULTS._replace(enlarge=1.5, groups=1)):
         sys.exit(f"{clip.name}: the rectangles are not those of detectMultiScale; nothing of OpenCV was measured")
-    side = (1 - knobs.width_share) / 2
-    body = np.array([side, knobs.feet_share - knobs.height_share, knobs.width_share, knobs.height_share])
+    side = (1 - parameters.width_share) / 2
+    body = np.array(
+        [side, parameters.feet_share - parameters.height_share, parameters.width_share, parameters.height_share]
+    )
     tried = list(people_opencv.grid(clip.every(every), body))
     best = max(tried, key=lambda pair: (pair[1].recall_at(1), -pair[1].log_average_miss_rate))[0]
     print(f"{clip.name}: best of {len(tried)} on {len(clip.every(every).frames)} frames: {best}", file=sys.stderr)
@@ -116,7 +119,7 @@ def opencv(clip: Clip, knobs: PeopleKnobs, every: int) -> dict[str, Curve]:
     }
 
 
-def calibration(clips: list[Clip], found: list[dict[int, People]], knobs: PeopleKnobs) -> list[str]:
+def calibration(clips: list[Clip], found: list[dict[int, People]], parameters: PeopleParameters) -> list[str]:
     """What the clips say of shares and probabilities."""
     lines = [
         "| clip | pairs | height_share | width_share | feet_share | height error, bias and median | foot row |",
@@ -154,7 +157,7 @@ def calibration(clips: list[Clip], found: list[dict[int, People]], knobs: People
         cells = []
         for end, count in zip(ends, counts, strict=True):
             here = slice(end - count, end)
-            said = probability(margin[here], knobs)
+            said = probability(margin[here], parameters)
             inside = (said >= low) & (said < high)
             share = f"{hit[here][inside].mean():.2f} right, said {said[inside].mean():.2f}" if inside.any() else "-"
             cells.append(f"{share}, {inside.sum()}")

@@ -31,16 +31,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people import suppression as suppress
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import people_in
-from torchvision_dddas.people.scorer import Recognizer, load_recognizer
+from torchvision_dddas.people.scorer import WindowScorer, load_scorer
 
 # What detectMultiScale does unless told otherwise, whatever the project's defaults.
-PLAIN = PeopleKnobs(
+PLAIN = PeopleParameters(
     enlarge=1, padding_px=0, window_stride_px=8, scale_step=1.05, threshold=0, suppression="opencv", group=2
 )
 
@@ -69,9 +69,9 @@ def main() -> None:
             continue
         for padding in map(int, chosen.padding.split(",")):
             for stride in map(int, chosen.stride.split(",")):
-                knobs = PLAIN.model_copy(update={"padding_px": padding, "window_stride_px": stride})
+                parameters = PLAIN.model_copy(update={"padding_px": padding, "window_stride_px": stride})
                 images = (frame.image for frame in islice(open_source(name), 0, None, chosen.every))
-                for backend, found in compare(images, knobs, backends).items():
+                for backend, found in compare(images, parameters, backends).items():
                     print(f"| {Path(name).name} | {padding} | {stride} | {backend} | {found.row()} |", flush=True)
     if chosen.crops is not None:
         crops(chosen.crops, backends)
@@ -97,20 +97,20 @@ class Parity:
         )
 
 
-def compare(images: Iterable[np.ndarray], knobs: PeopleKnobs, backends: Sequence[str]) -> dict[str, Parity]:
+def compare(images: Iterable[np.ndarray], parameters: PeopleParameters, backends: Sequence[str]) -> dict[str, Parity]:
     """Each back end beside OpenCV over all pictures."""
-    svm = read_classifier(knobs.classifier, 3780)
-    engines = {name: load_recognizer(name, knobs, svm) for name in backends}
+    svm = read_classifier(parameters.classifier, 3780)
+    engines = {name: load_scorer(name, parameters, svm) for name in backends}
     figures = {name: Parity() for name in backends}
     for image in images:
         size = image.shape[1], image.shape[0]
-        parts = scan.everywhere(size, knobs)
-        wanted = [opencv_scores(image, part.level, knobs) for part in parts]
-        boxes = opencv_boxes(image, knobs)
+        parts = scan.everywhere(size, parameters)
+        wanted = [opencv_scores(image, part.level, parameters) for part in parts]
+        boxes = opencv_boxes(image, parameters)
         for name, engine in engines.items():
             (maps,) = engine.scores([image], [parts])
             tally(figures[name], maps, wanted)
-            tally_boxes(figures[name], own_boxes(maps, size, knobs), boxes)
+            tally_boxes(figures[name], own_boxes(maps, size, parameters), boxes)
     return figures
 
 
@@ -140,10 +140,10 @@ def opencv() -> cv2.HOGDescriptor:
     return made
 
 
-def opencv_scores(image: np.ndarray, size: tuple[int, int], knobs: PeopleKnobs) -> np.ndarray:
+def opencv_scores(image: np.ndarray, size: tuple[int, int], parameters: PeopleParameters) -> np.ndarray:
     """The map of one level; NaN where OpenCV has no window."""
     level = image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR_EXACT)
-    stride, pad = knobs.window_stride_px, knobs.padding_px
+    stride, pad = parameters.window_stride_px, parameters.padding_px
     hits = opencv().detect(level, -1e9, (stride, stride), (pad, pad))
     places, scores = (np.asarray(hit) for hit in hits)
     columns, rows = ((places + pad) // stride).T
@@ -152,23 +152,25 @@ def opencv_scores(image: np.ndarray, size: tuple[int, int], knobs: PeopleKnobs) 
     return found
 
 
-def opencv_boxes(image: np.ndarray, knobs: PeopleKnobs, group: int | None = None) -> np.ndarray:
+def opencv_boxes(image: np.ndarray, parameters: PeopleParameters, group: int | None = None) -> np.ndarray:
     """x, y, width, height, score of OpenCV's own search."""
-    stride, pad = knobs.window_stride_px, knobs.padding_px
+    stride, pad = parameters.window_stride_px, parameters.padding_px
     boxes, scores = opencv().detectMultiScale(
         image,
         winStride=(stride, stride),
         padding=(pad, pad),
-        scale=knobs.scale_step,
-        groupThreshold=knobs.group if group is None else group,
+        scale=parameters.scale_step,
+        groupThreshold=parameters.group if group is None else group,
     )
     return np.column_stack([np.reshape(boxes, (-1, 4)), np.ravel(scores)])
 
 
-def own_boxes(maps: Sequence[np.ndarray], size: tuple[int, int], knobs: PeopleKnobs) -> np.ndarray:
+def own_boxes(maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters) -> np.ndarray:
     """The same from our maps, cut at the picture's border; those wholly outside are dropped, as OpenCV does."""
     boxes, scores = suppress.group(
-        *scan.windows(scan.everywhere(size, knobs), maps, size, knobs), knobs.group, knobs.group_distance
+        *scan.windows(scan.everywhere(size, parameters), maps, size, parameters),
+        parameters.group,
+        parameters.group_distance,
     )
     low, high = np.maximum(boxes[:, :2], 0), np.minimum(boxes[:, :2] + boxes[:, 2:], size)
     return np.column_stack([low, high - low, scores])[(high > low).all(axis=1)]
@@ -188,23 +190,23 @@ def crops(folder: Path, backends: Sequence[str]) -> None:
         "any window, padding 8": ([len(opencv_boxes(image, padded, 0)) for image in images], images, padded),
         "any group": ([len(opencv_boxes(image, PLAIN)) for image in images], images, PLAIN),
         "the middle 64 x 128": ([len(opencv().detect(image)[0]) for image in middles], middles, each),
-        "any window, beside our default": (anywhere, images, PeopleKnobs()),
+        "any window, beside our default": (anywhere, images, PeopleParameters()),
     }
     print(f"\n| of {len(images)} crops | OpenCV |", *(f"{name} | its misses |" for name in backends))
     print("| --- | --: |", "--: | --: |" * len(backends))
     svm = read_classifier(PLAIN.classifier, 3780)
-    for rule, (wanted, pictures, knobs) in rules.items():
+    for rule, (wanted, pictures, parameters) in rules.items():
         words = [f"| {rule} | {sum(map(bool, wanted))} |"]
         for name in backends:
-            found = accepted(pictures, load_recognizer(name, knobs, svm), knobs)
+            found = accepted(pictures, load_scorer(name, parameters, svm), parameters)
             missed = sum(bool(right) and not one for right, one in zip(wanted, found, strict=True))
             words.append(f"{sum(found)} | {missed} |")
         print(*words, flush=True)
 
 
-def accepted(images: Sequence[np.ndarray], recognizer: Recognizer, knobs: PeopleKnobs) -> list[bool]:
+def accepted(images: Sequence[np.ndarray], recognizer: WindowScorer, parameters: PeopleParameters) -> list[bool]:
     """Whether each shows anybody."""
-    return [len(people.box_px) > 0 for people in people_in(images, recognizer, knobs)]
+    return [len(people.box_px) > 0 for people in people_in(images, recognizer, parameters)]
 
 
 def middle(image: np.ndarray) -> np.ndarray:

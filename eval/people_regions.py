@@ -21,14 +21,14 @@ from footage import film_of, truth_of
 from people_curves import CLIPS, matched
 
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import scenes
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.detector import recognize, recognizer_of
-from torchvision_dddas.people.scorer import Recognizer
-from torchvision_dddas.types import Frame, Recognized
+from torchvision_dddas.people.scorer import WindowScorer
+from torchvision_dddas.types import Frame, PeopleFrame
 
 LIKELY = 0.5
 MODES = {
@@ -65,7 +65,7 @@ def main() -> None:
         report.put(options.write, "people-regions", text)
 
 
-def of_clip(place: Path, settings: Settings, engine: Recognizer, count: int) -> list[str]:
+def of_clip(place: Path, settings: Settings, engine: WindowScorer, count: int) -> list[str]:
     """The rows of a clip."""
     tracks, video = truth_of(place).tracks, str(film_of(place))
     assert tracks is not None
@@ -73,7 +73,9 @@ def of_clip(place: Path, settings: Settings, engine: Recognizer, count: int) -> 
     moving = movers(islice(iter(open_source(video)), count), settings, rate_hz)
     clips = tee(islice(iter(open_source(video)), count), len(MODES))
     runs = [
-        recognize(clip, engine, with_knobs(settings, {"people.search": search}), moving if around else None, batch=1)
+        recognize(
+            clip, engine, with_parameters(settings, {"people.search": search}), moving if around else None, batch=1
+        )
         for clip, (search, around) in zip(clips, MODES.values(), strict=True)
     ]
     hits, false, share = np.zeros(len(MODES)), np.zeros(len(MODES)), np.zeros(len(MODES))
@@ -98,7 +100,7 @@ def of_clip(place: Path, settings: Settings, engine: Recognizer, count: int) -> 
     ]
 
 
-def hit(recognized: Recognized, true_px: np.ndarray) -> np.ndarray:
+def hit(recognized: PeopleFrame, true_px: np.ndarray) -> np.ndarray:
     """Which of the likely people are true."""
     likely = recognized.people.score >= LIKELY
     return matched((recognized.people.box_px[likely], recognized.people.score[likely]), true_px) >= 0

@@ -29,17 +29,17 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import OnboardRecognizer, opened
-from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.people.onnx_scorer import OnnxScorer, opened
+from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.types import Part
 
-KNOBS = PeopleKnobs(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
+KNOBS = PeopleParameters(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
 SVM = read_classifier("opencv", 3780)
 REGIONS_PX = np.array([(0.06, 0.2), (0.39, 0.3), (0.67, 0.12)])  # of three regions the corner, in picture sizes
 REGION_PX, BLOB_PX = (192, 256), 150
@@ -87,7 +87,7 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
     for name, held in parts.items():
         pixels = sum(part.width * part.height for part in held) / 1e6
         print(f"{name:16} {len(held):3} parts, {pixels:.2f} Mpx, {scan.cost(held, KNOBS) / whole:4.0%} of the windows")
-    onboard = load_recognizer("onboard", KNOBS, SVM)
+    onboard = load_scorer("onboard", KNOBS, SVM)
     found: dict[str, Callable[[np.ndarray], object]] = {
         "cv2": lambda image: opencv.detectMultiScale(image, winStride=(8, 8), padding=(0, 0), scale=1.05)
     }
@@ -95,14 +95,14 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
         found[f"onboard {name}"] = lambda image, held=held: onboard.scores([image], [held])
     found["whole graph"] = whole_graph(parts["everywhere"])
     if find_spec("torch"):
-        torch = load_recognizer("torch", KNOBS, SVM)
+        torch = load_scorer("torch", KNOBS, SVM)
         found["torch everywhere"] = lambda image: torch.scores([image], [parts["everywhere"]])
     return found
 
 
 def whole_graph(parts: list[Part]) -> Callable[[np.ndarray], object]:
     """people.onnx on every level, shared among as many threads as OpenCV takes."""
-    session, svm = opened(SHIPPED, "people.onnx"), OnboardRecognizer(KNOBS, SVM).svm_feed
+    session, svm = opened(SHIPPED, "people.onnx"), OnnxScorer(KNOBS, SVM).svm_feed
     threads = ThreadPoolExecutor(cv2.getNumThreads())
 
     def scored(image: np.ndarray, part: Part) -> np.ndarray:

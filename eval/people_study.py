@@ -28,11 +28,11 @@ from people_curves import CLIPS, Clip, Found, curve, read
 
 from export.train_people import Plan, crops, train, write
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import classifier_of
 from torchvision_dddas.people.pyramid import everywhere, windows
-from torchvision_dddas.people.torch_scorer import TorchRecognizer
+from torchvision_dddas.people.torch_scorer import TorchScorer
 from torchvision_dddas.types import LinearSvm
 
 CROP = (64, 128)  # INRIA's window in its crops
@@ -58,9 +58,9 @@ class Trial:
         """The window's size."""
         return f"{self.size[0]} x {self.size[1]}"
 
-    def knobs(self, step: float) -> PeopleKnobs:
+    def parameters(self, step: float) -> PeopleParameters:
         """The settings."""
-        return PeopleKnobs(
+        return PeopleParameters(
             window_width_px=self.size[0],
             window_height_px=self.size[1],
             block_stride_px=self.block,
@@ -118,25 +118,25 @@ def classifiers(
     rest = list(plain(options.data))
     made: dict[tuple[str, tuple[int, int], int], LinearSvm] = {}
     for trial in wanted:
-        key, knobs = (trial.classifier, trial.size, trial.block), trial.knobs(options.step)
+        key, parameters = (trial.classifier, trial.size, trial.block), trial.parameters(options.step)
         if key in made:
             continue
         if trial.classifier == "OpenCV":
-            made[key] = classifier_of(knobs)
+            made[key] = classifier_of(parameters)
             continue
         kept = options.out and options.out / f"{trial.size[0]}x{trial.size[1]}_{trial.block}_{options.c:g}.npz"
         if kept and kept.exists():
-            made[key] = classifier_of(knobs.model_copy(update={"classifier": str(kept)}))
+            made[key] = classifier_of(parameters.model_copy(update={"classifier": str(kept)}))
             continue
         larger = max(1.0, trial.size[1] / CROP[1])  # so that large windows have pictures to be trained on, too
         pictures = [resized(image, larger) for image in rest]
-        knobs = knobs.model_copy(update={"window_stride_px": 8})
-        trained = train(crops(people, knobs, CROP), pictures, knobs, Plan(c=options.c, rounds=options.rounds))
+        parameters = parameters.model_copy(update={"window_stride_px": 8})
+        trained = train(crops(people, parameters, CROP), pictures, parameters, Plan(c=options.c, rounds=options.rounds))
         made[key] = trained.svm
         print(f"{trial.name}, blocks every {trial.block} px: {trained.lines[-2]}", file=sys.stderr, flush=True)
         if kept:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            write(kept, trained.svm, knobs)
+            write(kept, trained.svm, parameters)
     return made
 
 
@@ -158,7 +158,7 @@ def run(
 ) -> list[Clip]:
     """Every setting on every picture, in turn; Ctrl-C ends it early. Returns the clips as far as they were seen."""
     recognizers = [
-        TorchRecognizer(trial.knobs(options.step), svms[trial.classifier, trial.size, trial.block]) for trial in wanted
+        TorchScorer(trial.parameters(options.step), svms[trial.classifier, trial.size, trial.block]) for trial in wanted
     ]
     try:
         with progress("study", sum(len(clip.frames) for clip in clips), False) as tick:
@@ -185,18 +185,18 @@ def in_turn(clips: list[Clip]) -> list[tuple[Clip, int, np.ndarray]]:
     return [(clip, number, image) for _, clip, number, image in sorted(every, key=lambda row: row[0])]
 
 
-def look(trial: Trial, recognizer: TorchRecognizer, clip: str, number: int, image: np.ndarray, smallest: float) -> None:
+def look(trial: Trial, recognizer: TorchScorer, clip: str, number: int, image: np.ndarray, smallest: float) -> None:
     """One setting on one picture."""
-    knobs = recognizer.knobs
-    factor = knobs.height_share * knobs.window_height_px / smallest if trial.same else 1.0
+    parameters = recognizer.parameters
+    factor = parameters.height_share * parameters.window_height_px / smallest if trial.same else 1.0
     begun = time.process_time()
     shown = resized(image, factor)
     size = shown.shape[1::-1]
-    parts = everywhere(size, knobs)
+    parts = everywhere(size, parameters)
     maps = recognizer.scores([shown], [parts])[0]
     trial.seconds.append(time.process_time() - begun)
     every = np.sort(np.concatenate([scores.ravel() for scores in maps]))
-    low = knobs.model_copy(update={"threshold": float(every[-MOST_WINDOWS:][0])})
+    low = parameters.model_copy(update={"threshold": float(every[-MOST_WINDOWS:][0])})
     found = people_of(*windows(parts, maps, size, low), size, low)
     trial.found.setdefault(clip, {})[number] = (found.box_px / factor, found.margin)
 

@@ -23,7 +23,7 @@ import report
 from footage import truth_of
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.evaluation.metrics.detection import iou
 from torchvision_dddas.geo.ranging import sight, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
@@ -143,16 +143,16 @@ def detected(path: Path, interval: int, truth: People, size: tuple[int, int], le
     return People(truth.frame[theirs], table.box_px[ours], cut[ours], truth.east_north_m[theirs])
 
 
-def seen(people: People, camera: Camera, knobs: GroundKnobs) -> Sightings:
+def seen(people: People, camera: Camera, parameters: GroundParameters) -> Sightings:
     """What ranging says of them."""
     n = len(people.frame)
     poses = Poses(np.tile(camera.place, (n, 1)), np.full(n, camera.heading_rad), np.full(n, camera.pitch_rad))
-    return sight(people.box_px, people.cut, camera, poses, poses.place, knobs)
+    return sight(people.box_px, people.cut, camera, poses, poses.place, parameters)
 
 
 def body_height(people: People, camera: Camera, use: np.ndarray) -> float:
     """The height with which the median person stands where it should."""
-    found = seen(people, camera, GroundKnobs(use="height", body_height_m=1.75))
+    found = seen(people, camera, GroundParameters(use="height", body_height_m=1.75))
     return float(np.nanmedian((1.75 * distance(people, camera) / found.distance_m)[use & ~people.cut]))
 
 
@@ -164,20 +164,20 @@ def distance(people: People, camera: Camera) -> np.ndarray:
 def measure(people: People, camera: Camera) -> tuple[dict[str, dict[str, float]], dict[str, np.ndarray]]:
     """Figures and relative errors of each way to range."""
     early = people.frame <= np.median(people.frame)
-    ways: dict[str, tuple[GroundKnobs, bool]] = {
-        "eq. 13–15, 1.8 m": (GroundKnobs(mode="paper", body_height_m=1.8), False),
-        "height, 1.8 m": (GroundKnobs(use="height", body_height_m=1.8), False),
-        "height, 1.7 m": (GroundKnobs(use="height", body_height_m=1.7), False),
-        "height, calibrated": (GroundKnobs(use="height"), True),
-        "foot row": (GroundKnobs(use="feet"), False),
-        "both, calibrated": (GroundKnobs(), True),
+    ways: dict[str, tuple[GroundParameters, bool]] = {
+        "eq. 13–15, 1.8 m": (GroundParameters(mode="paper", body_height_m=1.8), False),
+        "height, 1.8 m": (GroundParameters(use="height", body_height_m=1.8), False),
+        "height, 1.7 m": (GroundParameters(use="height", body_height_m=1.7), False),
+        "height, calibrated": (GroundParameters(use="height"), True),
+        "foot row": (GroundParameters(use="feet"), False),
+        "both, calibrated": (GroundParameters(), True),
     }
     far, figures, errors = distance(people, camera), {}, {}
-    for way, (knobs, calibrated) in ways.items():
+    for way, (parameters, calibrated) in ways.items():
         error, covered, heights = np.full(len(far), np.nan), np.full(len(far), np.nan), []
         for half in (early, ~early):
-            height = body_height(people, camera, ~half) if calibrated else knobs.body_height_m
-            found = seen(people, camera, knobs.model_copy(update={"body_height_m": height}))
+            height = body_height(people, camera, ~half) if calibrated else parameters.body_height_m
+            found = seen(people, camera, parameters.model_copy(update={"body_height_m": height}))
             off = found.east_north_m - people.east_north_m
             squared = np.einsum("ni,nij,nj->n", off, np.linalg.pinv(np.nan_to_num(found.covariance_m2)), off)
             error[half] = (found.distance_m / far - 1)[half]

@@ -43,9 +43,9 @@ def plain(grey: np.ndarray, later: np.ndarray) -> np.ndarray:
 
 def onboard(frames: list[np.ndarray], config: str) -> list[np.ndarray]:
     """later_from_earlier of successive frames."""
-    vision = load_engine("onboard", load_config(None if config == "default" else config))
-    views = [vision.prepare(frame) for frame in frames]
-    return [vision.register([pair])[0].later_from_earlier for pair in pairwise(views)]
+    engine = load_engine("onboard", load_config(None if config == "default" else config))
+    views = [engine.prepare(frame) for frame in frames]
+    return [engine.register([pair])[0].later_from_earlier for pair in pairwise(views)]
 
 
 def carefully(grey: np.ndarray, later: np.ndarray) -> np.ndarray | None:

@@ -22,7 +22,7 @@ from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.metrics import segmentation
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.simulation.source import SimulatorSource
-from torchvision_dddas.types import Followed, Surveyed, Tracks
+from torchvision_dddas.types import FrameResult, TrackedFrame, Tracks
 
 KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}
 FIXED: dict[str, Case] = {"morphology.erode_px": {}, "morphology.close_px": {"morphology.close_m": 0.0}}
@@ -42,9 +42,9 @@ def work(case: Case) -> Case:
     source = SimulatorSource(scenario)
     clip = Kept(source)
     found = {}
-    for knob, sizes in KERNELS.items():
+    for parameter, sizes in KERNELS.items():
         for size in sizes:
-            settings = usual(source, {"crowds.join_m": 0.0, **FIXED[knob], **case["set"], knob: size})
+            settings = usual(source, {"crowds.join_m": 0.0, **FIXED[parameter], **case["set"], parameter: size})
             pixels, scorer = segmentation.Pixels(), CrowdScorer()
             for scene in run(clip, load_engine("onboard", settings), settings, clip.log):
                 number = scene.frame.number
@@ -55,16 +55,16 @@ def work(case: Case) -> Case:
                 rows = np.arange(len(scene.detections))
                 tracks = Tracks(number, rows + 1, scene.detections.box_px, scene.detections.score, rows)
                 scorer.feed(truth)
-                scorer.feed(Surveyed(Followed(number, scene.frame, scene.detections, tracks)))
+                scorer.feed(FrameResult(TrackedFrame(number, scene.frame, scene.detections, tracks)))
             score = scorer.score()
             more = {"detected": score.detected, "false_blobs": score.false_blobs}
-            found[f"{knob} {size}"] = {**segmentation.measures(pixels), **more}
+            found[f"{parameter} {size}"] = {**segmentation.measures(pixels), **more}
     return found
 
 
-def over(results: list[Case], knob: str, size: int, name: str) -> Over:
+def over(results: list[Case], parameter: str, size: int, name: str) -> Over:
     """A figure over seeds."""
-    return Over(result[f"{knob} {size}"][name] for result in results)
+    return Over(result[f"{parameter} {size}"][name] for result in results)
 
 
 def tables(results: list[Case]) -> str:
@@ -74,12 +74,12 @@ def tables(results: list[Case]) -> str:
         ["kernel", "px", "precision %", "recall %", "F %", "crowds detected %", "false blobs a frame"],
         [
             [
-                f"`{knob}`",
+                f"`{parameter}`",
                 str(size),
-                *(over(results, knob, size, name).text(1, 100) for name in names),
-                over(results, knob, size, "false_blobs").text(),
+                *(over(results, parameter, size, name).text(1, 100) for name in names),
+                over(results, parameter, size, "false_blobs").text(),
             ]
-            for knob, sizes in KERNELS.items()
+            for parameter, sizes in KERNELS.items()
             for size in sizes
         ],
     )
@@ -90,13 +90,13 @@ def draw(results: list[Case], path: Path) -> None:
     plt = pyplot()
     figure, axes = plt.subplots(1, 2, figsize=(9.5, 3.8), constrained_layout=True, sharey=True)
     shown = {"precision": "#d9730d", "recall": "#0b6e99", "f": "#444444", "detected": "#448361"}
-    for axis, (knob, sizes) in zip(axes, KERNELS.items(), strict=True):
+    for axis, (parameter, sizes) in zip(axes, KERNELS.items(), strict=True):
         for name, colour in shown.items():
-            overs = [over(results, knob, size, name) for size in sizes]
+            overs = [over(results, parameter, size, name) for size in sizes]
             label = {"f": "F", "detected": "crowds detected"}.get(name, name)
             axis.errorbar(sizes, [100 * o.mean for o in overs], [100 * np.nan_to_num(o.error) for o in overs],
                           fmt="o-", color=colour, ms=4, capsize=3, label=label)  # fmt: skip
-        axis.set(xlabel=f"{knob}, px", ylim=(0, 102))
+        axis.set(xlabel=f"{parameter}, px", ylim=(0, 102))
         axis.set_xticks(sizes)
     axes[0].set_ylabel("%")
     axes[1].legend(frameon=False)
@@ -113,9 +113,9 @@ def main() -> None:
     asked = parser.parse_args()
     from torchvision_dddas.config import parse_override
 
-    size, knobs = [int(side) for side in asked.size.split("x")], dict(map(parse_override, asked.set))
+    size, parameters = [int(side) for side in asked.size.split("x")], dict(map(parse_override, asked.set))
     cases = [
-        {"seed": seed, "altitude_m": asked.altitude, "seconds": asked.seconds, "size": size, "set": knobs}
+        {"seed": seed, "altitude_m": asked.altitude, "seconds": asked.seconds, "size": size, "set": parameters}
         for seed in range(asked.seeds)
     ]
     results = run_all(cases, work, asked.cache, asked.jobs)

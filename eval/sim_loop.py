@@ -27,7 +27,7 @@ from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import CONFIG
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.control.mission_api import Begun, mission_of
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
@@ -91,17 +91,17 @@ def work(case: Case) -> Case:
     cv2.setNumThreads(1)
     scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
     source = SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"])
-    knobs = {name: value for name, value in case["set"].items() if name != "every"}
-    settings = with_knobs(load_config(CONFIG, (), settings_of(source.scenario)), knobs)
+    parameters = {name: value for name, value in case["set"].items() if name != "every"}
+    settings = with_parameters(load_config(CONFIG, (), settings_of(source.scenario)), parameters)
     timed = Timed(source, case["set"].get("every", 1))
     begun = Begun(timed)
     mission = mission_of(begun, settings, "onboard")
-    vision = load_engine("onboard", mission.settings)
+    engine = load_engine("onboard", mission.settings)
     scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
     stages: Counter[str] = Counter()
     judging = 0.0
     timed.cpu_s, start = 0.0, time.process_time()
-    for surveyed in survey(begun, vision, mission.settings, None, mission.watch, 1, mission):
+    for surveyed in survey(begun, engine, mission.settings, None, mission.watch, 1, mission):
         grounded = surveyed.grounded
         stages.update(grounded.seconds if grounded is not None else surveyed.followed.seconds)
         before = time.process_time()
@@ -228,13 +228,13 @@ def main() -> None:
     asked = parser.parse_args()
     words = [word for word in asked.only or () if word not in ways()]
     named = [name for name in ways() if name in (asked.only or ()) or any(word in name for word in words)]
-    chosen = {name: knobs for name, knobs in ways().items() if not asked.only or name in named}
+    chosen = {name: parameters for name, parameters in ways().items() if not asked.only or name in named}
     # The settings in turns, so that what else the machine does is spread over them.
     cases = [
-        {"scenario": scenario, "seed": seed, "seconds": asked.seconds, "name": name, "set": knobs}
+        {"scenario": scenario, "seed": seed, "seconds": asked.seconds, "name": name, "set": parameters}
         for scenario in asked.scenarios
         for seed in range(asked.seeds)
-        for name, knobs in chosen.items()
+        for name, parameters in chosen.items()
     ]
     results = run_all(cases, work, asked.cache, asked.jobs)
     found = {name: [r for c, r in zip(cases, results, strict=True) if c["name"] == name] for name in chosen}

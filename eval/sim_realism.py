@@ -3,7 +3,7 @@
     python eval/sim_realism.py [DATA] [--frames 24] [--write eval/README.md]
 
 DATA is a folder of clips (NAME/frames, NAME/masks or none). Simulated flights of several altitudes and pitches are
-drawn at the size of the real clips from a UAV, uav123_*, and both go through the project's onboard vision: successive
+drawn at the size of the real clips from a UAV, uav123_*, and both go through the project's onboard engine: successive
 frames are registered, keypoints are followed, and what is left of the difference of the two frames is looked at. Then
 the detector runs on what holds no movers: uav123_building4, and the flights, over ground on which nothing moves.
 Clips of hand-held cameras, bms_*, stand beside them for comparison; nothing is judged by them.
@@ -34,12 +34,12 @@ from torchvision_dddas.detection.opencv_registration import keypoints
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scenario import (
-    AircraftKnobs,
-    CameraKnobs,
-    ClipKnobs,
+    AircraftParameters,
+    CameraParameters,
+    ClipParameters,
     Scenario,
-    TeamKnobs,
-    WorldKnobs,
+    TeamParameters,
+    WorldParameters,
 )
 from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Frame
@@ -120,11 +120,11 @@ def flight(altitude_m: float, pitch_deg: float, seed: int, size: Sequence[int], 
     side = float(np.clip(3 * altitude_m, 160, 600))
     return Scenario(
         seed=seed,
-        clip=ClipKnobs(seconds=frames / 10, located_by="nothing"),
-        world=WorldKnobs(side_m=side, texel_m=0.05 if altitude_m < 40 else 0.1),
-        uav=AircraftKnobs(altitude_m=altitude_m, pitch_deg=pitch_deg, way_m=((30.0, 10.0),)),
-        camera=CameraKnobs(width_px=size[0], height_px=size[1]),
-        team=TeamKnobs(ugvs=0),
+        clip=ClipParameters(seconds=frames / 10, located_by="nothing"),
+        world=WorldParameters(side_m=side, texel_m=0.05 if altitude_m < 40 else 0.1),
+        uav=AircraftParameters(altitude_m=altitude_m, pitch_deg=pitch_deg, way_m=((30.0, 10.0),)),
+        camera=CameraParameters(width_px=size[0], height_px=size[1]),
+        team=TeamParameters(ugvs=0),
     )
 
 
@@ -134,11 +134,11 @@ def flight(altitude_m: float, pitch_deg: float, seed: int, size: Sequence[int], 
 def statistics(frames: Sequence[Frame]) -> dict[str, float]:
     """Medians over the pairs of successive frames."""
     settings = Settings()
-    vision = load_engine("onboard", settings)
+    engine = load_engine("onboard", settings)
     rows = []
     for earlier, later in pairwise(frames):
-        views = vision.prepare(earlier.image), vision.prepare(later.image)
-        found = vision.register([views])[0]
+        views = engine.prepare(earlier.image), engine.prepare(later.image)
+        found = engine.register([views])[0]
         if found.reliable:
             rows.append(followed(views[0].grey, views[1].grey, found.later_from_earlier, settings))
     if not rows:
@@ -150,8 +150,8 @@ def followed(
     earlier: np.ndarray, later: np.ndarray, later_from_earlier: np.ndarray, settings: Settings
 ) -> dict[str, float]:
     """Keypoints of the earlier frame in the later one, and the difference of the two once they are registered."""
-    knobs = settings.registration
-    start = keypoints(earlier, knobs)
+    parameters = settings.registration
+    start = keypoints(earlier, parameters)
     guess = transfer(later_from_earlier, start).astype(np.float32)
     search = {"winSize": (21, 21), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     end, seen, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess.copy(), **search)
@@ -160,14 +160,14 @@ def followed(
     inside = ((guess >= 0) & (guess <= (width - 1, height - 1))).all(axis=1)
     kept = inside & (seen.ravel() == 1) & (again.ravel() == 1) & (np.linalg.norm(back - start, axis=1) < 1)
     miss = np.linalg.norm(guess - end, axis=1)[kept]
-    inliers = miss < knobs.ransac_px
+    inliers = miss < parameters.ransac_px
     size = (width, height)
     moved = cv2.warpPerspective(earlier.astype(np.float32), later_from_earlier, size, flags=cv2.INTER_CUBIC)
     whole = cv2.warpPerspective(np.full_like(earlier, 255), later_from_earlier, size)
     whole = cv2.erode(whole, np.ones((2 * _CUT_PX + 1,) * 2, np.uint8), borderValue=0) > 0
     gain = float((later[whole].mean() + 1) / (moved[whole].mean() + 1))
     difference = np.abs(later[whole] - gain * moved[whole])
-    cell = cell_side(width, height, knobs)
+    cell = cell_side(width, height, parameters)
     return {
         "residual_median": float(np.median(miss[inliers])),
         "residual_p90": float(np.percentile(miss[inliers], 90)),

@@ -21,7 +21,7 @@ from films import resized
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, walking
 
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection.detector import Loop
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.simulation.source import SimulatorSource
@@ -50,7 +50,7 @@ def work(case: Case) -> Case:
         frames[size] = [resized(frame.image, size) for frame in kept.frames]
         focal = source.camera.focal_px[0] * size[0] / largest[0]
         for config in CONFIGS:
-            settings = with_knobs(load_config(config), {"gates.focal_px": focal})
+            settings = with_parameters(load_config(config), {"gates.focal_px": focal})
             loops[size, config] = Loop(load_engine("onboard", settings), settings, kept.rate_hz, kept.log)
     times: dict[tuple[tuple[int, int], str], list[float]] = {key: [] for key in loops}
     order = list(range(len(kept.frames)))

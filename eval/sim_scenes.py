@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control.mission_api import Begun, fitted
 from torchvision_dddas.control.rules import every_least
 from torchvision_dddas.detection.detector import run
@@ -29,11 +29,11 @@ from torchvision_dddas.types import (
     Command,
     Elevation,
     Fix,
-    Followed,
     Frame,
+    FrameResult,
     Landmarks,
     Scene,
-    Surveyed,
+    TrackedFrame,
     Tracks,
     Truth,
 )
@@ -46,7 +46,8 @@ CONFIG = "patrol"
 class Way:
     """A way to locate the same pictures. landmarks: which of the team's, by row; empty: all.
 
-    gps95_m: error of their receivers that is added to the reports, in 95 %; 0: none. settings: knobs beside the usual.
+    gps95_m: error of their receivers that is added to the reports, in 95 %; 0: none. settings: parameters beside the
+    usual.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Way:
 
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
     """What `dddas run sim:` takes, and more."""
-    return with_knobs(fitted(load_config(CONFIG, (), settings_of(source.scenario)), source), more or {})
+    return with_parameters(fitted(load_config(CONFIG, (), settings_of(source.scenario)), source), more or {})
 
 
 class OnceAFrame:
@@ -111,7 +112,9 @@ class Eye:
         )  # fmt: skip
         grounded = locator.ground(watched.look, targets)
         tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
-        scorer.feed(Surveyed(Followed(scene.frame.number, scene.frame, found, tracks), grounded, watched.sighted_by))
+        scorer.feed(
+            FrameResult(TrackedFrame(scene.frame.number, scene.frame, found, tracks), grounded, watched.sighted_by)
+        )
         return math.nan if truth is None else self._astray(truth, locator, watched.look.fix)
 
     def _astray(self, truth: Truth, locator: Locator, fix: Fix) -> float:
@@ -222,7 +225,7 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
 def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
     """A team about two crowds that walk side by side through its ring, to one side or past one another.
 
-    tables: knobs beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
+    tables: parameters beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
     """
     rng = np.random.default_rng([seed, 5])
     crowds = []
@@ -246,8 +249,8 @@ def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str
         )
     car = CarPlan(start_m=(-60.0, float(rng.uniform(18, 22))), heading_deg=90.0, speed_m_s=5.0)
     usual_tables: dict[str, dict[str, object]] = {"clip": {"seconds": seconds, "rate_hz": rate_hz}}
-    for name, knobs in tables.items():
-        usual_tables[name] = {**usual_tables.get(name, {}), **knobs}
+    for name, parameters in tables.items():
+        usual_tables[name] = {**usual_tables.get(name, {}), **parameters}
     return Scenario.model_validate({"seed": seed, "crowd": tuple(crowds), "car": (car,), **usual_tables})
 
 

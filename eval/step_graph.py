@@ -40,15 +40,15 @@ class StepGraph:
 
     def __init__(self, folder: Path, size: Size) -> None:
         self.session = opened(folder, file_of(size), enable_cpu_mem_arena=False)
-        knobs = load_config("fast")
-        cell = cell_side(*size, knobs.registration)
+        parameters = load_config("fast")
+        cell = cell_side(*size, parameters.registration)
         count = (size[0] // cell) * (size[1] // cell)
         hypotheses = next(i.shape[0] for i in self.session.get_inputs() if i.name == "samples")
         rng = np.random.default_rng(0)
         self.given = {
             "samples": np.stack([rng.choice(count, 4, replace=False) for _ in range(hypotheses)]).astype(np.int64),
-            "tolerance_px": np.array(knobs.registration.ransac_px, np.float64),
-            "threshold": np.array(int(knobs.difference.threshold), np.uint8),
+            "tolerance_px": np.array(parameters.registration.ransac_px, np.float64),
+            "threshold": np.array(int(parameters.difference.threshold), np.uint8),
         }
         self.greys: list[np.ndarray] = []
 

@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 import draws
 from sequences import identified, idf1
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.affinities import Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 KNOBS = {
     "dispersion": ("paper.threshold", "paper.lowest_dispersion", "paper.location_cut", "paper.appearance_cut"),
@@ -47,7 +47,7 @@ def main() -> None:
     ask.add_argument("--json", type=Path)
     given = ask.parse_args()
     torch.set_num_threads(1)
-    shipped = with_knobs(load_config("paper"), {"paper.window": 2, "paper.rule": given.rule})
+    shipped = with_parameters(load_config("paper"), {"paper.window": 2, "paper.rule": given.rule})
     clips = {
         clip.name: clip
         for clip in identified(given.data, ("motchallenge", "cvml"))
@@ -64,11 +64,11 @@ def main() -> None:
         learned = [name for name in clips if name not in fold]
         began = time.perf_counter()
         plan = Plan(given.steps, 8, given.rate, given.seed, look_every=5, most_watched=16)
-        done = descend(family, Knobs(shipped, names), [one for name in learned for one in examples[name]], plan)
+        done = descend(family, Parameters(shipped, names), [one for name in learned for one in examples[name]], plan)
         seconds = time.perf_counter() - began + sum(took[name] for name in learned)
         found = _searched([clips[name] for name in learned], shipped, names, given.interval, seconds, given.seed)
-        knobs = {name: getattr(done.settings.paper, name.split(".")[1]) for name in names}
-        print(f"step {done.best}, {seconds:.0f} s: {knobs}", flush=True)
+        parameters = {name: getattr(done.settings.paper, name.split(".")[1]) for name in names}
+        print(f"step {done.best}, {seconds:.0f} s: {parameters}", flush=True)
         for name in fold:
             values = [
                 idf1(clips[name], "association", each, given.interval) for each in (shipped, done.settings, found)
@@ -95,7 +95,7 @@ def _searched(
         if time.perf_counter() >= end:
             return best
         drawn = {name: TUNABLE[name].rounded(chance.uniform(TUNABLE[name].low, TUNABLE[name].high)) for name in names}
-        settings = with_knobs(shipped, drawn)
+        settings = with_parameters(shipped, drawn)
 
 
 if __name__ == "__main__":

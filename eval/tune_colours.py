@@ -26,7 +26,7 @@ import report
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics.segmentation import ratio
 from torchvision_dddas.geo.colour_calibration import hsv_of, hue_apart, pooled, ranges_of, standing_out
-from torchvision_dddas.geo.opencv_colours import OnboardColours
+from torchvision_dddas.geo.opencv_colours import OpenCVColourFinder
 from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Fault, Scenario
 from torchvision_dddas.simulation.simulator import Shot, Simulator
 from torchvision_dddas.simulation.team import plates
@@ -101,7 +101,7 @@ def judged(colours: Colours, pictures: Sequence[Seen]) -> tuple[float, float, fl
     """Share of the plates' pixels found, false pixels a picture and colour, F; over all pictures and colours."""
     hit = told = true = 0
     for one in pictures:
-        masks = OnboardColours().masks(one.image, colours.low, colours.high) > 0
+        masks = OpenCVColourFinder().masks(one.image, colours.low, colours.high) > 0
         right = np.stack([one.labels == k + 1 for k in range(TEAM)])
         hit, told, true = hit + int((masks & right).sum()), told + int(masks.sum()), true + int(right.sum())
     return ratio(hit, true), (told - hit) / (TEAM * len(pictures)), ratio(2 * hit, told + true)

@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.evaluation.studies import sweep as sweeping
 from torchvision_dddas.evaluation.studies.axes import Range, possible
 from torchvision_dddas.evaluation.studies.spec import read_spec
@@ -34,7 +34,7 @@ MOST = 100_000
 def main() -> None:
     args = _arguments()
     spec = replace(read_spec(args.study), overrides=tuple(args.set or ()))
-    names, holdout = args.knobs.split(","), args.holdout.split(",")
+    names, holdout = args.parameters.split(","), args.holdout.split(",")
     base = args.study.parent
     with tempfile.TemporaryDirectory() as place:
         began = time.perf_counter()
@@ -65,30 +65,30 @@ def main() -> None:
 def _gradient(
     spec: Any, base: Path, names: Sequence[str], holdout: Sequence[str], seed: int, seconds: float, rate: float
 ) -> tuple[dict[str, object], int]:
-    """The knobs after so many seconds of steps. The examples' time was taken off before."""
+    """The parameters after so many seconds of steps. The examples' time was taken off before."""
     ready = prepare(spec, base, names, holdout)
     # Annealed over as many steps as there is time for: the first two tell how many.
     began = time.perf_counter()
-    descend(ready.family, prepare_knobs(ready), ready.examples, Plan(steps=2, seed=seed, rate=rate, look_every=2))
+    descend(ready.family, prepare_parameters(ready), ready.examples, Plan(steps=2, seed=seed, rate=rate, look_every=2))
     each = (time.perf_counter() - began) / 4  # two steps, and two looks that cost about as much
     steps = max(int((seconds - 4 * each) / (1.3 * each)), 1)
     plan = Plan(steps=steps, seed=seed, rate=rate, most_s=max(seconds - 4 * each, 0.1))
-    found = descend(ready.family, ready.knobs, ready.examples, plan)
-    return _values(found.settings, ready.knobs.names), found.history[-1].step
+    found = descend(ready.family, ready.parameters, ready.examples, plan)
+    return _values(found.settings, ready.parameters.names), found.history[-1].step
 
 
-def prepare_knobs(ready: Prepared) -> Any:
-    return type(ready.knobs)(ready.knobs.base, ready.knobs.names)
+def prepare_parameters(ready: Prepared) -> Any:
+    return type(ready.parameters)(ready.parameters.base, ready.parameters.names)
 
 
 def _search(
     way: str, tried: Tried, ready: Prepared, settings: Settings, factor: float, seed: int, seconds: float
 ) -> tuple[dict[str, object], int]:
     """The best point that was measured in so many seconds; the point under way at the end still counts."""
-    axes = [_axis(name, settings, factor) for name in ready.knobs.names]
+    axes = [_axis(name, settings, factor) for name in ready.parameters.names]
 
-    def measure(knobs: Mapping[str, object]) -> sweeping.Measured:
-        return tried.measured(knobs, ready.tuned)
+    def measure(parameters: Mapping[str, object]) -> sweeping.Measured:
+        return tried.measured(parameters, ready.tuned)
 
     least = ready.goal.least
     trials = (
@@ -102,19 +102,19 @@ def _search(
         if time.perf_counter() >= end:
             break
     best = sweeping.best(done, least)
-    return dict(best.knobs) if best else {}, len(done)
+    return dict(best.parameters) if best else {}, len(done)
 
 
 def _random(axes: Sequence[Range], settings: Settings, measure: Any, seed: int) -> Iterator[sweeping.Trial]:
     chance = random.Random(seed)
     yield sweeping.Trial(0, {}, *measure({}))
     for number in range(1, MOST):
-        knobs: dict[str, object] = {}
+        parameters: dict[str, object] = {}
         for axis in axes:
             value = math.exp(chance.uniform(math.log(axis.low), math.log(axis.high)))
-            knobs[axis.knob] = TUNABLE[axis.knob].rounded(value)
-        if not possible(settings, knobs):
-            yield sweeping.Trial(number, knobs, *measure(knobs))
+            parameters[axis.parameter] = TUNABLE[axis.parameter].rounded(value)
+        if not possible(settings, parameters):
+            yield sweeping.Trial(number, parameters, *measure(parameters))
 
 
 def _axis(name: str, settings: Settings, factor: float) -> Range:
@@ -127,10 +127,12 @@ def _axis(name: str, settings: Settings, factor: float) -> Range:
     return Range(name, tunable.rounded(max(low, 1)), tunable.rounded(high), step, log=False)
 
 
-def _judged(judge: Tried, knobs: Mapping[str, object], ready: Prepared, count: int, spent: float) -> dict[str, Any]:
-    with_knobs(load_config(judge.spec.config, judge.spec.overrides), knobs)
-    tuned, held = (judge.measured(knobs, clips)[0] for clips in (ready.tuned, ready.held))
-    return {"tuned": tuned, "held_out": held, "points": count, "seconds": spent, "knobs": dict(knobs)}
+def _judged(
+    judge: Tried, parameters: Mapping[str, object], ready: Prepared, count: int, spent: float
+) -> dict[str, Any]:
+    with_parameters(load_config(judge.spec.config, judge.spec.overrides), parameters)
+    tuned, held = (judge.measured(parameters, clips)[0] for clips in (ready.tuned, ready.held))
+    return {"tuned": tuned, "held_out": held, "points": count, "seconds": spent, "knobs": dict(parameters)}
 
 
 def _values(settings: Settings, names: Sequence[str]) -> dict[str, object]:

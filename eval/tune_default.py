@@ -18,7 +18,7 @@ import draws
 import report
 from tune_recovery import f
 
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.simulation.demo import film_into
 
@@ -54,7 +54,7 @@ def _scene(seed: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as place:
         film_into(Path(place) / "scene", seed, FRAMES, SIZE)
         (clip,) = folder.read(Path(place), {}, lambda name: True).clips
-        found = f(clip, with_knobs(shipped, BEFORE)), f(clip, shipped)
+        found = f(clip, with_parameters(shipped, BEFORE)), f(clip, shipped)
     print(f"seed {seed}: {found[0]:.3f} {found[1]:.3f}", file=sys.stderr, flush=True)
     return found
 

@@ -3,10 +3,10 @@
     python eval/tune_ellipses.py [--seeds 10] [--scenes 6000] [--steps 120] [--json FILE]
 
 Scenes as in geo_scene.py: at 50 and 200 m, straight down and 45° off, four and six landmarks, on a ring and anywhere,
-with the noise that its head says. For each seed every noise knob begins off by a factor of up to 3, drawn evenly in the
-logarithm. The knobs are tuned on one half of the scenes by the negative log-likelihood of the places
+with the noise that its head says. For each seed every noise parameter begins off by a factor of up to 3, drawn evenly
+in the logarithm. The parameters are tuned on one half of the scenes by the negative log-likelihood of the places
 (tuning/places.py), in two turns of fits that are kept, and judged on the other half by the hard registrar with all its
-tests. `true noise`: the knobs as the scenes were drawn. An interval is that of 95 % over whole scenes. No data are
+tests. `true noise`: the parameters as the scenes were drawn. An interval is that of 95 % over whole scenes. No data are
 needed.
 """
 
@@ -28,15 +28,15 @@ import numpy as np
 import report
 from geo_scene import CAMERA, Case, Scenes, scenes
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.tuning.aerial_examples import Seen, kept, look_at
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.places import family
-from torchvision_dddas.types import Flight, Marks
+from torchvision_dddas.types import Flight, LandmarkObservations
 
 TUNED = (
     "aerial.tilt_sigma_deg",
@@ -64,7 +64,7 @@ def batches(count: int, seed: int) -> list[Scenes]:
     return [scenes(case, each, TARGETS, 1000 * seed + k) for k, case in enumerate(kinds)]
 
 
-def parts(batch: Scenes, settings: Settings) -> Iterator[tuple[Flight, Marks, np.ndarray, np.ndarray]]:
+def parts(batch: Scenes, settings: Settings) -> Iterator[tuple[Flight, LandmarkObservations, np.ndarray, np.ndarray]]:
     """Telemetry, landmarks and targets of each scene, with the standard deviations that the settings have."""
     for s in range(len(batch)):
         flight = replace(geo_error.flight_of(batch.axes[s], batch.place[s]), hfov_rad=float(np.radians(70.0)))
@@ -94,7 +94,7 @@ def examples(part: Sequence[Scenes], settings: Settings) -> list[Example]:
 def judged(part: Sequence[Scenes], settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """(S, T) whether ellipses hold the places, and (S, T) m that these are off; by the registrar, frame by frame."""
     inside, far, solver = [], [], load_solver("onboard")
-    settings = with_knobs(settings, {"aerial.correlation_s": 0.0})
+    settings = with_parameters(settings, {"aerial.correlation_s": 0.0})
     for batch in part:
         case = replace(batch.case, pixel_sigma=settings.aerial.target_sigma_px)
         for flight, marks, pixels, true in parts(batch, settings):
@@ -116,14 +116,16 @@ def coverage(inside: np.ndarray, draws: int = 1000) -> tuple[float, float, float
 
 
 def off_by(seed: int) -> Settings:
-    """The defaults, which the scenes keep to, with each knob off by a factor of up to OFF."""
+    """The defaults, which the scenes keep to, with each parameter off by a factor of up to OFF."""
     factors = np.exp(np.random.default_rng([seed, 77]).uniform(-np.log(OFF), np.log(OFF), len(TUNED)))
     true = Settings()
     values = {}
     for name, factor in zip(TUNED, factors.tolist(), strict=True):
-        group, knob = name.split(".")
-        values[name] = min(max(factor * getattr(getattr(true, group), knob), TUNABLE[name].low), TUNABLE[name].high)
-    return with_knobs(true, values)
+        group, parameter = name.split(".")
+        values[name] = min(
+            max(factor * getattr(getattr(true, group), parameter), TUNABLE[name].low), TUNABLE[name].high
+        )
+    return with_parameters(true, values)
 
 
 def study(seed: int, count: int, steps: int) -> dict[str, Any]:
@@ -144,8 +146,8 @@ def study(seed: int, count: int, steps: int) -> dict[str, Any]:
             patience=1000,
             most_watched=1000,
         )
-        # Each turn begins from hard fits with the knobs that the one before came to.
-        tuned = descend(family(), Knobs(tuned, TUNED), examples(tuned_on, tuned), plan).settings
+        # Each turn begins from hard fits with the parameters that the one before came to.
+        tuned = descend(family(), Parameters(tuned, TUNED), examples(tuned_on, tuned), plan).settings
     found: dict[str, Any] = {"seed": seed, "seconds": time.perf_counter() - began}
     found["knobs"] = {
         name: {"true": _of(Settings(), name), "before": _of(start, name), "after": _of(tuned, name)} for name in TUNED
@@ -166,8 +168,8 @@ def _rows(batch: Scenes, rows: slice) -> Scenes:
 
 
 def _of(settings: Settings, name: str) -> float:
-    group, knob = name.split(".")
-    return float(getattr(getattr(settings, group), knob))
+    group, parameter = name.split(".")
+    return float(getattr(getattr(settings, group), parameter))
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -4,7 +4,7 @@
 
 Every clip with masks is held out once; clips in which nothing moves are learned from in every fold, and told how many
 of their frames are alarmed. Of clips with many labelled frames about `--frames` are learned from, evenly spaced; judged
-is every labelled frame. A last fold holds nothing out: its knobs are what would be shipped.
+is every labelled frame. A last fold holds nothing out: its parameters are what would be shipped.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.masks import Masks
-from torchvision_dddas.tuning.parameters import Knobs, chosen
+from torchvision_dddas.tuning.parameters import Parameters, chosen
 
 MEAN = "mean"
 
@@ -40,7 +40,7 @@ def main() -> None:
     torch.set_num_threads(1)
     spec = replace(read_spec(given.study), overrides=tuple(given.set or ()), tasks=("motion",))
     spec = replace(spec, config=given.config) if given.config else spec
-    settings, names = load_config(spec.config, spec.overrides), chosen(given.knobs.split(","))
+    settings, names = load_config(spec.config, spec.overrides), chosen(given.parameters.split(","))
     judged = Judge(spec, given.study.parent, given.jobs)
     clips = {job.clip.name: job.clip for job in plan(spec, given.study.parent, []).jobs}
     learned = {name: Masks().examples([thinned(clip, given.frames)], settings) for name, clip in clips.items()}
@@ -50,12 +50,12 @@ def main() -> None:
         began = time.perf_counter()
         examples = [example for name, mine in learned.items() if name != held for example in mine]
         how = Plan(given.steps, given.batch, given.rate, given.seed, watched=given.watched, pull=given.pull)
-        found = descend(Masks(), Knobs(settings, names), examples, how)
-        spent, knobs = time.perf_counter() - began, _values(found.settings, names)
-        after, alarmed = judged.f(knobs)
-        row = {"held_out": held, "knobs": knobs, "f": after, "alarmed": alarmed, "step": found.best, "s": spent}
+        found = descend(Masks(), Parameters(settings, names), examples, how)
+        spent, parameters = time.perf_counter() - began, _values(found.settings, names)
+        after, alarmed = judged.f(parameters)
+        row = {"held_out": held, "knobs": parameters, "f": after, "alarmed": alarmed, "step": found.best, "s": spent}
         rows.append(row)
-        print(_line(held or "none", before, after, alarmed, knobs), flush=True)
+        print(_line(held or "none", before, after, alarmed, parameters), flush=True)
     text = "\n".join(table(rows))
     print(text)
     if given.json:
@@ -71,9 +71,9 @@ class Judge:
     def __init__(self, spec: Spec, base: Path, jobs: int | None) -> None:
         self._spec, self._base, self._jobs = spec, base, jobs
 
-    def f(self, knobs: Mapping[str, object]) -> tuple[dict[str, float], float]:
+    def f(self, parameters: Mapping[str, object]) -> tuple[dict[str, float], float]:
         """F of each clip with masks, and the share of frames with an alarm where nothing moves."""
-        changed = tuple(f"{name}={value}" for name, value in knobs.items())
+        changed = tuple(f"{name}={value}" for name, value in parameters.items())
         spec = replace(self._spec, overrides=(*self._spec.overrides, *changed))
         found, alarmed, frames = {}, 0.0, 0.0
         for case in run_study(spec, self._base, self._jobs).cases:
@@ -105,10 +105,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return [*lines, f"| {MEAN} | {means} |"]
 
 
-def _line(held: str, before: Mapping[str, float], after: Mapping[str, float], alarmed: float, knobs: Any) -> str:
+def _line(held: str, before: Mapping[str, float], after: Mapping[str, float], alarmed: float, parameters: Any) -> str:
     gain = f", F {before[held]:.4f} to {after[held]:.4f}" if held in before else ""
     others = [after[name] - before[name] for name in before if name != held]
-    told = ", ".join(f"{name} {value:g}" for name, value in knobs.items())
+    told = ", ".join(f"{name} {value:g}" for name, value in parameters.items())
     return f"held out {held}{gain}; the others {sum(others) / len(others):+.4f}; alarmed {alarmed:.2f}; {told}"
 
 

@@ -7,11 +7,11 @@ DATA: a folder of sequences, as the kinds `motchallenge`, `cvml` and `sdd` of a 
 followed by the tracker as it runs (hard decisions, K = 3), with the shipped knobs and with those tuned on all other
 sequences: on its true boxes without identities, or with --detections on its public ones. Boxes alone, no pictures: what
 is tuned is what is compared. --phases: a sequence is measured from each of these frames on, 0 being the first, and
-learned from as --learned says; the mean of its phases is its figure. Sequences that the shipped knobs leave nothing to
-gain on (IDF1 of 99.5 % or more) share one fold: they are held out together.
+learned from as --learned says; the mean of its phases is its figure. Sequences that the shipped parameters leave
+nothing to gain on (IDF1 of 99.5 % or more) share one fold: they are held out together.
 
 --search: for each fold as many seconds as the descent took, examples among them, go to a search for the best mean IDF1
-of the sequences that are not held out, by the same knobs within a factor of 3 of the shipped ones.
+of the sequences that are not held out, by the same parameters within a factor of 3 of the shipped ones.
 """
 
 import argparse
@@ -35,7 +35,7 @@ import draws
 import report
 from sequences import identified, idf1
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.studies import sweep
@@ -44,7 +44,7 @@ from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.identities import Identities
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 KNOBS = (
     "track.speed",
@@ -109,7 +109,7 @@ def _compare(sequences: Sequences, phases: Sequence[int], learned: Sequence[int]
     prepared_s = time.perf_counter() - began
     easy = tuple(name for name, value in shipped.items() if value >= PERFECT)
     folds = [(name,) for name in sequences.clips if name not in easy] + [easy] * bool(easy)
-    knobs, rows = given.knobs.split(","), list[dict[str, Any]]()
+    parameters, rows = given.parameters.split(","), list[dict[str, Any]]()
     for held in folds:
         if given.only and not set(held) & set(given.only.split(",")):
             continue
@@ -117,16 +117,18 @@ def _compare(sequences: Sequences, phases: Sequence[int], learned: Sequence[int]
         start = time.perf_counter()
         mine = [example for name in others for example in examples[name]]
         plan = Plan(given.steps, given.batch, given.rate, given.seed, look_every=8, pull=given.pull)
-        done = descend(family, Knobs(Settings(), knobs), mine, plan)
+        done = descend(family, Parameters(Settings(), parameters), mine, plan)
         seconds = time.perf_counter() - start + prepared_s
         ways: dict[str, dict[str, Any]] = {
-            "gradient": {name: getattr(done.settings.track, name.split(".")[1]) for name in knobs}
+            "gradient": {name: getattr(done.settings.track, name.split(".")[1]) for name in parameters}
         }
         points = {"gradient": done.best}
         for way in filter(None, given.search.split(",")):
-            ways[way], points[way] = _searched(way, sequences, others, learned, knobs, seconds, given.seed)
+            ways[way], points[way] = _searched(way, sequences, others, learned, parameters, seconds, given.seed)
         for name in held:
-            values = {way: sequences.idf1(name, with_knobs(Settings(), found), phases) for way, found in ways.items()}
+            values = {
+                way: sequences.idf1(name, with_parameters(Settings(), found), phases) for way, found in ways.items()
+            }
             rows.append({"sequence": name, "shipped": shipped[name], **values, "knobs": ways, "s": seconds})
             told = "  ".join(f"{way} {100 * v:5.1f} {100 * (v - shipped[name]):+5.1f}" for way, v in values.items())
             print(f"{name:24} shipped {100 * shipped[name]:5.1f}  {told}")
@@ -153,17 +155,17 @@ def _searched(
     sequences: Sequences,
     names: Sequence[str],
     phases: Sequence[int],
-    knobs: Sequence[str],
+    parameters: Sequence[str],
     seconds: float,
     seed: int,
 ) -> tuple[dict[str, Any], int]:
     """The best point of a search in so many seconds, and how many there were; the one under way at the end counts."""
 
     def measure(found: Mapping[str, object]) -> tuple[float, str]:
-        settings = with_knobs(Settings(), found)
+        settings = with_parameters(Settings(), found)
         return float(np.mean([sequences.idf1(name, settings, phases) for name in names])), ""
 
-    axes, many = [_axis(name) for name in knobs], 100_000
+    axes, many = [_axis(name) for name in parameters], 100_000
     trials = (
         sweep.proposed(axes, Settings(), measure, many, seed, least=False)
         if way == "optuna"
@@ -175,16 +177,16 @@ def _searched(
         if time.perf_counter() >= end:
             break
     best = sweep.best(done, least=False)
-    return dict(best.knobs) if best is not None else {}, len(done)
+    return dict(best.parameters) if best is not None else {}, len(done)
 
 
 def _random(axes: Sequence[Range], measure: Any, seed: int) -> Iterator[sweep.Trial]:
     chance = random.Random(seed)
     yield sweep.Trial(0, {}, *measure({}))
     for number in itertools.count(1):
-        point = {axis.knob: math.exp(chance.uniform(math.log(axis.low), math.log(axis.high))) for axis in axes}
-        knobs = {name: TUNABLE[name].rounded(value) for name, value in point.items()}
-        yield sweep.Trial(number, knobs, *measure(knobs))
+        point = {axis.parameter: math.exp(chance.uniform(math.log(axis.low), math.log(axis.high))) for axis in axes}
+        parameters = {name: TUNABLE[name].rounded(value) for name, value in point.items()}
+        yield sweep.Trial(number, parameters, *measure(parameters))
 
 
 def _axis(name: str) -> Range:
@@ -232,7 +234,7 @@ def _arguments() -> argparse.Namespace:
     ask.add_argument("--steps", type=int, default=24)
     ask.add_argument("--batch", type=int, default=4)
     ask.add_argument("--rate", type=float, default=0.2)
-    ask.add_argument("--pull", type=float, default=0.1, help="to the shipped knobs; see Plan")
+    ask.add_argument("--pull", type=float, default=0.1, help="to the shipped parameters; see Plan")
     ask.add_argument("--missed", type=float, help="margin of a true link that lacks; the family's by default")
     ask.add_argument("--wrong", type=float, help="margin of a wrong link; the family's by default")
     ask.add_argument("--softness", type=float, help="of the assignment; the family's by default")

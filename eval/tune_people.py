@@ -26,7 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import report
 
-from torchvision_dddas.config import PeopleKnobs, Settings
+from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.evaluation.datasets import inria, motchallenge
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.detection import iou
@@ -38,7 +38,7 @@ from torchvision_dddas.people.detector import people_in, recognizer_of
 from torchvision_dddas.tuning import recognition
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.types import People
 
 CROPS = "INRIA crops"
@@ -56,10 +56,10 @@ class Picture:
     size: tuple[int, int]
     truth_px: np.ndarray
 
-    def people(self, knobs: PeopleKnobs) -> People:
-        """Those whom these knobs find in it."""
-        above = self.margin >= knobs.threshold
-        return people_of(self.window_px[above], self.margin[above], self.size, knobs)
+    def people(self, parameters: PeopleParameters) -> People:
+        """Those whom these parameters find in it."""
+        above = self.margin >= parameters.threshold
+        return people_of(self.window_px[above], self.margin[above], self.size, parameters)
 
 
 def clips(data: Path) -> dict[str, list[Clip]]:
@@ -77,9 +77,9 @@ def clips(data: Path) -> dict[str, list[Clip]]:
 
 def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], list[Example]]:
     """At most so many pictures of a set, evenly over it; as what is judged and as what is learned from."""
-    knobs = Settings().people
-    recognizer = recognizer_of(knobs, "onboard")
-    low = knobs.model_copy(update={"threshold": knobs.threshold - recognition.BELOW})
+    parameters = Settings().people
+    recognizer = recognizer_of(parameters, "onboard")
+    low = parameters.model_copy(update={"threshold": parameters.threshold - recognition.BELOW})
     pictures: list[Picture] = []
     examples: list[Example] = []
     for clip in some:
@@ -91,20 +91,20 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
             if frame.number not in wanted:
                 continue
             size = (frame.image.shape[1], frame.image.shape[0])
-            parts = scan.everywhere(size, knobs)
+            parts = scan.everywhere(size, parameters)
             (maps,) = recognizer.scores([frame.image], [parts])
             truth_px = np.asarray(clip.truth.boxes[frame.number], float).reshape(-1, 4)
             pictures.append(Picture(group, *scan.windows(parts, maps, size, low), size, truth_px))
             held = _Held(maps)
-            one = recognition.scored(frame.image, truth_px, knobs, held)
+            one = recognition.scored(frame.image, truth_px, parameters, held)
             examples.append(Example(group, len(examples) + 1, one))
             print(f"\r{group}: {len(pictures)} pictures", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     first = pictures[0]
     for frame in opened(some[0]):  # what is held is what the recognizer itself finds
         if frame.number in some[0].truth.boxes:  # type: ignore[union-attr]
-            (whole,) = people_in([frame.image], recognizer, knobs)
-            assert np.allclose(whole.box_px, first.people(knobs).box_px), "the kept windows give other people"
+            (whole,) = people_in([frame.image], recognizer, parameters)
+            assert np.allclose(whole.box_px, first.people(parameters).box_px), "the kept windows give other people"
         break
     return pictures, examples
 
@@ -121,14 +121,14 @@ class _Held:
         return [list(self.maps)]
 
 
-def judge(pictures: Sequence[Picture], knobs: PeopleKnobs) -> list[dict[str, np.ndarray]]:
+def judge(pictures: Sequence[Picture], parameters: PeopleParameters) -> list[dict[str, np.ndarray]]:
     """Of each picture: right (N,), iou (R,) of those right, people; of the default threshold, sure (M,), score (M,).
 
     sure: right or not. Probabilities are judged on as many detections before and after.
     """
-    found, low = [], knobs.model_copy(update={"threshold": Settings().people.threshold})
+    found, low = [], parameters.model_copy(update={"threshold": Settings().people.threshold})
     for picture in pictures:
-        people, more = picture.people(knobs), picture.people(low)
+        people, more = picture.people(parameters), picture.people(low)
         right, sure = (judged(some.box_px, some.margin, picture.truth_px) for some in (people, more))
         best = iou(people.box_px, picture.truth_px).max(axis=1, initial=0.0)[right > 0]
         true = np.array([len(picture.truth_px)])
@@ -199,7 +199,7 @@ def main() -> None:
     for name, learned in splits(list(sets)):
         pictures, batch = sets[name][0], [one for other in learned for one in sets[other][1]]
         plan = Plan(steps=options.steps, batch=16, rate=0.05, look_every=10, patience=1000, most_watched=48)
-        done = descend(recognition.family(), Knobs(Settings(), options.knobs), batch, plan)
+        done = descend(recognition.family(), Parameters(Settings(), options.parameters), batch, plan)
         tuned = done.settings.people
         told = compared(judge(pictures, Settings().people), judge(pictures, tuned))
         cells = {key: f"{a:.3f} → {b:.3f} ({low:+.3f} to {high:+.3f})" for key, (a, b, low, high) in told.items()}
@@ -209,7 +209,10 @@ def main() -> None:
         lines.append(
             f"| {name} | {on} | {count} | {cells['f1']} | {both} | {cells['iou']} | {cells['doubt']} | {cells['off']} |"
         )
-        values = (f"{knob.partition('.')[2]} {getattr(tuned, knob.partition('.')[2]):g}" for knob in options.knobs)
+        values = (
+            f"{parameter.partition('.')[2]} {getattr(tuned, parameter.partition('.')[2]):g}"
+            for parameter in options.parameters
+        )
         words.append(f"- on {on}, {done.best} of {options.steps} steps, {done.seconds:.0f} s: {', '.join(values)}")
         print(lines[-1], words[-1], sep="\n", file=sys.stderr, flush=True)
     text = "\n".join([*lines, "", "Tuned values:", "", *words])

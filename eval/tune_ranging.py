@@ -4,8 +4,8 @@
 
 DATA is a folder of MOTChallenge 2015 sequences whose gt.txt has world metres: PETS09-S2L1 and TUD-Stadtmitte, with the
 cameras of ranging_error.py. The boxes are those of the benchmark's detector (det/det.txt) that overlap a true one. The
-knobs ground.feet_sigma, height_sigma and body_height_sigma_m are tuned on one clip and judged on the other by the hard
-ranging; also on the first half of a clip and judged on the second. Prints Markdown.
+parameters ground.feet_sigma, height_sigma and body_height_sigma_m are tuned on one clip and judged on the other by the
+hard ranging; also on the first half of a clip and judged on the second. Prints Markdown.
 """
 
 import argparse
@@ -18,12 +18,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from ranging_error import SIZES, People, detected, fitted, read_truth, seen, tsai
 
-from torchvision_dddas.config import GroundKnobs, Settings
+from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.evaluation.metrics.metres import inside
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.ground_examples import KNOBS, sighted
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.places import family
 from torchvision_dddas.types import Camera
 
@@ -38,9 +38,9 @@ def examples(name: str, people: People, camera: Camera) -> list[Example]:
     return found
 
 
-def coverage(people: People, camera: Camera, knobs: GroundKnobs) -> tuple[float, float, int]:
+def coverage(people: People, camera: Camera, parameters: GroundParameters) -> tuple[float, float, int]:
     """Share of people within their ellipses, median error in metres, and how many were placed."""
-    found = seen(people, camera, knobs)
+    found = seen(people, camera, parameters)
     off = found.east_north_m - people.east_north_m
     held = inside(off, found.covariance_m2)
     told = np.isfinite(held)
@@ -88,8 +88,8 @@ def main() -> None:
             ("its first half", examples(name, part(people, ~late), camera), part(people, late)),
         ):
             plan = Plan(steps=options.steps, batch=16, rate=0.1, look_every=10, patience=1000)
-            tuned = descend(family(), Knobs(Settings(), KNOBS), on, plan).settings.ground
-            before, after = coverage(held, camera, GroundKnobs()), coverage(held, camera, tuned)
+            tuned = descend(family(), Parameters(Settings(), KNOBS), on, plan).settings.ground
+            before, after = coverage(held, camera, GroundParameters()), coverage(held, camera, tuned)
             values = f"{tuned.feet_sigma:g}, {tuned.height_sigma:g}, {tuned.body_height_sigma_m:g} m"
             shares = f"{100 * before[0]:.1f} % | {100 * after[0]:.1f} %"
             lines.append(f"| {name} | {label} | {after[2]} | {shares} | {before[1]:.2f}, {after[1]:.2f} m | {values} |")

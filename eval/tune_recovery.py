@@ -1,10 +1,11 @@
 """Whether descent finds back what was lost: `python eval/tune_recovery.py [--seeds N] [--steps N] [--write FILE]`.
 
-For each seed a scene is filmed, and the knobs of the core are perturbed, each by a factor drawn evenly in the logarithm
-from 1/3 to 3. Descent starts there and learns from the scene's true masks. Told are the pixels' F of the whole hard
-pipeline, persistence and outlines included, at the shipped settings, at the perturbed and at the tuned ones, on that
-scene and on another one that nothing was learned from. A seed counts as recovered where F on its scene is at least 0.9
-of that of the shipped settings. With --step, the time and the memory of one step of all tunable knobs of motion.
+For each seed a scene is filmed, and the parameters of the core are perturbed, each by a factor drawn evenly in the
+logarithm from 1/3 to 3. Descent starts there and learns from the scene's true masks. Told are the pixels' F of the
+whole hard pipeline, persistence and outlines included, at the shipped settings, at the perturbed and at the tuned ones,
+on that scene and on another one that nothing was learned from. A seed counts as recovered where F on its scene is at
+least 0.9 of that of the shipped settings. With --step, the time and the memory of one step of all tunable parameters of
+motion.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.datasets import folder
@@ -32,7 +33,7 @@ from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.masks import Masks
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 KNOBS = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
@@ -55,7 +56,7 @@ def main() -> None:
 
 def recovery(seeds: int, steps: int) -> list[str]:
     """The table of all seeds."""
-    shipped = with_knobs(load_config(), BASE)
+    shipped = with_parameters(load_config(), BASE)
     rows = []
     for seed in range(seeds):
         with tempfile.TemporaryDirectory() as place:
@@ -82,13 +83,13 @@ def filmed(place: Path, seed: int) -> Clip:
 
 
 def perturbed(settings: Settings, seed: int) -> Settings:
-    """Each knob times a factor of its own, within its range."""
+    """Each parameter times a factor of its own, within its range."""
     factors = FACTOR ** np.random.default_rng([seed, 7]).uniform(-1, 1, len(KNOBS))
     starts = {}
     for name, factor in zip(KNOBS, factors, strict=True):
         group, key = name.split(".")
         starts[name] = float(TUNABLE[name].rounded(getattr(getattr(settings, group), key) * factor))
-    return with_knobs(settings, starts)
+    return with_parameters(settings, starts)
 
 
 def descended(clip: Clip, start: Settings, seed: int, steps: int) -> Settings:
@@ -96,9 +97,9 @@ def descended(clip: Clip, start: Settings, seed: int, steps: int) -> Settings:
     settings = start
     for after in (False, True):
         family = Masks(after=after)
-        knobs = Knobs(settings, KNOBS)
+        parameters = Parameters(settings, KNOBS)
         plan = Plan(steps=steps, batch=4, rate=0.15, seed=seed, most_watched=4)
-        settings = descend(family, knobs, family.examples([clip], settings), plan).settings
+        settings = descend(family, parameters, family.examples([clip], settings), plan).settings
     return settings
 
 
@@ -118,21 +119,21 @@ def one_step(frames: int = 8, rounds: int = 10) -> list[str]:
         clip = filmed(Path(place), 0)
         family = Masks()
         examples = family.examples([clip], settings)[4 : 4 + frames]
-    names = [name for name, knob in TUNABLE.items() if knob.family == "motion"]
-    knobs = Knobs(settings, names)
-    adam = torch.optim.Adam(knobs.parameters(), lr=0.05)
+    names = [name for name, parameter in TUNABLE.items() if parameter.family == "motion"]
+    parameters = Parameters(settings, names)
+    adam = torch.optim.Adam(parameters.parameters(), lr=0.05)
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     clock, spent = [], []
     for _ in range(rounds):
         start = time.perf_counter(), time.process_time()
-        loss = family.loss(knobs.values(), examples, 0.1).mean()
+        loss = family.loss(parameters.values(), examples, 0.1).mean()
         adam.zero_grad()
         loss.backward()
         adam.step()
         clock.append(time.perf_counter() - start[0])
         spent.append(time.process_time() - start[1])
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    what = f"{len(names)} knobs, {frames} windows of {SIZE[0]}×{SIZE[1]} | {torch.get_num_threads()}"
+    what = f"{len(names)} parameters, {frames} windows of {SIZE[0]}×{SIZE[1]} | {torch.get_num_threads()}"
     took = f"{np.median(clock):.2f} ({min(clock):.2f}) | {np.median(spent):.2f} | {before_mb:.0f}, {peak_mb:.0f}"
     return [
         "| step of | threads | clock, s: median (least) | processors, s | memory, MB: before, most |",

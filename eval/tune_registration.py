@@ -2,7 +2,7 @@
 
     python eval/tune_registration.py [--seeds N] [--steps N] [--write FILE]
 
-For each seed two scenes over flat ground are filmed, whose homographies from frame to frame are known. The knobs
+For each seed two scenes over flat ground are filmed, whose homographies from frame to frame are known. The parameters
 registration.ransac_px and registration.forward_backward_px begin at three times and at a third of what is shipped, and
 learn from the masks of one scene; the true homographies have no say. Told are, on that scene and on the other one, the
 mean distance of found and true homographies over the picture's corners, and the pixels' F of the whole hard pipeline.
@@ -22,14 +22,14 @@ import report
 from registration_error import distance
 from tune_recovery import BASE, FRAMES, SIZE, f, filmed
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import RATE_HZ
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, family
 
 FACTORS = {"three times": 3.0, "a third": 1 / 3}
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--write", type=Path, help="a text with marks for the table")
     given = parser.parse_args()
     found: dict[str, list[list[float]]] = {name: [] for name in FACTORS}
-    shipped = with_knobs(load_config(), BASE)
+    shipped = with_parameters(load_config(), BASE)
     for seed in range(given.seeds):
         with tempfile.TemporaryDirectory() as place:
             numbers = 2 * seed, 2 * seed + 1
@@ -64,25 +64,25 @@ def main() -> None:
 
 
 def off_by(settings: Settings, factor: float) -> Settings:
-    """Both knobs times a factor."""
+    """Both parameters times a factor."""
     values = {RANSAC: settings.registration.ransac_px, CHECK: settings.registration.forward_backward_px}
-    return with_knobs(settings, {name: TUNABLE[name].rounded(value * factor) for name, value in values.items()})
+    return with_parameters(settings, {name: TUNABLE[name].rounded(value * factor) for name, value in values.items()})
 
 
 def descended(clip: Clip, start: Settings, seed: int, steps: int) -> Settings:
-    """What the masks of a clip make of both knobs."""
+    """What the masks of a clip make of both parameters."""
     plan = Plan(steps=steps, batch=4, rate=0.15, seed=seed, most_watched=4)
     learned = family()
-    return descend(learned, Knobs(start, [RANSAC, CHECK]), learned.examples([clip], start), plan).settings
+    return descend(learned, Parameters(start, [RANSAC, CHECK]), learned.examples([clip], start), plan).settings
 
 
 def judged(clip: Clip, seed: int, settings: Settings) -> tuple[float, float]:
     """Mean error of the registrations over the corners, px, and pixels' F of the hard pipeline."""
     maps = [view.image_from_ground for view in flight(seed, FRAMES, SIZE, RATE_HZ)]
     true = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(maps)]
-    vision = load_engine("onboard", settings)
-    views = [vision.prepare(frame.image) for frame in opened(clip)]
-    ours = [vision.register([pair])[0].later_from_earlier for pair in pairwise(views)]
+    engine = load_engine("onboard", settings)
+    views = [engine.prepare(frame.image) for frame in opened(clip)]
+    ours = [engine.register([pair])[0].later_from_earlier for pair in pairwise(views)]
     error_px = float(np.mean([distance(a, b, *SIZE) for a, b in zip(ours, true, strict=True)]))
     return error_px, f(clip, settings)
 
@@ -103,7 +103,7 @@ def table(found: dict[str, list[list[float]]]) -> list[str]:
 
 def _values(name: str, rows: Sequence[float] | np.ndarray) -> str:
     spans = [np.quantile(np.asarray(rows)[:, k], (0.0, 0.5, 1.0)) for k in (0, 1)]
-    told = (f"{knob} {low:.2f} to {high:.2f}, median {middle:.2f}" for knob, (low, middle, high) in
+    told = (f"{parameter} {low:.2f} to {high:.2f}, median {middle:.2f}" for parameter, (low, middle, high) in
             zip(("ransac_px", "forward_backward_px"), spans, strict=True))  # fmt: skip
     return f"From {name}: {'; '.join(told)}."
 

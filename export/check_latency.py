@@ -25,7 +25,7 @@ from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.types import Frame
 
 WARM_UP = 10
@@ -69,9 +69,9 @@ def people_ms(images: list[np.ndarray]) -> list[float]:
     from torchvision_dddas.people.classifiers import read_classifier
     from torchvision_dddas.people.pyramid import everywhere
 
-    knobs = load_config(None, []).people
-    recognizer = load_recognizer("onboard", knobs, read_classifier(knobs.classifier, knobs.features))
-    parts = everywhere(images[0].shape[1::-1], knobs)
+    parameters = load_config(None, []).people
+    recognizer = load_scorer("onboard", parameters, read_classifier(parameters.classifier, parameters.features))
+    parts = everywhere(images[0].shape[1::-1], parameters)
     return [spent_ms(lambda image=image: recognizer.scores([image], [parts])) for image in images][1:]  # type: ignore[misc]
 
 

@@ -31,13 +31,13 @@ import numpy as np
 import torch
 
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.config import PeopleKnobs, load_config
+from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import hog
 from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, remove, temporary, write_whole
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.people.pyramid import everywhere, levels
-from torchvision_dddas.people.torch_scorer import TorchRecognizer
+from torchvision_dddas.people.torch_scorer import TorchScorer
 from torchvision_dddas.people.torch_scorer import layout as descriptor
 from torchvision_dddas.types import LinearSvm, Part
 
@@ -90,15 +90,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--quiet", action="store_true")
     options = parser.parse_args(words)
     try:
-        knobs = load_config(options.config, options.overrides).people
+        parameters = load_config(options.config, options.overrides).people
         plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
         check(plan)
         check_out(options.out, (options.positives, options.negatives))
         _sklearn("svm")  # better missed before the work than after it
-        people = crops(options.positives, knobs, size_of(options.crop) if options.crop else None)
-        rest = pictures(options.negatives, knobs)
-        trained = train(people, rest, knobs, plan, options.quiet)
-        write(options.out, trained.svm, knobs)
+        people = crops(options.positives, parameters, size_of(options.crop) if options.crop else None)
+        rest = pictures(options.negatives, parameters)
+        trained = train(people, rest, parameters, plan, options.quiet)
+        write(options.out, trained.svm, parameters)
     except InputError as error:
         print(f"train_people: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -169,17 +169,17 @@ def size_of(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def crops(folder: Path, knobs: PeopleKnobs, crop: tuple[int, int] | None = None) -> np.ndarray:
+def crops(folder: Path, parameters: PeopleParameters, crop: tuple[int, int] | None = None) -> np.ndarray:
     """(N, h + 2, w + 2, 3) uint8: the windows of a folder's crops with their neighbours, resized as a scan would.
 
     Raises InputError: a crop of less than half the window's size, which would be a blur, or smaller than `crop`.
     """
-    return np.stack([window(picture(path), path, knobs, crop) for path in files(folder)])
+    return np.stack([window(picture(path), path, parameters, crop) for path in files(folder)])
 
 
-def window(image: np.ndarray, path: Path, knobs: PeopleKnobs, crop: tuple[int, int] | None) -> np.ndarray:
+def window(image: np.ndarray, path: Path, parameters: PeopleParameters, crop: tuple[int, int] | None) -> np.ndarray:
     """The middle of a picture as a window with one pixel around it."""
-    size, wanted = image.shape[1::-1], (knobs.window_width_px, knobs.window_height_px)
+    size, wanted = image.shape[1::-1], (parameters.window_width_px, parameters.window_height_px)
     crop = crop or size
     if crop[0] > size[0] or crop[1] > size[1]:
         raise InputError(f"{path} is {size[0]} x {size[1]} px, smaller than --crop {crop[0]}x{crop[1]}")
@@ -213,16 +213,18 @@ def _reflected(index: np.ndarray, length: int) -> np.ndarray:
     return np.where(index < length, index, period - index)
 
 
-def pictures(folder: Path, knobs: PeopleKnobs) -> list[np.ndarray]:
+def pictures(folder: Path, parameters: PeopleParameters) -> list[np.ndarray]:
     """The pictures of a folder that hold a window. Raises InputError if none does."""
     every = [picture(path) for path in files(folder)]
     held = [
-        image for image in every if image.shape[1] >= knobs.window_width_px and image.shape[0] >= knobs.window_height_px
+        image
+        for image in every
+        if image.shape[1] >= parameters.window_width_px and image.shape[0] >= parameters.window_height_px
     ]
     if not held:
         raise InputError(
-            f"{folder}: none of {len(every)} pictures is as large as the window of {knobs.window_width_px} x "
-            f"{knobs.window_height_px} px"
+            f"{folder}: none of {len(every)} pictures is as large as the window of {parameters.window_width_px} x "
+            f"{parameters.window_height_px} px"
         )
     return held
 
@@ -231,9 +233,9 @@ def pictures(folder: Path, knobs: PeopleKnobs) -> list[np.ndarray]:
 # Descriptors.
 
 
-def descriptors(windows: np.ndarray, knobs: PeopleKnobs) -> np.ndarray:
+def descriptors(windows: np.ndarray, parameters: PeopleParameters) -> np.ndarray:
     """(N, F) float32 in OpenCV's order, of (N, h + 2, w + 2, 3) windows with one pixel around them."""
-    layout = descriptor(knobs)
+    layout = descriptor(parameters)
     (across, down), cells = layout.blocks, layout.cells
     found = [np.zeros((0, layout.features), np.float32)]
     for begin in range(0, len(windows), BATCH):
@@ -246,20 +248,20 @@ def descriptors(windows: np.ndarray, knobs: PeopleKnobs) -> np.ndarray:
 
 
 def random_windows(
-    images: Sequence[np.ndarray], knobs: PeopleKnobs, count: int, rng: np.random.Generator
+    images: Sequence[np.ndarray], parameters: PeopleParameters, count: int, rng: np.random.Generator
 ) -> np.ndarray:
     """(count, h + 2, w + 2, 3) windows of any picture, level and place; coarse levels as often as fine ones."""
     found = []
     for index in np.sort(rng.integers(0, len(images), count)):
         image = images[index]
-        found.append(cut(image, [_somewhere(image, knobs, rng)])[0])
+        found.append(cut(image, [_somewhere(image, parameters, rng)])[0])
     return np.stack(found)
 
 
-def _somewhere(image: np.ndarray, knobs: PeopleKnobs, rng: np.random.Generator) -> Part:
-    known = levels(image.shape[1::-1], knobs)
+def _somewhere(image: np.ndarray, parameters: PeopleParameters, rng: np.random.Generator) -> Part:
+    known = levels(image.shape[1::-1], parameters)
     size = known[rng.integers(len(known))].size
-    width, height = knobs.window_width_px, knobs.window_height_px
+    width, height = parameters.window_width_px, parameters.window_height_px
     x, y = (int(rng.integers(0, have - need + 1)) for have, need in zip(size, (width, height), strict=True))
     return Part(size, x, y, width, height)
 
@@ -274,28 +276,28 @@ def cut(image: np.ndarray, places: Sequence[Part]) -> list[np.ndarray]:
 
 
 def scored(
-    images: Sequence[np.ndarray], recognizer: TorchRecognizer, knobs: PeopleKnobs
+    images: Sequence[np.ndarray], recognizer: TorchScorer, parameters: PeopleParameters
 ) -> Iterator[tuple[list[Part], list[np.ndarray]]]:
     """The parts and score maps of each picture, on levels STEP apart."""
-    knobs = knobs.model_copy(update={"scale_step": max(knobs.scale_step, STEP)})
+    parameters = parameters.model_copy(update={"scale_step": max(parameters.scale_step, STEP)})
     for image in images:
-        parts = everywhere(image.shape[1::-1], knobs)
+        parts = everywhere(image.shape[1::-1], parameters)
         yield parts, recognizer.scores([image], [parts])[0]
 
 
 def hardest(
-    parts: Sequence[Part], maps: Sequence[np.ndarray], knobs: PeopleKnobs, above: float, count: int
+    parts: Sequence[Part], maps: Sequence[np.ndarray], parameters: PeopleParameters, above: float, count: int
 ) -> list[Part]:
     """The windows that score highest, and above a number, best first."""
     places = [np.argwhere(scores > above) for scores in maps]
     values = np.concatenate([scores[scores > above] for scores in maps])
     of = np.repeat(np.arange(len(maps)), [len(place) for place in places])
     rows = np.concatenate(places)
-    stride, found = knobs.window_stride_px, []
+    stride, found = parameters.window_stride_px, []
     for i in np.argsort(-values, kind="stable")[:count]:
         part, (row, column) = parts[of[i]], rows[i]
         x, y = part.x + int(column) * stride, part.y + int(row) * stride
-        found.append(Part(part.level, x, y, knobs.window_width_px, knobs.window_height_px))
+        found.append(Part(part.level, x, y, parameters.window_width_px, parameters.window_height_px))
     return found
 
 
@@ -304,7 +306,7 @@ def hardest(
 
 
 def train(
-    people: np.ndarray, rest: Sequence[np.ndarray], knobs: PeopleKnobs, plan: Plan, quiet: bool = False
+    people: np.ndarray, rest: Sequence[np.ndarray], parameters: PeopleParameters, plan: Plan, quiet: bool = False
 ) -> Trained:
     """A classifier of windows (as of `crops`) against all windows of pictures.
 
@@ -314,13 +316,13 @@ def train(
     people, tested = split(people, plan.held_out, rng, "positives")
     order, kept_back = split(np.arange(len(rest)), plan.held_out if len(rest) > 1 else 0, rng, "negatives")
     learned = [rest[i] for i in order]
-    positive = descriptors(mirrored(people), knobs)
-    negative = descriptors(random_windows(learned, knobs, plan.negatives, rng), knobs)
+    positive = descriptors(mirrored(people), parameters)
+    negative = descriptors(random_windows(learned, parameters, plan.negatives, rng), parameters)
     lines = [f"{len(people)} people and their mirror images, {len(negative)} random windows of {len(learned)} pictures"]
     c = plan.c or choose(positive, negative, plan.seed, lines)
     svm = fit(positive, negative, c, plan.seed)
     for turn in range(plan.rounds):
-        found = mine(learned, knobs, svm, plan, f"hard negatives, round {turn + 1}", quiet)
+        found = mine(learned, parameters, svm, plan, f"hard negatives, round {turn + 1}", quiet)
         both = np.unique(np.concatenate([negative, found]), axis=0)
         new = len(both) - len(np.unique(negative, axis=0))
         lines.append(f"round {turn + 1}: {len(found)} windows taken for people, or nearly so; {new} of them new")
@@ -329,7 +331,7 @@ def train(
         negative = both
         svm = fit(positive, negative, c, plan.seed)
     held = [rest[i] for i in kept_back]
-    return Trained(svm, lines + measured(svm, tested, held, knobs))
+    return Trained(svm, lines + measured(svm, tested, held, parameters))
 
 
 def split(items: np.ndarray, share: float, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -385,27 +387,29 @@ def fit(positive: np.ndarray, negative: np.ndarray, c: float, seed: int) -> Line
 
 
 def mine(
-    images: Sequence[np.ndarray], knobs: PeopleKnobs, svm: LinearSvm, plan: Plan, name: str, quiet: bool
+    images: Sequence[np.ndarray], parameters: PeopleParameters, svm: LinearSvm, plan: Plan, name: str, quiet: bool
 ) -> np.ndarray:
     """(N, F) descriptors of the windows that a classifier wrongly takes for people, on every level."""
-    recognizer = TorchRecognizer(knobs, svm)
+    recognizer = TorchScorer(parameters, svm)
     found = [np.zeros((0, svm.weights.size), np.float32)]
     with progress(name, len(images), quiet) as tick:
-        for image, (parts, maps) in zip(images, scored(images, recognizer, knobs), strict=True):
-            places = hardest(parts, maps, knobs, plan.margin, plan.hard)
+        for image, (parts, maps) in zip(images, scored(images, recognizer, parameters), strict=True):
+            places = hardest(parts, maps, parameters, plan.margin, plan.hard)
             if places:
-                found.append(descriptors(np.stack(cut(image, places)), knobs))
+                found.append(descriptors(np.stack(cut(image, places)), parameters))
             tick()
     return np.concatenate(found)
 
 
-def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], knobs: PeopleKnobs) -> list[str]:
+def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], parameters: PeopleParameters) -> list[str]:
     """Lines on pictures that took no part in the training."""
     if not len(people) or not len(rest):
         return ["nothing was held out, so nothing was measured"]
-    score = descriptors(people, knobs) @ svm.weights + svm.bias
-    recognizer = TorchRecognizer(knobs, svm)
-    false = np.concatenate([np.concatenate([m.ravel() for m in maps]) for _, maps in scored(rest, recognizer, knobs)])
+    score = descriptors(people, parameters) @ svm.weights + svm.bias
+    recognizer = TorchScorer(parameters, svm)
+    false = np.concatenate(
+        [np.concatenate([m.ravel() for m in maps]) for _, maps in scored(rest, recognizer, parameters)]
+    )
     right = ((score > 0).mean() + (false <= 0).mean()) / 2
     missed, taken = int((score <= 0).sum()), int((false > 0).sum())
     line = (
@@ -420,11 +424,11 @@ def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], kno
     return [*lines, f"miss rate at false positives per window: {', '.join(shown) or 'too few windows'}"]
 
 
-def write(path: Path, svm: LinearSvm, knobs: PeopleKnobs) -> None:
+def write(path: Path, svm: LinearSvm, parameters: PeopleParameters) -> None:
     """As .npz with the layout, else as text that tells it in its comments. Raises InputError if the disk refuses."""
     import io
 
-    layout = knobs.descriptor
+    layout = parameters.descriptor
     held = io.BytesIO()
     if path.suffix.lower() == ".npz":
         # The format keeps no names of its own in `layout`, so arrays of the same name do.

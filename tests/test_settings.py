@@ -1,4 +1,4 @@
-"""Settings: every knob is described, every mistake gets one line, every shipped configuration loads."""
+"""Settings: every parameter is described, every mistake gets one line, every shipped configuration loads."""
 
 import tomllib
 from pathlib import Path
@@ -9,42 +9,44 @@ from pydantic import Field, ValidationError
 
 from torchvision_dddas.config import (
     Group,
-    Knob,
+    Parameter,
     Settings,
-    all_knobs,
+    all_parameters,
     changes,
     config_names,
-    knob,
     load_config,
+    parameter,
     range_of,
-    with_knobs,
+    with_parameters,
 )
 from torchvision_dddas.errors import InputError
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.toml"))
-KNOBS = {row.name: row for row in all_knobs()}
+KNOBS = {row.name: row for row in all_parameters()}
 
 
-@pytest.mark.parametrize("row", all_knobs(), ids=lambda row: row.name)
-def test_every_knob_has_unit_range_and_meaning(row: Knob) -> None:
+@pytest.mark.parametrize("row", all_parameters(), ids=lambda row: row.name)
+def test_every_parameter_has_unit_range_and_meaning(row: Parameter) -> None:
     assert row.unit
     assert len(row.meaning.split()) >= 3
     assert "None" not in row.range
     assert " to " in row.range or " or " in row.range
 
 
-def test_every_knob_of_every_group_is_listed() -> None:
+def test_every_parameter_of_every_group_is_listed() -> None:
     content = Settings().model_dump()
-    assert [f"{group}.{name}" for group, knobs in content.items() for name in knobs] == list(KNOBS)
+    assert [f"{group}.{name}" for group, parameters in content.items() for name in parameters] == list(KNOBS)
 
 
 def test_every_default_lies_in_its_own_range() -> None:
-    assert with_knobs(Settings(), {name: row.default for name, row in KNOBS.items()}) == Settings()
+    assert with_parameters(Settings(), {name: row.default for name, row in KNOBS.items()}) == Settings()
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_a_shipped_configuration_loads_and_holds_only_what_differs_from_the_defaults(path: Path) -> None:
-    written = {f"{group}.{name}" for group, knobs in tomllib.loads(path.read_text()).items() for name in knobs}
+    written = {
+        f"{group}.{name}" for group, parameters in tomllib.loads(path.read_text()).items() for name in parameters
+    }
     assert written == set(changes(load_config(path.stem)))
 
 
@@ -64,9 +66,11 @@ def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Pa
     }
 
 
-def test_a_list_of_numbers_can_be_a_knob() -> None:
+def test_a_list_of_numbers_can_be_a_parameter() -> None:
     class Gaps(Group):
-        gaps: tuple[Annotated[int, Field(ge=1, le=30)], ...] = knob((1, 2), "frames", meaning="how far to look back")
+        gaps: tuple[Annotated[int, Field(ge=1, le=30)], ...] = parameter(
+            (1, 2), "frames", meaning="how far to look back"
+        )
 
     assert range_of(Gaps.model_fields["gaps"]) == "a list of 1 to 30"
     with pytest.raises(ValidationError):
@@ -82,8 +86,8 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
     [
         ("registration.keypoint=3", ["registration.keypoint'", "registration.keypoints"]),
         ("keypoints=3", ["did you mean registration.keypoints"]),
-        ("nowhere.zzzz=3", ["unknown knob 'nowhere.zzzz'", "dddas settings"]),
-        ("registration=3", ["unknown knob 'registration'"]),
+        ("nowhere.zzzz=3", ["unknown parameter 'nowhere.zzzz'", "dddas settings"]),
+        ("registration=3", ["unknown parameter 'registration'"]),
         ("registration.keypoints=9000", ["registration.keypoints = 9000", "50 to 5000 points"]),
         ("registration.keypoints=1.5", ["1.5", "a whole number"]),
         ("registration.keypoints=many", ["'many'", "50 to 5000 points"]),
@@ -99,7 +103,7 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
         ("people.window_width_px=60", ["do not fill window_width_px = 60; wanted 16 + a multiple of 8"]),
         ("people.window_height_px=8", ["do not fill window_height_px = 8"]),
         ("gates.min_size_m=90", ["min_size_m", "above max_size_m"]),
-        ("registration.keypoints", ["no override", "group.knob=value"]),
+        ("registration.keypoints", ["no override", "group.parameter=value"]),
         ("=3", ["no override"]),
     ],
 )

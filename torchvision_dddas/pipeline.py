@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Protocol
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import detector as run
-from torchvision_dddas.detection.engine import Vision
+from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.geo import Locator, Targets, Watch, Watched, gathered, named
 from torchvision_dddas.tracking import sequence as following
 from torchvision_dddas.tracking.crowd_identity import RollCall
-from torchvision_dddas.types import Followed, Scene, Surveyed, Telemetry
+from torchvision_dddas.types import FrameResult, Scene, Telemetry, TrackedFrame
 
 if TYPE_CHECKING:
     from torchvision_dddas.control.mission_api import Mission
@@ -28,7 +28,7 @@ class Clip(run.Clip, Protocol):
 
 def survey(
     source: Clip,
-    vision: Vision,
+    engine: Engine,
     settings: Settings,
     telemetry: Telemetry | None = None,
     watch: Watch | None = None,
@@ -37,7 +37,7 @@ def survey(
     seen: Callable[[Scene], object] | None = None,
     retune: run.Retune | None = None,
     pictures: bool = True,
-) -> Iterator[Surveyed]:
+) -> Iterator[FrameResult]:
     """Everything of each frame that is followed, in order.
 
     Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
@@ -48,7 +48,7 @@ def survey(
     roll = RollCall() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
-        for scene in run.run(source, vision, settings, telemetry, retune=retune):
+        for scene in run.run(source, engine, settings, telemetry, retune=retune):
             if watch is None:
                 if seen is not None:
                     seen(scene)
@@ -64,7 +64,7 @@ def survey(
 
     for followed in following.follow_scenes(scenes(), settings, interval, source.size, pictures):
         if watch is None:
-            yield Surveyed(followed)
+            yield FrameResult(followed)
             continue
         past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
         if roll is not None:
@@ -77,7 +77,7 @@ def _unpictured(watched: Watched) -> Watched:
     return replace(watched, scene=replace(watched.scene, frame=following.without_picture(watched.scene.frame)))
 
 
-def _located(followed: Followed, past: Sequence[Watched], locator: Locator) -> Surveyed:
+def _located(followed: TrackedFrame, past: Sequence[Watched], locator: Locator) -> FrameResult:
     """A followed frame on the ground. past: what was seen since the one before, it at the end."""
     here, tracks = past[-1], followed.tracks
     # A box that bridges a gap was not seen: it has an identity, and no place.
@@ -99,4 +99,4 @@ def _located(followed: Followed, past: Sequence[Watched], locator: Locator) -> S
     grounded = locator.ground(replace(here.look, seconds={}), targets, (*followed.adjustments, *earlier), seconds)
     origin = locator.site.origin_deg
     degrees = None if origin is None else geometry.lonlat(grounded.marks.east_north_m, origin)
-    return Surveyed(followed, grounded, here.sighted_by, degrees)
+    return FrameResult(followed, grounded, here.sighted_by, degrees)

@@ -1,8 +1,8 @@
 """What computes: torch, or ONNX graphs, opened only where they are what the manifest of `dddas export` says.
 
-A folder of graphs has one manifest.json. It holds each file's SHA-256, inputs, outputs and knobs, the version of this
-package that made it, and a seal: the SHA-256 of everything else in it. This tells damage, edits and mixed-up versions
-from the graphs that were checked; it is no signature, which would need a key.
+A folder of graphs has one manifest.json. It holds each file's SHA-256, inputs, outputs and parameters, the version of
+this package that made it, and a seal: the SHA-256 of everything else in it. This tells damage, edits and mixed-up
+versions from the graphs that were checked; it is no signature, which would need a key.
 """
 
 import hashlib

@@ -148,10 +148,10 @@ class Detections:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A knob that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
+    """A parameter that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
 
     frame: int
-    knob: str
+    parameter: str
     old: float
     new: float
     cause: str
@@ -209,7 +209,7 @@ class People:
 
 
 @dataclass(frozen=True)
-class Recognized:
+class PeopleFrame:
     """All that is known of one frame after it was searched for people.
 
     frame: the picture. people: whom it shows. regions_px: (R, 4) where it was searched, beside the levels of the
@@ -326,7 +326,7 @@ class Landmarks:
 
 
 @dataclass(frozen=True)
-class Marks:
+class LandmarkObservations:
     """The landmarks of one frame, one row each.
 
     landmark: (n,) int64, which of the names. image_px: (n, 2), NaN where the picture does not show it.
@@ -464,7 +464,7 @@ class Ortho:
 
 
 @dataclass(frozen=True)
-class Located:
+class GroundLocations:
     """All that is known of one frame after its people were located from the ground.
 
     positions: the people, fused where several cameras see them. members: (P, V) which sighting of each camera is of
@@ -484,7 +484,7 @@ class Located:
 
 
 @dataclass(frozen=True)
-class Grounded:
+class AerialLocations:
     """All that is known of one frame after its targets were located from the air.
 
     positions: the targets that could be located; covariance_m2 is that of the absolute place. row: (P,) which of the
@@ -501,13 +501,13 @@ class Grounded:
     velocity_m_s: np.ndarray
     box_px: np.ndarray
     fix: Fix
-    marks: Marks
+    marks: LandmarkObservations
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Confirmed:
+class Confirmation:
     """What vehicles on the ground say of the blobs of one frame, one row a blob.
 
     row: (N,) int64, its place in the blobs' table, sorted by frame. kind: human, not_human or unseen, by all looks so
@@ -570,7 +570,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedFrame:
     """All that is known of one frame after its targets were given their identities.
 
     number: 1-based position in the clip. frame: its picture; None where there is none or it could not be read.
@@ -599,7 +599,7 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class FrameResult:
     """All that is known of one frame at the end of the whole path. grounded: None where nothing lays it on the ground.
 
     followed: its targets, without the landmarks. sighted_by: (n,) what showed each of the landmarks of grounded.marks:
@@ -608,11 +608,11 @@ class Surveyed:
     command: what the instruments were asked to do after this frame; None where they stay as they are.
     """
 
-    followed: Followed
-    grounded: Grounded | None = None
+    followed: TrackedFrame
+    grounded: AerialLocations | None = None
     sighted_by: tuple[str, ...] = ()
     mark_lonlat_deg: np.ndarray | None = None
-    confirmed: Confirmed | None = None
+    confirmed: Confirmation | None = None
     command: "Command | None" = None
 
 

@@ -14,7 +14,7 @@ from torchvision_dddas.types import Detections, Scene
 def stub_engine(found=True, after=None):
     """Modules `run` and `vision` that find one target in each frame; `after(scene)` runs once each scene is out."""
 
-    def run(source, vision, settings, telemetry=None, retune=None):
+    def run(source, engine, settings, telemetry=None, retune=None):
         for frame in source:
             mask = np.zeros(frame.image.shape[:2], np.uint16)
             mask[2:8, 3:9] = found

@@ -28,12 +28,12 @@ def test_version_and_help(dddas):
         assert command in dddas("--help").stdout
 
 
-def test_settings_lists_every_knob_on_its_line(dddas):
-    from torchvision_dddas.config import all_knobs
+def test_settings_lists_every_parameter_on_its_line(dddas):
+    from torchvision_dddas.config import all_parameters
 
     lines = dddas("settings").stdout.splitlines()
-    for knob in all_knobs():
-        assert any(knob.name in line and str(knob.default) in line for line in lines), knob.name
+    for parameter in all_parameters():
+        assert any(parameter.name in line and str(parameter.default) in line for line in lines), parameter.name
 
 
 def test_evaluate_prints_a_table_and_writes_metrics(dddas, engine, clip, tmp_path):

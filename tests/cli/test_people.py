@@ -17,8 +17,8 @@ from torchvision_dddas.io.detection_tables import read_detections
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = tuple(
     word
-    for knob in ("window_width_px=16", "window_height_px=32", "padding_px=0", "enlarge=1.0")
-    for word in ("--set", f"people.{knob}")
+    for parameter in ("window_width_px=16", "window_height_px=32", "padding_px=0", "enlarge=1.0")
+    for word in ("--set", f"people.{parameter}")
 )
 
 
@@ -27,11 +27,11 @@ class Stub:
 
     name = "stub"
 
-    def __init__(self, knobs, found=True):
-        self.knobs, self.found = knobs, found
+    def __init__(self, parameters, found=True):
+        self.parameters, self.found = parameters, found
 
     def scores(self, images, parts):
-        k = self.knobs
+        k = self.parameters
         maps = [
             [
                 np.full(
@@ -52,9 +52,9 @@ def stub(monkeypatch):
     def install(found=True):
         loads = []
 
-        def load(knobs, backend):
+        def load(parameters, backend):
             loads.append(backend)
-            return Stub(knobs, found)
+            return Stub(parameters, found)
 
         monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", load)
         return loads
@@ -296,7 +296,7 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
         import torchvision_dddas.people.detector
 
         sys.modules["torchvision_dddas.cli.people"].progress = stopping
-        torchvision_dddas.people.detector.recognizer_of = lambda knobs, backend: Stub(knobs)
+        torchvision_dddas.people.detector.recognizer_of = lambda parameters, backend: Stub(parameters)
         torchvision_dddas.cli.main()
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "people", str(clip), *SMALL]

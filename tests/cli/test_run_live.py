@@ -80,9 +80,9 @@ def test_a_second_session_touches_nothing_of_the_first(dddas, frames, tmp_path):
 
 
 def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames, tmp_path, monkeypatch):
-    from torchvision_dddas.detection.opencv_engine import OnboardVision
+    from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 
-    prepare, asked = OnboardVision.prepare, []
+    prepare, asked = OpenCVEngine.prepare, []
 
     def broken(self, image):
         asked.append(1)
@@ -90,7 +90,7 @@ def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames
             raise cv2.error("the sixth picture")
         return prepare(self, image)
 
-    monkeypatch.setattr(OnboardVision, "prepare", broken)
+    monkeypatch.setattr(OpenCVEngine, "prepare", broken)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     folder, record, results = session(tmp_path)
@@ -102,13 +102,13 @@ def test_an_error_in_one_frame_is_an_event_and_costs_a_few_results(dddas, frames
 
 
 def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frames, tmp_path, monkeypatch):
-    from torchvision_dddas.detection.opencv_engine import OnboardVision
+    from torchvision_dddas.detection.opencv_engine import OpenCVEngine
     from torchvision_dddas.live import runner
 
     def broken(self, image):
         raise ValueError("no picture will do")
 
-    monkeypatch.setattr(OnboardVision, "prepare", broken)
+    monkeypatch.setattr(OpenCVEngine, "prepare", broken)
     monkeypatch.setattr(runner, "_IN_VAIN", 5)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 70

@@ -200,7 +200,7 @@ def test_without_a_name_it_lists_the_scenarios(dddas):
     ("words", "line"),
     [
         (["nowhere"], "no scenario is named 'nowhere'; there are border100, border200"),
-        (["joining", "--set", "uav.altitud_m=3"], "unknown knob 'uav.altitud_m'; did you mean uav.altitude_m"),
+        (["joining", "--set", "uav.altitud_m=3"], "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
         (
             ["joining", "--set", "team.ugvs=3"],
             "scenario joining: team.ugvs = 3 will not do: a clip located by landmarks",

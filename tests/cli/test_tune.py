@@ -84,7 +84,7 @@ def test_every_step_is_recorded_and_its_losses_are_told_on_the_way(tuned) -> Non
     assert "step 10 of 10: loss" in tuned[1] and "watched" in tuned[1]
 
 
-def test_the_page_shows_the_knob_and_both_sets_of_clips(tuned) -> None:
+def test_the_page_shows_the_parameter_and_both_sets_of_clips(tuned) -> None:
     page = (tuned[0] / "report.html").read_text()
     assert THRESHOLD in page and "Clips tuned on" in page and "Clips held out" in page and "http" not in page
 
@@ -100,7 +100,7 @@ def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tune
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
-def test_a_pull_holds_the_knob_where_it_began(clips, tuned, tmp_path) -> None:
+def test_a_pull_holds_the_parameter_where_it_began(clips, tuned, tmp_path) -> None:
     result = asked(clips, *ASKED, "--clips", "one", "--pull", "100", "--out", str(tmp_path))
     assert result.exit_code == 0, result.output
     held, free = (json.loads((out / "run.json").read_text())["history"] for out in (tmp_path, tuned[0]))
@@ -186,10 +186,10 @@ def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed(cli
 
 def test_a_run_that_is_stopped_says_so_and_can_be_taken_up(clips, tmp_path) -> None:
     class Stopped(Bowl):
-        def loss(self, knobs, batch, softness):
+        def loss(self, parameters, batch, softness):
             if len(self.calls) > 9:
                 raise KeyboardInterrupt
-            return super().loss(knobs, batch, softness)
+            return super().loss(parameters, batch, softness)
 
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
@@ -212,10 +212,10 @@ def test_without_a_checkpoint_to_go_on_from_it_is_said_that_it_begins_anew(clips
 def test_an_unfinished_descent_is_kept_beside_the_new_one(clips, tmp_path) -> None:
     def stopped(after: int):
         class Stopped(Bowl):
-            def loss(self, knobs, batch, softness):
+            def loss(self, parameters, batch, softness):
                 if len(self.calls) > after:
                     raise KeyboardInterrupt
-                return super().loss(knobs, batch, softness)
+                return super().loss(parameters, batch, softness)
 
         return Stopped(place=math.log(6))
 
@@ -239,10 +239,10 @@ def test_an_unfinished_descent_that_was_set_aside_can_be_gone_on_with_at_its_own
     clips, tmp_path, monkeypatch
 ) -> None:
     class Stopped(Bowl):
-        def loss(self, knobs, batch, softness):
+        def loss(self, parameters, batch, softness):
             if len(self.calls) > 8:
                 raise KeyboardInterrupt
-            return super().loss(knobs, batch, softness)
+            return super().loss(parameters, batch, softness)
 
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
     monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: settings.difference.threshold)
@@ -279,7 +279,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
     ("words", "said"),
     [
         (("--knobs", "difference.absent"), "difference.threshold (0.1 to"),
-        (("--knobs", "registration.keypoints"), "is no knob that can be tuned"),
+        (("--knobs", "registration.keypoints"), "is no parameter that can be tuned"),
         (("--knobs", ""), "names no knob"),
         (("--knobs", f"{THRESHOLD},track.speed"), "several families"),
         (("--knobs", THRESHOLD, "--steps", "0"), "steps is 0"),

@@ -6,7 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import IntervalKnobs, LandmarkKnobs, Settings, SteeringKnobs, with_knobs
+from torchvision_dddas.config import (
+    IntervalParameters,
+    LandmarkParameters,
+    Settings,
+    SteeringParameters,
+    with_parameters,
+)
 from torchvision_dddas.control.rules import (
     SAMPLING,
     LandmarkUse,
@@ -27,10 +33,10 @@ from torchvision_dddas.control.rules import (
     spread_m2,
     steered,
 )
-from torchvision_dddas.types import Adjustment, Marks
+from torchvision_dddas.types import Adjustment, LandmarkObservations
 
-KNOBS = IntervalKnobs(minimum_frames=1, maximum_frames=12)
-BASE = with_knobs(
+KNOBS = IntervalParameters(minimum_frames=1, maximum_frames=12)
+BASE = with_parameters(
     Settings(),
     {
         "gates.min_area_px": 300,
@@ -83,7 +89,7 @@ def test_the_interval_is_rounded_and_bounded(wanted, interval):
 def test_a_change_is_recorded_with_its_cause_and_no_change_is_not():
     new, (record,) = adjusted(7, 3, 6.1, "altitude 90 m", KNOBS)
     assert new == 6
-    assert (record.frame, record.knob, record.old, record.new, record.cause) == (
+    assert (record.frame, record.parameter, record.old, record.new, record.cause) == (
         *(7, "interval.frames", 3, 6),
         "altitude 90 m",
     )
@@ -108,24 +114,24 @@ def test_the_expected_size_sets_the_smallest_area_between_its_bounds():
 def test_the_small_path_is_on_while_targets_are_expected_to_fit_its_boxes():
     assert regime_at(50.5, 10, BASE).settings.small.on
     assert not regime_at(49.5, 10, BASE).settings.small.on
-    off = with_knobs(BASE, {"small.on": False})
+    off = with_parameters(BASE, {"small.on": False})
     assert not regime_at(200.0, 10, off).settings.small.on
 
 
 def test_nothing_else_of_the_settings_changes_with_the_altitude():
     there = regime_at(90.0, 10, BASE).settings
     back = {"gates.min_area_px": BASE.gates.min_area_px, "small.on": BASE.small.on}
-    assert with_knobs(there, back) == BASE
+    assert with_parameters(there, back) == BASE
 
 
 def test_the_regime_moves_only_when_the_altitude_has_changed_by_a_fifth():
     regime, first = steered(1, Regime(BASE), 100.0, 10, BASE)
-    assert {record.knob for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
+    assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
     assert all("altitude 100.0 m" in record.cause for record in first)
     assert steered(2, regime, 119.0, 10, BASE) == (regime, ())
     higher, records = steered(3, regime, 121.0, 10, BASE)
     assert higher.altitude_m == 121.0
-    bound = next(r for r in records if r.knob == "gates.max_size_px")
+    bound = next(r for r in records if r.parameter == "gates.max_size_px")
     assert bound.new == pytest.approx(bound.old * 100 / 121)
     assert "was 100.0 m" in bound.cause
 
@@ -140,7 +146,7 @@ def test_where_telemetry_ends_the_bounds_in_metres_end_and_that_is_recorded():
 
 # Of how many frames one is looked at.
 
-EVERY = SteeringKnobs(sampling_share=0.5, maximum_every=6)
+EVERY = SteeringParameters(sampling_share=0.5, maximum_every=6)
 
 
 def test_of_so_many_frames_one_is_looked_at_as_a_share_of_the_interval_says():
@@ -166,7 +172,7 @@ def test_between_two_looks_no_target_moves_by_more_than_half_its_size():
 def test_the_sampling_is_rounded_and_bounded_and_its_change_recorded(wanted, every):
     new, made = sampled(5, 1, wanted, "altitude 50 m", EVERY)
     assert new == every
-    assert [(a.frame, a.knob, a.old, a.new, a.cause) for a in made] == (
+    assert [(a.frame, a.parameter, a.old, a.new, a.cause) for a in made] == (
         [] if every == 1 else [(5, "sampling.every", 1, every, "altitude 50 m")]
     )
 
@@ -182,18 +188,18 @@ def test_noise_about_the_middle_between_two_samplings_does_not_make_it_flutter()
 # The 4-or-more rule.
 
 SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
-SOURCE = LandmarkKnobs(rule="source", poor_speed_m_s=2.0)
+SOURCE = LandmarkParameters(rule="source", poor_speed_m_s=2.0)
 
 
 def marks_at(places, seen=None):
     image = np.array(places, float) * 20
     image[[k for k in range(len(places)) if seen is not None and k not in seen]] = np.nan
     n = len(places)
-    return Marks(np.arange(n), image, np.array(places, float), np.ones(n), np.ones(n), np.zeros(n))
+    return LandmarkObservations(np.arange(n), image, np.array(places, float), np.ones(n), np.ones(n), np.zeros(n))
 
 
 def test_every_landmark_in_view_is_used_by_default_and_no_other():
-    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkKnobs())
+    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkParameters())
     assert (rows.tolist(), use.landmark, record) == ([0, 1, 2, 4, 5], (0, 1, 2, 4, 5), ())
 
 
@@ -202,7 +208,7 @@ def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_
     assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
     rows, use, (more,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
     assert len(rows) == 6 and use.poor
-    assert (more.frame, more.knob, more.old, more.new) == (2, "landmarks.used", 4, 6)
+    assert (more.frame, more.parameter, more.old, more.new) == (2, "landmarks.used", 4, 6)
     assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
     _, use, (fewer,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
     assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
@@ -251,7 +257,7 @@ def test_landmarks_all_on_one_line_are_taken_as_far_apart_as_they_are():
 
 
 def test_gaps_are_closed_in_metres_where_that_is_asked_for_and_never_wider_than_in_pixels():
-    base = with_knobs(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
+    base = with_parameters(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
     closes = [regime_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
     assert closes == [base.morphology.close_px, 17, 4]
     plain = regime_at(200.0, 10.0, Settings())
@@ -259,14 +265,14 @@ def test_gaps_are_closed_in_metres_where_that_is_asked_for_and_never_wider_than_
 
 
 def test_from_look_to_look_a_walker_moves_far_enough_to_show():
-    knobs = Settings().steering
-    frames = every_least(554 / 200, 10.0, knobs)
-    assert frames / 10 * 1.4 * 554 / 200 == pytest.approx(knobs.least_move_px)
+    parameters = Settings().steering
+    frames = every_least(554 / 200, 10.0, parameters)
+    assert frames / 10 * 1.4 * 554 / 200 == pytest.approx(parameters.least_move_px)
 
 
 # -- a run that must keep up with a camera -----------------------------------------------------------------------------
 
-LIVE = with_knobs(
+LIVE = with_parameters(
     Settings(),
     {
         "registration.keypoints": 400,
@@ -313,7 +319,7 @@ def test_who_keeps_up_looks_at_everything():
 
 def test_too_long_a_look_is_shed_until_it_fits_and_no_further():
     now, moved, _ = driven(36, 200)
-    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 400, 200)]
+    assert [(a.parameter, a.old, a.new) for a in moved] == [("registration.keypoints", 400, 200)]
     assert "36 ms" in moved[0].cause
     assert "90%" in moved[0].cause
     assert now.rung == 1
@@ -323,7 +329,7 @@ def test_what_takes_far_too_long_is_shed_at_once_and_fits():
     now, moved = shed(1, Load(), 0.1, APART_S, 0.0, LIVE)
     rung = rungs(LIVE)[now.rung]
     assert (rung["registration.keypoints"], rung[SAMPLING]) == (100, 4)
-    assert {a.knob for a in moved} == {"registration.keypoints", SAMPLING}
+    assert {a.parameter for a in moved} == {"registration.keypoints", SAMPLING}
 
 
 def test_the_least_is_the_least_however_busy():
@@ -333,7 +339,7 @@ def test_the_least_is_the_least_however_busy():
 
 
 def test_pictures_that_miss_their_deadline_are_made_cheaper_but_none_is_left_out_for_it():
-    late = with_knobs(LIVE, {"live.deadline_ms": 20})
+    late = with_parameters(LIVE, {"live.deadline_ms": 20})
     now = Load()
     for k in range(20):
         now, _ = shed(k + 1, now, 0.025, APART_S, k * APART_S, late)
@@ -347,7 +353,7 @@ def test_more_is_looked_at_again_after_calm_s_with_time_to_spare_and_not_before(
     assert not moved
     calm, moved, _ = driven(15, 130, busy, end_s)
     assert calm.rung == 0
-    assert [(a.knob, a.old, a.new) for a in moved] == [("registration.keypoints", 200, 400)]
+    assert [(a.parameter, a.old, a.new) for a in moved] == [("registration.keypoints", 200, 400)]
 
 
 def test_a_moment_without_time_to_spare_starts_the_wait_anew():
@@ -378,10 +384,10 @@ def test_pictures_left_out_come_back_as_many_as_there_is_time_for():
     few = Load(rung=len(rungs(LIVE)) - 1)
     now, moved, _ = driven(25, 140, few)
     assert rungs(LIVE)[now.rung][SAMPLING] == 1
-    assert [(a.knob, a.old, a.new) for a in moved] == [(SAMPLING, 4, 1)]
+    assert [(a.parameter, a.old, a.new) for a in moved] == [(SAMPLING, 4, 1)]
 
 
 @pytest.mark.parametrize(("apart_s", "on"), [(0.0, True), (APART_S, False)])
 def test_nothing_is_shed_where_pictures_wait_or_it_is_turned_off(apart_s, on):
-    settings = with_knobs(LIVE, {"live.shed": on})
+    settings = with_parameters(LIVE, {"live.shed": on})
     assert shed(1, Load(), 10.0, apart_s, 0.0, settings) == (Load(), ())

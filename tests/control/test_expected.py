@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.control.expected_regions import expected_regions
 from torchvision_dddas.types import Camera
 
@@ -21,7 +21,7 @@ def regions(camera, *targets):
     place = np.array([stands + a * ahead + r * aside for a, r, _ in targets]).reshape(-1, 2)
     spread = np.tile(0.04 * np.eye(2), (len(targets), 1, 1))
     radius = np.array([radius for *_, radius in targets])
-    return expected_regions(place, spread, radius, camera, stands, HEADING, GroundKnobs())
+    return expected_regions(place, spread, radius, camera, stands, HEADING, GroundParameters())
 
 
 def box_of(camera, ahead, right, tall):

@@ -12,7 +12,7 @@ from torchvision_dddas.control.mission_api import Begun, Mission, mission_of
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.pipeline import survey
 from torchvision_dddas.simulation.source import SimulatorSource
-from torchvision_dddas.types import Command, Surveyed
+from torchvision_dddas.types import Command, FrameResult
 
 FROZEN = {"what": "frozen", "time_s": 2.0, "seconds": 0.5}
 DROPPED = {"what": "dropped", "time_s": 3.2, "seconds": 0.3}
@@ -25,7 +25,7 @@ class Flight:
 
     source: SimulatorSource
     mission: Mission
-    surveyed: list[Surveyed] = field(default_factory=list)
+    surveyed: list[FrameResult] = field(default_factory=list)
     steered: list[Command] = field(default_factory=list)
     noticed: list[tuple[int, str]] = field(default_factory=list)
     places: dict[int, np.ndarray] = field(default_factory=dict)  # true ones of the ground vehicles, by frame
@@ -56,8 +56,8 @@ def fly(overrides=(), seconds=6.0, **tables) -> Flight:
     source = Begun(simulated)
     mission = mission_of(source, settings, "onboard", scenario.clip.located_by == "landmarks")
     flown = Flight(simulated, mission, steered=steered)
-    vision = load_engine("onboard", mission.settings)
-    for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
+    engine = load_engine("onboard", mission.settings)
+    for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):
         flown.surveyed.append(surveyed)
         flown.noticed += [(notice.frame, notice.text) for notice in mission.notices()]
         for truth in simulated.truths():

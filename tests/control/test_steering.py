@@ -6,20 +6,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import Settings, SteeringKnobs
+from torchvision_dddas.config import Settings, SteeringParameters
 from torchvision_dddas.control.rules import best_spread, spread_m2
 from torchvision_dddas.control.steering_api import Steering
 from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.types import (
     Adjustment,
+    AerialLocations,
     Camera,
     CameraPose,
     Command,
-    Confirmed,
+    Confirmation,
     Fix,
     Flight,
-    Grounded,
-    Marks,
+    LandmarkObservations,
     Positions,
     Registration,
 )
@@ -34,8 +34,8 @@ def names(count: int) -> tuple[str, ...]:
     return tuple(f"ugv{k + 1}" for k in range(count))
 
 
-def with_steering(**knobs: object) -> Settings:
-    return Settings(steering=SteeringKnobs(**knobs))  # type: ignore[arg-type]
+def with_steering(**parameters: object) -> Settings:
+    return Settings(steering=SteeringParameters(**parameters))  # type: ignore[arg-type]
 
 
 def pose_at(place_m, altitude_m=50.0, pitch_deg=90.0, heading_rad=0.0) -> CameraPose:
@@ -44,7 +44,7 @@ def pose_at(place_m, altitude_m=50.0, pitch_deg=90.0, heading_rad=0.0) -> Camera
     return CameraPose(np.array([*place_m, 0.0]) - axes[:, 2] * altitude_m / -axes[2, 2], axes)
 
 
-def located(frame, places, velocities=None, targets=None, pose=None, size_m=3.0, rate_hz=RATE_HZ) -> Grounded:
+def located(frame, places, velocities=None, targets=None, pose=None, size_m=3.0, rate_hz=RATE_HZ) -> AerialLocations:
     """A located frame: what stands at places (N, 2), as large as size_m."""
     places = np.asarray(places, float).reshape(-1, 2)
     n, pose = len(places), pose or pose_at((0, 0))
@@ -55,25 +55,27 @@ def located(frame, places, velocities=None, targets=None, pose=None, size_m=3.0,
     covariance = np.tile(0.1 * np.eye(2), (n, 1, 1))
     positions = Positions(np.full(n, frame), target, places, covariance, np.ones(n))
     fix = Fix(frame, "pose", pose)
-    return Grounded(frame, (frame - 1) / rate_hz, positions, np.arange(n), covariance, velocity, boxes, fix, Marks())
+    return AerialLocations(
+        frame, (frame - 1) / rate_hz, positions, np.arange(n), covariance, velocity, boxes, fix, LandmarkObservations()
+    )
 
 
-def judged(frame, *kinds) -> Confirmed:
+def judged(frame, *kinds) -> Confirmation:
     """What ground vehicles say of targets in order: human, not_human or unseen, or a probability."""
     chance = {"human": 0.99, "not_human": 0.01, "unseen": 0.5}
     probability = np.array([chance.get(kind, kind) for kind in kinds], float)
     words = tuple(k if isinstance(k, str) else ("human" if k >= 0.5 else "not_human") for k in kinds)
     n = len(kinds)
     nothing = np.full(n, np.nan)
-    return Confirmed(
+    return Confirmation(
         *(frame, np.arange(n), words, probability, ((),) * n, np.zeros(n, np.int64), nothing, nothing, nothing)
     )
 
 
-def team_at(places) -> Marks:
+def team_at(places) -> LandmarkObservations:
     places = np.asarray(places, float).reshape(-1, 2)
     n = len(places)
-    return Marks(np.arange(n), np.full((n, 2), np.nan), places, np.ones(n), np.ones(n), np.zeros(n))
+    return LandmarkObservations(np.arange(n), np.full((n, 2), np.nan), places, np.ones(n), np.ones(n), np.zeros(n))
 
 
 def flown(pose: CameraPose, speed_m_s: float = 2.0) -> Flight:
@@ -114,7 +116,7 @@ class World:
     commands: list[Command] = field(default_factory=list)
     made: list[Adjustment] = field(default_factory=list)
     poses: list[CameraPose] = field(default_factory=list)
-    frames: list[Grounded] = field(default_factory=list)
+    frames: list[AerialLocations] = field(default_factory=list)
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(7))
     said: np.ndarray | None = None  # (V,) bool: which vehicles report
     silent: bool = False
@@ -179,9 +181,9 @@ def world(targets, velocity=None, team=SQUARE, settings=None, **more) -> World:
     return World(steering, targets, velocity, np.array(team, float), **more)
 
 
-def of(made: list[Adjustment], knob: str) -> list[Adjustment]:
-    """The adjustments of a knob."""
-    return [adjustment for adjustment in made if adjustment.knob == knob]
+def of(made: list[Adjustment], parameter: str) -> list[Adjustment]:
+    """The adjustments of a parameter."""
+    return [adjustment for adjustment in made if adjustment.parameter == parameter]
 
 
 # The aerial vehicle.
@@ -367,7 +369,7 @@ def test_a_vehicle_is_sent_to_what_nobody_can_see_from_the_ring_and_called_back_
     six = np.r_[SQUARE, [[0, 16], [0, -16]]]
     far = [[0, 0], [1, 0], [0, 1], [-70, -30]]
     w = world(far, team=six, kinds=("human", "human", "human", "unseen"), altitude_m=140.0).run(14)
-    sent = [change for change in w.made if change.knob.endswith(".sent_to")]
+    sent = [change for change in w.made if change.parameter.endswith(".sent_to")]
     assert [change.new for change in sent] == [4.0] and "nobody has seen it" in sent[0].cause
     apart = np.linalg.norm(w.team - w.targets[3], axis=1)
     w.run(10)
@@ -376,7 +378,7 @@ def test_a_vehicle_is_sent_to_what_nobody_can_see_from_the_ring_and_called_back_
     assert w.inside(w.team).sum() >= 4
     w.kinds = ("human",) * 4
     w.run(3)
-    assert [change.new for change in w.made if change.knob.endswith(".sent_to")] == [4.0, 0.0]
+    assert [change.new for change in w.made if change.parameter.endswith(".sent_to")] == [4.0, 0.0]
 
 
 def test_pictures_are_taken_in_turn_often_of_what_is_unsure_and_seldom_of_what_is_sure():
@@ -473,8 +475,8 @@ def test_a_detector_that_misses_now_and_then_does_not_make_the_sampling_flutter(
 
 
 def test_each_part_can_be_left_as_planned():
-    def after(**knobs):
-        w = world([[0, 5]], [[1.4, 0]], kinds=("unseen",), settings=with_steering(**knobs)).run(8)
+    def after(**parameters):
+        w = world([[0, 5]], [[1.4, 0]], kinds=("unseen",), settings=with_steering(**parameters)).run(8)
         return w.commands[-1], w.made
 
     command, made = after(on=False)

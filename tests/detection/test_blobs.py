@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import MorphologyKnobs
+from torchvision_dddas.config import MorphologyParameters
 from torchvision_dddas.detection.blobs import filled_hull, find_blobs, weak_blobs
 
 SIZE = (101, 67)
@@ -86,13 +86,13 @@ def test_a_region_in_another_ones_box_but_outside_its_hull_is_kept(painted):
 def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted):
     wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
     strong = found(painted(SIZE, (5, 6, 10, 10)))
-    (weak,) = weak_blobs(wide, strong, 10, MorphologyKnobs(erode_px=1, close_px=1), 1, 0)
+    (weak,) = weak_blobs(wide, strong, 10, MorphologyParameters(erode_px=1, close_px=1), 1, 0)
     assert weak.weak and weak.box == (50, 30, 20, 20)
     assert not strong[0].weak
 
 
 def test_without_wide_evidence_there_are_no_weak_blobs(painted):
-    assert weak_blobs(painted(SIZE), [], 10, MorphologyKnobs(), 1, 0) == []
+    assert weak_blobs(painted(SIZE), [], 10, MorphologyParameters(), 1, 0) == []
 
 
 @pytest.mark.parametrize("hull", [False, True])

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas import config as knobs
+from torchvision_dddas import config as parameters
 from torchvision_dddas.detection.engine import View, Window, load_engine
 from torchvision_dddas.detection.exposure import exposure, in_one_light, to_light_of
 from torchvision_dddas.geometry import corner_error
@@ -22,7 +22,7 @@ def lit(grey: np.ndarray, gain: float, offset: float = 0.0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def greys() -> list[np.ndarray]:
-    onboard = load_engine("onboard", knobs.load_config())
+    onboard = load_engine("onboard", parameters.load_config())
     return [onboard.prepare(image).grey for image in render(3, 6, SIZE).images]
 
 
@@ -91,7 +91,7 @@ def test_a_jumping_gain_does_not_move_the_registration(backend, config) -> None:
         pytest.importorskip("torch")
     steps = []
     for gain in (None, GAIN):
-        engine = load_engine(backend, knobs.load_config(config))
+        engine = load_engine(backend, parameters.load_config(config))
         views = [engine.prepare(image) for image in render(3, 6, SIZE, gain).images]
         # One pair a call, as in a stream: what is carried from step to step must bear the jump too.
         steps.append([engine.register([pair])[0] for pair in pairwise(views)])
@@ -107,7 +107,7 @@ def test_what_both_neighbours_cut_off_at_white_does_not_move(backend) -> None:
     pattern = np.random.default_rng(0).integers(40, 200, (240, 320)).astype(np.float32)
     still = cv2.GaussianBlur(pattern, (0, 0), 3) - 90 + np.linspace(0, 150, 320)
     still[80:160, 100:220] = np.linspace(205, 250, 120)
-    engine = load_engine(backend, knobs.load_config())
+    engine = load_engine(backend, parameters.load_config())
     views = [engine.prepare(lit(still, gain)) for gain in (1.2, 1.0, 1.2)]
     assert (views[0].grey == 255).mean() > 0.05
     asked = Window(views[1], (views[0], views[2]), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import GateKnobs
+from torchvision_dddas.config import GateParameters
 from torchvision_dddas.detection.gates import Gates, gates_at, pixels_per_metre
 
-KNOBS = GateKnobs(min_size_m=0.5, max_size_m=10.0, max_speed_m_s=30.0, focal_px=800.0)
+KNOBS = GateParameters(min_size_m=0.5, max_size_m=10.0, max_speed_m_s=30.0, focal_px=800.0)
 
 
 def test_bounds_are_metric_bounds_times_focal_over_altitude():

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import HistoryKnobs
+from torchvision_dddas.config import HistoryParameters
 from torchvision_dddas.detection.blobs import find_blobs
 from torchvision_dddas.detection.motion_history import MotionHistory
 from torchvision_dddas.detection.motion_segmentation import moving_parts, regions
 
 SIZE = (161, 121)
-KNOBS = HistoryKnobs()
+KNOBS = HistoryParameters()
 
 
 def film(painted, *movers, frames=6, step=None):

@@ -11,7 +11,7 @@ from torchvision_dddas.detection import opencv_foreground as onboard_pixels
 from torchvision_dddas.detection import opencv_registration as onboard_registration
 from torchvision_dddas.detection.keypoint_grid import cell_side
 from torchvision_dddas.detection.mask_cleaning import closed
-from torchvision_dddas.detection.opencv_engine import OnboardVision
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.geometry import corner_error, transfer
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import render
@@ -129,25 +129,25 @@ def test_the_median_over_a_mask_is_numpys_where_it_exceeds_the_least(seed: int) 
 
 
 def test_keypoints_are_the_best_pixel_of_every_cell(images: list[np.ndarray]) -> None:
-    knobs, grey = load_config().registration, cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY)
-    corner, cell = cv2.cornerMinEigenVal(grey, knobs.block_px, ksize=3), 16
+    parameters, grey = load_config().registration, cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY)
+    corner, cell = cv2.cornerMinEigenVal(grey, parameters.block_px, ksize=3), 16
     wanted = set()
     for top in range(0, 240, cell):
         for left in range(0, 320, cell):
             part = corner[top : top + cell, left : left + cell]
             row, column = np.unravel_index(part.argmax(), part.shape)
-            if part.max() > knobs.quality * corner.max():
+            if part.max() > parameters.quality * corner.max():
                 wanted.add((left + int(column), top + int(row)))
-    found = onboard_registration.keypoints(grey, knobs)
-    assert cell_side(320, 240, knobs) == cell
+    found = onboard_registration.keypoints(grey, parameters)
+    assert cell_side(320, 240, parameters) == cell
     assert {(int(u), int(v)) for u, v in found} == wanted
 
 
 @pytest.mark.parametrize("config", [None, "fast"])
 def test_registrations_follow_the_ground(images: list[np.ndarray], truth: list[np.ndarray], config: str | None) -> None:
-    vision = OnboardVision(load_config(config))
-    views = [vision.prepare(image) for image in images]
-    steps = vision.register(list(pairwise(views)))
+    engine = OpenCVEngine(load_config(config))
+    views = [engine.prepare(image) for image in images]
+    steps = engine.register(list(pairwise(views)))
     assert all(step.reliable for step in steps)
     off = [corner_error(step.later_from_earlier, true, SIZE) for step, true in zip(steps, truth, strict=True)]
     assert np.median(off) < 0.5 and max(off) < 1.5
@@ -163,34 +163,34 @@ def test_carried_keypoints_are_detected_anew_every_so_many_frames(
         return detect(grey, *rest, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(onboard_registration, "keypoints", counted)
-    vision = OnboardVision(load_config("fast"))
-    views = [vision.prepare(image) for image in images]
+    engine = OpenCVEngine(load_config("fast"))
+    views = [engine.prepare(image) for image in images]
     for at, pair in enumerate(pairwise(views)):
-        vision.register([pair])
+        engine.register([pair])
         if at == 4:
             assert len(detections) == 1
     assert len(detections) == 3  # at steps 0, 5 and 10 of 13
 
 
 def test_what_is_carried_goes_on_and_leaves_nothing_behind(images: list[np.ndarray]) -> None:
-    vision = OnboardVision(load_config("fast"))
-    views = [vision.prepare(image) for image in images[:5]]
+    engine = OpenCVEngine(load_config("fast"))
+    views = [engine.prepare(image) for image in images[:5]]
     for pair in pairwise(views):
-        vision.register([pair])
+        engine.register([pair])
     assert ["carried" in view.kept for view in views] == [False] * 4 + [True]
 
 
 def test_a_jump_that_no_prediction_foresees_is_found_by_the_deep_search(images: list[np.ndarray]) -> None:
-    vision = OnboardVision(load_config("fast"))
+    engine = OpenCVEngine(load_config("fast"))
     big = textured((480, 360), 5)
-    views = [vision.prepare(big[40:280, 40 + x : 360 + x].copy()) for x in (0, 1, 2, 3, 33)]
-    steps = [vision.register([pair])[0] for pair in pairwise(views)]
+    views = [engine.prepare(big[40:280, 40 + x : 360 + x].copy()) for x in (0, 1, 2, 3, 33)]
+    steps = [engine.register([pair])[0] for pair in pairwise(views)]
     assert steps[-1].reliable
     assert corner_error(steps[-1].later_from_earlier, np.array([[1, 0, -30], [0, 1, 0], [0, 0, 1.0]]), SIZE) < 0.1
 
 
 def test_a_cut_carries_nothing_on(images: list[np.ndarray]) -> None:
-    vision = OnboardVision(load_config("fast"))
-    views = [vision.prepare(image) for image in (images[0], images[1], textured(seed=9))]
-    steps = [vision.register([pair])[0] for pair in pairwise(views)]
+    engine = OpenCVEngine(load_config("fast"))
+    views = [engine.prepare(image) for image in (images[0], images[1], textured(seed=9))]
+    steps = [engine.register([pair])[0] for pair in pairwise(views)]
     assert steps[0].reliable and not steps[1].reliable and "carried" not in views[2].kept

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection import opencv_engine as onboard_vision
 from torchvision_dddas.detection import opencv_half as onboard_half
 from torchvision_dddas.detection.detector import scenes
 from torchvision_dddas.detection.engine import Foreground, View
-from torchvision_dddas.detection.opencv_engine import OnboardVision
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.geometry import corner_error
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import render
@@ -52,13 +52,13 @@ def test_the_half_picture_is_made_once() -> None:
 def test_registration_at_half_the_size_has_the_whole_pictures_pixels(images: list[np.ndarray]) -> None:
     ground = [view.image_from_ground for view in flight(1, 10, SIZE)]
     truth = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
-    vision = OnboardVision(load_config("half", ["registration.keypoints=300"]))
-    views = [vision.prepare(image) for image in images]
-    steps = [vision.register([pair])[0] for pair in pairwise(views)]
+    engine = OpenCVEngine(load_config("half", ["registration.keypoints=300"]))
+    views = [engine.prepare(image) for image in images]
+    steps = [engine.register([pair])[0] for pair in pairwise(views)]
     assert all(step.reliable for step in steps)
     off = [corner_error(step.later_from_earlier, true, SIZE) for step, true in zip(steps, truth, strict=True)]
     assert np.median(off) < 0.5
-    flow = [step.flow_px for step in OnboardVision(load_config("fast")).register(list(pairwise(views)))]
+    flow = [step.flow_px for step in OpenCVEngine(load_config("fast")).register(list(pairwise(views)))]
     assert np.allclose([step.flow_px for step in steps], flow, atol=0.3)
 
 
@@ -66,7 +66,7 @@ def test_targets_found_at_half_the_size_lie_where_those_of_the_whole_size_do(ima
     def masks(config: str) -> list[np.ndarray]:
         settings = load_config(config, ["gates.min_area_px=60"])
         frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
-        return [scene.mask > 0 for scene in scenes(frames, OnboardVision(settings), settings)]
+        return [scene.mask > 0 for scene in scenes(frames, OpenCVEngine(settings), settings)]
 
     both = [(a, b) for a, b in zip(masks("fast"), masks("half"), strict=True) if a.any() and b.any()]
     assert len(both) >= 5
@@ -75,9 +75,9 @@ def test_targets_found_at_half_the_size_lie_where_those_of_the_whole_size_do(ima
 
 @pytest.mark.parametrize("size", [(161, 121), SIZE])
 def test_every_kind_of_difference_and_refinement_can_be_halved(size: tuple[int, int]) -> None:
-    settings = with_knobs(load_config(), {"difference.halved": True, "registration.halved": True})
+    settings = with_parameters(load_config(), {"difference.halved": True, "registration.halved": True})
     frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(render(seed=2, frames=6, size=size).images))
-    found = list(scenes(frames, OnboardVision(settings), settings))
+    found = list(scenes(frames, OpenCVEngine(settings), settings))
     assert len(found) == 6 and all(scene.mask.shape == size[::-1] for scene in found)
 
 
@@ -88,7 +88,7 @@ def test_a_chain_that_only_looks_for_blobs_keeps_half_maps_and_finds_what_whole_
 
     def found() -> list[np.ndarray]:
         frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
-        return [scene.mask for scene in scenes(frames, OnboardVision(settings), settings)]
+        return [scene.mask for scene in scenes(frames, OpenCVEngine(settings), settings)]
 
     scales = []
 

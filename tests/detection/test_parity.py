@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("torch")
 
-from torchvision_dddas import config as knobs
-from torchvision_dddas.detection.engine import View, Vision, Window, load_engine
+from torchvision_dddas import config as parameters
+from torchvision_dddas.detection.engine import Engine, View, Window, load_engine
 from torchvision_dddas.geometry import chain, corner_error
 from torchvision_dddas.simulation.camera import flight
 from torchvision_dddas.simulation.scene import RATE_HZ, render
@@ -33,12 +33,12 @@ def film(size: tuple[int, int], light_jumps: bool) -> list[np.ndarray]:
 
 
 @pytest.fixture(params=CONFIGS, ids=IDS)
-def engines(request) -> tuple[Vision, Vision]:
-    settings = knobs.load_config(None, request.param)
+def engines(request) -> tuple[Engine, Engine]:
+    settings = parameters.load_config(None, request.param)
     return load_engine("onboard", settings), load_engine("torch", settings)
 
 
-def seen_by(engine: Vision, images: list[np.ndarray]) -> tuple[list[View], list[np.ndarray]]:
+def seen_by(engine: Engine, images: list[np.ndarray]) -> tuple[list[View], list[np.ndarray]]:
     """Views and the registrations of successive frames, all of them trusted."""
     views = [engine.prepare(image) for image in images]
     steps = engine.register(list(pairwise(views)))
@@ -105,7 +105,7 @@ def test_on_the_same_registrations_only_ties_of_rounding_differ_even_where_the_l
 
 
 def test_plain_differences_show_the_same_in_both_engines_whether_or_not_the_light_jumps() -> None:
-    size, settings = SIZES[0], knobs.load_config("fast")
+    size, settings = SIZES[0], parameters.load_config("fast")
     ground = [view.image_from_ground for view in flight(1, FRAMES, size, RATE_HZ)]
     steps = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
     found = {}

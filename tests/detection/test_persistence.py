@@ -1,11 +1,11 @@
-"""Blobs that stay are targets, blobs that flicker are not. Knobs are given: a new default changes nothing here."""
+"""Blobs that stay are targets, blobs that flicker are not. Parameters are given: a new default changes nothing here."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import PersistenceKnobs
+from torchvision_dddas.config import PersistenceParameters
 from torchvision_dddas.detection.blob_motion import Motion
 from torchvision_dddas.detection.blobs import Blob
 from torchvision_dddas.detection.persistence import Sighting, persistent
@@ -13,7 +13,7 @@ from torchvision_dddas.detection.persistence import Sighting, persistent
 SIZE = (640, 480)
 NOTHING = np.zeros((3, 2))
 # The flow test for every blob, however few there are.
-STRICT = PersistenceKnobs(flow_share=0.4, sure_share=0.7, links=3, passes=2, large_share=0.02, trusted_blobs=0)
+STRICT = PersistenceParameters(flow_share=0.4, sure_share=0.7, links=3, passes=2, large_share=0.02, trusted_blobs=0)
 
 
 def motion(velocity=(4.0, 0.0), steady=0.5) -> Motion:
@@ -36,11 +36,11 @@ def sightings(box_blob):
     return make
 
 
-def verdict(frames, index=2, knobs=STRICT) -> bool:
+def verdict(frames, index=2, parameters=STRICT) -> bool:
     """Of the first blob of a frame; a second one far off in every frame is there so that blobs come in crowds."""
     off = Blob((500, 400, 9, 9), np.ones((9, 9), bool), np.ones((9, 9), bool), 1.0)
     crowds = [Sighting([*f.blobs, off], [*f.motions, motion()], f.next_from_this) for f in frames]
-    return persistent(crowds, index, SIZE, knobs)[0]
+    return persistent(crowds, index, SIZE, parameters)[0]
 
 
 def test_a_blob_seen_all_along_and_moving_steadily_is_a_target(sightings):
@@ -82,8 +82,8 @@ def test_a_large_blob_is_believed_without_steady_flow(sightings):
 
 def test_where_few_blobs_are_seen_one_link_does_for_a_small_one(sightings):
     few = STRICT.model_copy(update={"trusted_blobs": 4})
-    assert verdict(sightings(there=(0, 0, 1, 1, 0), steady=0.0), knobs=few)
-    assert not verdict(sightings(there=(0, 0, 1, 0, 0), steady=0.0), knobs=few)
+    assert verdict(sightings(there=(0, 0, 1, 1, 0), steady=0.0), parameters=few)
+    assert not verdict(sightings(there=(0, 0, 1, 0, 0), steady=0.0), parameters=few)
 
 
 def test_a_blob_that_jumps_elsewhere_is_not_the_same(box_blob):

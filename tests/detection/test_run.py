@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import Loop, run, scenes
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.detection.windows import delay, reach
@@ -191,7 +191,7 @@ def test_grey_frames_give_masks_like_colour_ones(noise):
 
 @pytest.mark.parametrize("gain", [0.85, 1.15])
 def test_an_exposure_that_jumps_costs_at_most_a_twentieth_of_f(gain, film):
-    settings = with_knobs(load_config(), {"gates.min_area_px": 40})  # the people of so small a film
+    settings = with_parameters(load_config(), {"gates.min_area_px": 40})  # the people of so small a film
     calm = f_measure(detect(frames_of(film.images), settings), film.masks)
     gains = [gain if k % 4 >= 2 else 1.0 for k in range(16)]
     jumpy = [
@@ -296,13 +296,13 @@ def test_telemetry_of_another_time_is_refused_naming_both_spans(count, from_s, t
 
 def test_telemetry_of_a_part_of_the_clip_is_taken_for_that_part(film):
     settings = load_config("fast")
-    vision = load_engine("onboard", settings)
-    told = list(run(Film(film.images, 16), vision, settings, flight([0.9, 1.0])))
+    engine = load_engine("onboard", settings)
+    told = list(run(Film(film.images, 16), engine, settings, flight([0.9, 1.0])))
     assert len(told) == 16
 
 
 def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
-    settings = with_knobs(
+    settings = with_parameters(
         load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
     )
     altitude = np.where(np.arange(16) < 8, 60.0, 100.0)
@@ -310,36 +310,36 @@ def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
         run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
     )
     assert [s.interval_frames for s in told] == [3] * 8 + [5] * 8
-    (moved,) = [a for s in told for a in s.adjustments if a.knob == "interval.frames"]
+    (moved,) = [a for s in told for a in s.adjustments if a.parameter == "interval.frames"]
     assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
     assert "altitude 100.0 m" in moved.cause
-    gates = [a for s in told for a in s.adjustments if a.knob == "gates.max_size_px"]
+    gates = [a for s in told for a in s.adjustments if a.parameter == "gates.max_size_px"]
     assert [a.frame for a in gates] == [1, 9]
 
 
 @pytest.mark.parametrize(("altitude_m", "speed_m_s"), [(np.nan, 5.0), (60.0, np.nan), (np.nan, np.nan)])
 def test_where_telemetry_lacks_altitude_or_speed_the_interval_follows_the_flow(altitude_m, speed_m_s, film):
-    settings = with_knobs(load_config("fast"), {"interval.minimum_frames": 3, "interval.maximum_frames": 9})
-    vision = load_engine("onboard", settings)
+    settings = with_parameters(load_config("fast"), {"interval.minimum_frames": 3, "interval.maximum_frames": 9})
+    engine = load_engine("onboard", settings)
     time_s = np.arange(16) / 10
     silent = Telemetry(time_s, np.full(16, altitude_m), np.full(16, speed_m_s))
-    told = list(run(Film(film.images), vision, settings, silent))
-    alone = list(run(Film(film.images), vision, settings))
+    told = list(run(Film(film.images), engine, settings, silent))
+    alone = list(run(Film(film.images), engine, settings))
     assert [s.interval_frames for s in told] == [s.interval_frames for s in alone]
-    causes = {a.cause for s in told for a in s.adjustments if a.knob == "interval.frames"}
+    causes = {a.cause for s in told for a in s.adjustments if a.parameter == "interval.frames"}
     assert all("background flow" in cause for cause in causes)
-    assert any(a.knob.startswith("gates.") for s in told for a in s.adjustments) == np.isfinite(altitude_m)
+    assert any(a.parameter.startswith("gates.") for s in told for a in s.adjustments) == np.isfinite(altitude_m)
 
 
 def test_telemetry_that_falls_silent_in_flight_gives_the_steering_back_to_the_flow(film):
-    settings = with_knobs(
+    settings = with_parameters(
         load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
     )
     altitude = np.where(np.arange(16) < 8, 100.0, np.nan)
     told = list(
         run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
     )
-    first = next(a for s in told for a in s.adjustments if a.knob == "interval.frames")
+    first = next(a for s in told for a in s.adjustments if a.parameter == "interval.frames")
     assert "altitude 100.0 m" in first.cause
     after = [a.cause for s in told[8:] for a in s.adjustments]
     assert after and not any("altitude" in cause or "nan" in cause for cause in after)
@@ -349,10 +349,10 @@ def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left
     images = pan(noise, 12, car=5.0)
     base = {"gates.focal_px": 1000.0, "gates.min_size_m": 0.2, "gates.max_size_m": 25.0, "gates.max_speed_m_s": 60.0}
 
-    def count(**knobs: float) -> int:
-        settings = with_knobs(load_config("fast"), base | {f"gates.{k}": v for k, v in knobs.items()})
-        vision = load_engine("onboard", settings)
-        told = run(Film(images), vision, settings, flight([0, 1.1], altitude_m=100.0))
+    def count(**parameters: float) -> int:
+        settings = with_parameters(load_config("fast"), base | {f"gates.{k}": v for k, v in parameters.items()})
+        engine = load_engine("onboard", settings)
+        told = run(Film(images), engine, settings, flight([0, 1.1], altitude_m=100.0))
         return sum(len(s.detections) for s in told)
 
     seen = count()
@@ -371,15 +371,15 @@ def test_no_altitude_however_odd_breaks_a_run(config, film):
 
 def test_scenes_of_frames_at_hand_are_those_of_a_run(film):
     settings = load_config("fast")
-    vision = load_engine("onboard", settings)
-    at_hand = list(scenes(frames_of(film.images), vision, settings, RATE_HZ))
-    assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), vision, settings), strict=True))
+    engine = load_engine("onboard", settings)
+    at_hand = list(scenes(frames_of(film.images), engine, settings, RATE_HZ))
+    assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), engine, settings), strict=True))
 
 
 @pytest.mark.parametrize("config", [None, "fast"])
 def test_what_no_window_looks_at_again_is_let_go(config, film):
     """No more colour pictures are held than a window spans, however long the clip; a settled frame's is not."""
-    settings = with_knobs(load_config(config), {"interval.rule": False})
+    settings = with_parameters(load_config(config), {"interval.rule": False})
     loop, there_and_back = Loop(load_engine("onboard", settings), settings, RATE_HZ), [*film.images, *film.images[::-1]]
     held = []
     for frame in frames_of(there_and_back * 2):
@@ -389,9 +389,9 @@ def test_what_no_window_looks_at_again_is_let_go(config, film):
         colours -= {id(slot.view.grey) for slot in loop.slots}
         held.append((len(loop.slots), len(colours)))
     assert max(held) == max(held[-10:])
-    knobs = settings.difference
+    parameters = settings.difference
     ahead = reach(settings.interval.frames, settings) + delay(settings.interval.frames, settings)
-    assert max(colours for _, colours in held) <= knobs.wide_frames + ahead + 1
+    assert max(colours for _, colours in held) <= parameters.wide_frames + ahead + 1
 
 
 def test_a_run_loads_neither_scipy_nor_torch():

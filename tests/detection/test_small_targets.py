@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import SmallKnobs
+from torchvision_dddas.config import SmallParameters
 from torchvision_dddas.detection.small_targets import SmallTracks, candidates
 
-KNOBS = SmallKnobs()
+KNOBS = SmallParameters()
 
 
-def follow(place, frames=30, camera=(0.0, 0.0), size=(10, 6), knobs=KNOBS, seen=lambda k: True):
+def follow(place, frames=30, camera=(0.0, 0.0), size=(10, 6), parameters=KNOBS, seen=lambda k: True):
     """Tracks of one candidate whose ground position is place(k), under a camera that shifts the picture."""
-    tracks = SmallTracks(knobs)
+    tracks = SmallTracks(parameters)
     shift = np.array([[1, 0, camera[0]], [0, 1, camera[1]], [0, 0, 1.0]])
     for k in range(frames):
         u, v = np.array(place(k)) + np.array(camera) * k
@@ -76,4 +76,4 @@ def test_candidates_are_gated_by_area_and_box(painted):
 @pytest.mark.parametrize(("most", "count"), [(12, 12), (11, 0)])
 def test_too_many_candidates_are_none(most, count, painted):
     mask = painted((200, 40), *((16 * k + 2, 10, 5, 5) for k in range(12)))
-    assert len(candidates(mask, SmallKnobs(max_candidates=most))) == count
+    assert len(candidates(mask, SmallParameters(max_candidates=most))) == count

@@ -7,13 +7,13 @@ import pytest
 
 pytest.importorskip("torch")
 
-from torchvision_dddas import config as knobs
+from torchvision_dddas import config as parameters
 from torchvision_dddas.detection.engine import View, Window
-from torchvision_dddas.detection.torch_engine import TorchVision
+from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.geometry import corner_error
 from torchvision_dddas.simulation.scene import render
 
-SETTINGS = knobs.load_config()
+SETTINGS = parameters.load_config()
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +22,8 @@ def images() -> list[np.ndarray]:
 
 
 @pytest.fixture
-def engine() -> TorchVision:
-    return TorchVision(SETTINGS, device="cpu")
+def engine() -> TorchEngine:
+    return TorchEngine(SETTINGS, device="cpu")
 
 
 def around(views: list[View], at: int) -> Window:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection import windows
 
 SHIPPED = {name: load_config(name) for name in ("source", "fast")} | {"default": load_config()}
@@ -61,7 +61,7 @@ def test_the_source_looks_at_one_and_two_intervals_ahead_and_back_at_the_end():
 
 
 def test_small_targets_are_looked_for_only_over_long_intervals_and_where_they_are_switched_on():
-    settings = with_knobs(load_config(), {"small.from_interval": 3, "small.gap_frames": 3})
+    settings = with_parameters(load_config(), {"small.from_interval": 3, "small.gap_frames": 3})
     assert windows.pairs(20, 2, 0, 40, settings)[2] is None
     assert windows.pairs(20, 3, 0, 40, settings)[2] == (17, 23)
-    assert windows.pairs(20, 3, 0, 40, with_knobs(settings, {"small.on": False}))[2] is None
+    assert windows.pairs(20, 3, 0, 40, with_parameters(settings, {"small.on": False}))[2] is None

@@ -15,15 +15,15 @@ import onnx
 import onnxruntime
 import torch
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import manifest
 from torchvision_dddas.export import people_graphs as people
 from torchvision_dddas.export.checked import refuse_wrong
 from torchvision_dddas.functional import hog
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import OnboardRecognizer
-from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.people.onnx_scorer import OnnxScorer
+from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import LinearSvm, Part
 
@@ -108,14 +108,14 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
         "window_width_px": 32,
         "window_height_px": 64,
     }
-    manifest.write(tmp_path / "own", people.made(PeopleKnobs(**changed)))
-    knobs = PeopleKnobs(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
+    manifest.write(tmp_path / "own", people.made(PeopleParameters(**changed)))
+    parameters = PeopleParameters(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
     image = np.random.default_rng(1).integers(0, 256, (80, 70, 3), np.uint8)
     weights = np.random.default_rng(2).normal(0, 0.05, math.prod((7, 15, 4, 9))).astype(np.float32)
     svm = LinearSvm(weights, 0.1, "made up")
     part = Part((70, 80), 0, 0, 70, 80)
-    ((onboard,),) = OnboardRecognizer(knobs, svm).scores([image], [[part]])
-    ((torch_scores,),) = load_recognizer("torch", knobs, svm).scores([image], [[part]])
+    ((onboard,),) = OnnxScorer(parameters, svm).scores([image], [[part]])
+    ((torch_scores,),) = load_scorer("torch", parameters, svm).scores([image], [[part]])
     assert onboard.shape == (3, 7)
     np.testing.assert_allclose(onboard, torch_scores, atol=3e-5)
 
@@ -126,4 +126,4 @@ def test_graphs_that_are_off_are_refused(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(people, "graphs", lambda _: made)
     with pytest.raises(InputError, match=r"people.onnx does not agree with ops.hog: .* score where 5e-05"):
-        refuse_wrong(people.made(PeopleKnobs()))
+        refuse_wrong(people.made(PeopleParameters()))

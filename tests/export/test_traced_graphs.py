@@ -17,7 +17,7 @@ import onnx
 import onnxruntime
 import torch
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import traced_graphs as traced
 from torchvision_dddas.export.checked import Made
@@ -60,7 +60,7 @@ def test_the_graph_computes_what_torch_does_on_pictures_it_was_not_traced_with(m
 
 
 def test_the_whole_step_computes_what_torch_does_on_pictures_it_was_not_traced_with(fast):
-    settings = with_knobs(fast, LEAST)
+    settings = with_parameters(fast, LEAST)
     (made,) = traced.made("step", settings, STEP_SIZE).values()
     assert all(check.passed for check in made.checks)
     graph = traced.module("step", settings, STEP_SIZE)
@@ -108,7 +108,7 @@ def test_nothing_of_the_machine_is_in_the_file(made):
 
 def test_a_graph_that_computes_something_else_does_not_pass(made, fast):
     assert all(check.passed for check in made.checks)
-    other = traced.module("warp_difference", with_knobs(fast, {"morphology.erode_px": 1}), SIZE)
+    other = traced.module("warp_difference", with_parameters(fast, {"morphology.erode_px": 1}), SIZE)
     examples = [traced.example("warp_difference", fast, SIZE, 0)]
     assert not all(check.passed for check in traced.compared(made.content, other, "warp_difference", examples))
 
@@ -128,7 +128,7 @@ def test_a_picture_too_small_for_keypoints_is_refused(fast):
 @pytest.mark.parametrize("model", ["homography", "affine"])
 def test_the_step_finds_the_motion_of_the_background_and_what_moves_on_it(fast, model):
     """As torch runs it, before it is traced."""
-    settings, size = with_knobs(fast, {"registration.model": model}), (320, 240)
+    settings, size = with_parameters(fast, {"registration.model": model}), (320, 240)
     given = traced.example("step", settings, size, 0)
     known = traced.example("warp_difference", settings, size, 0)["neighbour_from_reference"].numpy()
     with torch.inference_mode():

@@ -10,16 +10,16 @@ pytest.importorskip("sklearn")
 pytest.importorskip("torch")
 
 from export import train_people as script
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import classifier_of, recognizer_of
 from torchvision_dddas.people.pyramid import everywhere, windows
-from torchvision_dddas.people.scorer import load_recognizer
+from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.types import LinearSvm, Part
 
-SMALL = PeopleKnobs(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
+SMALL = PeopleParameters(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
 SET = [
     "--set",
     "people.window_width_px=32",
@@ -85,15 +85,17 @@ def trained(folders):
 
 def test_what_was_trained_finds_people_again_in_other_pictures(trained):
     rng = np.random.default_rng(99)
-    knobs = SMALL.model_copy(update={"classifier": str(trained)})
-    recognizer = recognizer_of(knobs, "torch")
+    parameters = SMALL.model_copy(update={"classifier": str(trained)})
+    recognizer = recognizer_of(parameters, "torch")
     right = 0
     for _ in range(10):
         image = background(rng, (160, 120))
         x, height = int(rng.integers(30, 130)), int(rng.integers(50, 70))
         stick(image, (x, 100), height, rng)
-        parts = everywhere((160, 120), knobs)
-        found = people_of(*windows(parts, recognizer.scores([image], [parts])[0], (160, 120), knobs), (160, 120), knobs)
+        parts = everywhere((160, 120), parameters)
+        found = people_of(
+            *windows(parts, recognizer.scores([image], [parts])[0], (160, 120), parameters), (160, 120), parameters
+        )
         if len(found):
             u, v = found.feet_px[0]
             right += abs(u - x) < 12 and abs(v - 100) < 16
@@ -102,10 +104,10 @@ def test_what_was_trained_finds_people_again_in_other_pictures(trained):
 
 def test_hard_negatives_push_the_background_below_zero(trained):
     rng = np.random.default_rng(7)
-    knobs = SMALL.model_copy(update={"classifier": str(trained)})
-    recognizer = recognizer_of(knobs, "torch")
+    parameters = SMALL.model_copy(update={"classifier": str(trained)})
+    recognizer = recognizer_of(parameters, "torch")
     image = background(rng, (320, 240))
-    parts = everywhere((320, 240), knobs)
+    parts = everywhere((320, 240), parameters)
     scores = np.concatenate([m.ravel() for m in recognizer.scores([image], [parts])[0]])
     assert (scores > 0).mean() < 0.02
 
@@ -130,33 +132,33 @@ def test_the_same_pictures_and_seed_give_the_same_numbers_as_text_too(folders, t
 
 def test_the_file_tells_its_layout(trained):
     with pytest.raises(InputError, match=r"window of 32 x 64, the settings say 64 x 128"):
-        classifier_of(PeopleKnobs(classifier=str(trained)))
+        classifier_of(PeopleParameters(classifier=str(trained)))
 
 
 @pytest.mark.parametrize(
-    "knobs", [SMALL, PeopleKnobs(), PeopleKnobs(bins=18, signed=True, block_stride_px=4, gamma=False)]
+    "knobs", [SMALL, PeopleParameters(), PeopleParameters(bins=18, signed=True, block_stride_px=4, gamma=False)]
 )
-def test_descriptors_under_the_weights_are_the_recognizers_scores(knobs):
+def test_descriptors_under_the_weights_are_the_recognizers_scores(parameters):
     rng = np.random.default_rng(1)
     image = background(rng, (200, 170))
-    size = knobs.window_width_px, knobs.window_height_px
-    weights = rng.normal(size=knobs.features).astype(np.float32)
-    parts = everywhere((200, 170), knobs)
-    maps = load_recognizer("torch", knobs, LinearSvm(weights, 0.5)).scores([image], [parts])[0]
+    size = parameters.window_width_px, parameters.window_height_px
+    weights = rng.normal(size=parameters.features).astype(np.float32)
+    parts = everywhere((200, 170), parameters)
+    maps = load_scorer("torch", parameters, LinearSvm(weights, 0.5)).scores([image], [parts])[0]
     places, wanted = [], []
     for part, scores in zip(parts[::2], maps[::2], strict=True):
         for row, column in {(0, 0), (scores.shape[0] - 1, scores.shape[1] - 1)}:
-            stride = knobs.window_stride_px
+            stride = parameters.window_stride_px
             places.append(Part(part.level, part.x + column * stride, part.y + row * stride, *size))
             wanted.append(scores[row, column])
-    found = script.descriptors(np.stack(script.cut(image, places)), knobs) @ weights + 0.5
+    found = script.descriptors(np.stack(script.cut(image, places)), parameters) @ weights + 0.5
     np.testing.assert_allclose(found, wanted, atol=2e-4)
 
 
 def test_descriptors_are_opencvs():
     window = background(np.random.default_rng(2), (66, 130))
     theirs = np.ravel(cv2.HOGDescriptor().compute(window, winStride=(8, 8), locations=[(1, 1)]))
-    np.testing.assert_allclose(script.descriptors(window[None], PeopleKnobs())[0], theirs, atol=1e-5)
+    np.testing.assert_allclose(script.descriptors(window[None], PeopleParameters())[0], theirs, atol=1e-5)
 
 
 def test_the_windows_that_score_highest_are_the_hardest():

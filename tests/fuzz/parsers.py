@@ -216,18 +216,18 @@ def _telemetry(path: Path) -> None:
 
 
 def _classifier(path: Path) -> None:
-    from torchvision_dddas.config import PeopleKnobs
+    from torchvision_dddas.config import PeopleParameters
     from torchvision_dddas.people.classifiers import read_classifier
 
-    svm = read_classifier(path, seeds.FEATURES, PeopleKnobs().descriptor)
+    svm = read_classifier(path, seeds.FEATURES, PeopleParameters().descriptor)
     _finite(svm.weights)
 
 
 def _manifest(path: Path) -> None:
-    from torchvision_dddas.config import PeopleKnobs
+    from torchvision_dddas.config import PeopleParameters
     from torchvision_dddas.people.onnx_scorer import graphs
 
-    graphs(PeopleKnobs(graphs=str(path.parent)))
+    graphs(PeopleParameters(graphs=str(path.parent)))
 
 
 def _folder(path: Path) -> None:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tests.upright import boxes, camera, poses
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.geo import fusion
 from torchvision_dddas.geo.fusion import associate, crowd, fuse, gate, together
 from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.types import Sightings
 
-KNOBS = GroundKnobs()
+KNOBS = GroundParameters()
 
 
 def sightings(east_north_m, own=0.01, common=None, body=None):

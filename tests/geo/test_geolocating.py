@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.overflight import COLOURS_TOML, Overflight, pictures
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import Locator, Watch, camera_of, check_table, locate, site_of
 from torchvision_dddas.geo.aerial_locator import Targets, points_of, sigma_of
@@ -38,12 +38,12 @@ def raster(ground, base=1300.0, reach=260.0, step=1.0):
 def prepared(tmp_path):
     """A locator and a table for a flight in local metres."""
 
-    def prepare(flight, elevation=None, telemetry=True, pictured=True, **knobs):
+    def prepare(flight, elevation=None, telemetry=True, pictured=True, **parameters):
         texts = {"l.csv": flight.landmarks_csv(pictured=pictured), "tel.csv": flight.telemetry_csv()}
         texts |= {"c.toml": flight.camera_toml(), "t.txt": flight.tracks_txt()}
         for name, text in texts.items():
             (tmp_path / name).write_text(text)
-        settings = with_knobs(Settings(), knobs)
+        settings = with_parameters(Settings(), parameters)
         flown = read_telemetry(tmp_path / "tel.csv") if telemetry else None
         site = replace(site_of(read_landmarks(tmp_path / "l.csv"), flown), elevation=elevation)
         camera, known, _ = camera_of(read_camera(tmp_path / "c.toml"), None, flown, settings)
@@ -135,7 +135,7 @@ def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
     busy = list(locate(table, locator))
     assert len(busy[-1].marks) == 6
     (moved,) = [a for g in busy for a in g.adjustments]
-    assert (moved.knob, moved.new) == ("landmarks.used", 6)
+    assert (moved.parameter, moved.new) == ("landmarks.used", 6)
 
 
 def test_frames_between_with_landmarks_are_located_too(prepared):
@@ -169,22 +169,22 @@ def test_landmarks_that_are_absent_for_a_while_leave_gaps_without_positions(prep
 def test_a_found_box_is_known_less_well_the_larger_it_is():
     boxes = np.array([[0, 0, 10, 10], [0, 0, 40, 40.0]])
     targets = Targets(boxes, np.array([1, 2]), np.ones(2, bool), np.ones(2))
-    knobs = Settings().aerial
-    assert sigma_of(targets, knobs) == pytest.approx([1, 1])
-    assert sigma_of(replace(targets, bodies=True), knobs) == pytest.approx(np.hypot(1, [1.3, 5.2]))
+    parameters = Settings().aerial
+    assert sigma_of(targets, parameters) == pytest.approx([1, 1])
+    assert sigma_of(replace(targets, bodies=True), parameters) == pytest.approx(np.hypot(1, [1.3, 5.2]))
 
 
 def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
     feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
     targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
-    knobs = Settings().aerial
-    points, lift = points_of(targets, knobs, posed=True)
+    parameters = Settings().aerial
+    points, lift = points_of(targets, parameters, posed=True)
     assert points.tolist() == [[5, 9], [5, 10]]
     assert lift.tolist() == [0, 0]
     bodies = replace(targets, feet_px=None, bodies=True)
-    assert points_of(bodies, knobs, posed=True)[1].tolist() == [0.85, 0.85]
+    assert points_of(bodies, parameters, posed=True)[1].tolist() == [0.85, 0.85]
     # A homography alone cannot tell what lies above the ground.
-    assert points_of(bodies, knobs, posed=False)[1].tolist() == [0, 0]
+    assert points_of(bodies, parameters, posed=False)[1].tolist() == [0, 0]
 
 
 def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess():
@@ -208,15 +208,15 @@ def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
 
 def test_paper_mode_says_that_it_leaves_a_bent_lens_aside():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
-    _, _, (note,) = camera_of(camera, None, None, with_knobs(Settings(), {"aerial.mode": "paper"}))
+    _, _, (note,) = camera_of(camera, None, None, with_parameters(Settings(), {"aerial.mode": "paper"}))
     assert "takes the lens of camera mine for straight" in note
     assert camera_of(camera, None, None, Settings())[2] == []
 
 
 def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), focal_sigma=0.002)
-    for knobs, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
-        settings = with_knobs(Settings(), knobs)
+    for parameters, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
+        settings = with_parameters(Settings(), parameters)
         found, known, _ = camera_of(camera, None, None, settings)
         prior = bare_prior(found, settings.aerial, known)
         assert prior.information[6, 6] == pytest.approx(sigma**-2)

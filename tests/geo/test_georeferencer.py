@@ -12,15 +12,15 @@ from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.plane import ground_points
 from torchvision_dddas.geo.pose_estimation import expected_of, prior_of
 from torchvision_dddas.geo.solvers import load_solver
-from torchvision_dddas.types import Flight, Marks
+from torchvision_dddas.types import Flight, LandmarkObservations
 
 SOLVER = load_solver("onboard")
 NAMES = ("red", "green", "blue", "white", "black", "pink")
 NAN = float("nan")
 
 
-def registrar(settings=None, **knobs):
-    return Registrar(CAMERA, settings or with_aerial(**knobs), SOLVER, names=NAMES)
+def registrar(settings=None, **parameters):
+    return Registrar(CAMERA, settings or with_aerial(**parameters), SOLVER, names=NAMES)
 
 
 def rows(marks, which):
@@ -197,7 +197,7 @@ def test_paper_mode_takes_identities_as_they_come():
 def test_nothing_at_all_is_refused():
     for flight in (None, Flight(NAN)):
         for mode in ("pose", "homography", "paper"):
-            fix = registrar(mode=mode).step(2, 0.0, flight, Marks())
+            fix = registrar(mode=mode).step(2, 0.0, flight, LandmarkObservations())
             assert fix.by == "" and "frame 2 has no landmark" in fix.cause
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.airborne import CAMERA, GPS_M, look
-from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.landmark_faults import judge
 from torchvision_dddas.geo.plane import ground_points
 from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
-from torchvision_dddas.types import Camera, Fix, Marks
+from torchvision_dddas.types import Camera, Fix, LandmarkObservations
 
-KNOBS = AerialKnobs()
+KNOBS = AerialParameters()
 NAMES = ("red", "green", "blue", "white", "black", "pink")
 SEEDS = range(25)
 
@@ -140,7 +140,9 @@ def test_without_telemetry_four_of_six_landmarks_whose_names_are_all_wrong_are_n
     places = np.array([[10.3, -5.1], [9.5, 11.7], [1.9, 13.4], [-12.9, 5.4], [-9.5, -6.8], [4.7, -12.2]])
     pixels = np.array([[1179, 500], [966, 221], [850, 284], [636, 619], [843, 790], [1173, 703.0]])
     camera = Camera("above", (1920, 1080), (1371.0, 1371.0), (959.5, 539.5))
-    marks = Marks(np.arange(6), np.roll(pixels, turn, axis=0), places, np.full(6, GPS_M), np.ones(6), np.zeros(6))
+    marks = LandmarkObservations(
+        np.arange(6), np.roll(pixels, turn, axis=0), places, np.full(6, GPS_M), np.ones(6), np.zeros(6)
+    )
     expected = expected_of(bare_prior(camera, KNOBS), marks.sigma_m)
     verdict = judge(marks, camera, expected, KNOBS.gate_probability, NAMES)
     assert not verdict.passed

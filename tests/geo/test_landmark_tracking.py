@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import LandmarkKnobs
+from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.geo.landmark_tracking import LandmarkFollower, separate
 from torchvision_dddas.types import Detections
 
-EXACT = LandmarkKnobs(reach_px=10.0)
-GREEDY = LandmarkKnobs(reach_px=10.0, differentiation="greedy")
+EXACT = LandmarkParameters(reach_px=10.0)
+GREEDY = LandmarkParameters(reach_px=10.0, differentiation="greedy")
 SIZE = (300, 400)
 
 
@@ -44,11 +44,11 @@ def test_greedy_goes_row_by_row_and_so_may_leave_a_landmark_without_a_blob():
 
 
 @pytest.mark.parametrize("knobs", [EXACT, GREEDY])
-def test_a_colour_that_was_not_found_and_a_blob_out_of_reach_are_matched_with_nothing(knobs):
+def test_a_colour_that_was_not_found_and_a_blob_out_of_reach_are_matched_with_nothing(parameters):
     colour = np.array([[np.nan, np.nan], [0, 0], [50, 50]])
-    assert separate(colour, np.array([[1, 0.0], [80, 80]]), knobs).tolist() == [-1, 0, -1]
-    assert separate(colour, np.zeros((0, 2)), knobs).tolist() == [-1, -1, -1]
-    assert separate(np.zeros((0, 2)), np.zeros((3, 2)), knobs).tolist() == []
+    assert separate(colour, np.array([[1, 0.0], [80, 80]]), parameters).tolist() == [-1, 0, -1]
+    assert separate(colour, np.zeros((0, 2)), parameters).tolist() == [-1, -1, -1]
+    assert separate(np.zeros((0, 2)), np.zeros((3, 2)), parameters).tolist() == []
 
 
 def plates(*boxes):
@@ -66,8 +66,8 @@ def blobs(*boxes):
     return Detections(box, np.ones(n), box[:, 2:].prod(axis=1), unknown, unknown)
 
 
-def follower(names="a", **knobs):
-    return LandmarkFollower(tuple(names), LandmarkKnobs(reach_px=30.0, **knobs))
+def follower(names="a", **parameters):
+    return LandmarkFollower(tuple(names), LandmarkParameters(reach_px=30.0, **parameters))
 
 
 def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target():

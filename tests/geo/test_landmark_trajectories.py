@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import LandmarkKnobs
+from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.geo.landmark_trajectories import Courses
 from torchvision_dddas.types import Landmarks
 
 RATE = 25.0
-KNOBS = LandmarkKnobs(sigma_m=1.0, gap_s=4.0, drift_m_s=0.5, pixel_sigma=2.0, height_m=1.5)
+KNOBS = LandmarkParameters(sigma_m=1.0, gap_s=4.0, drift_m_s=0.5, pixel_sigma=2.0, height_m=1.5)
 
 
 def landmarks(rows, names=("a",)):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring
-from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.initial_pose import find_pose
 from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
 from torchvision_dddas.types import Flight
 
-KNOBS = AerialKnobs()
+KNOBS = AerialParameters()
 NAN = float("nan")
 SAYS_NOT: dict[str, dict[str, Any]] = {
     "nothing": {},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.upright import boxes, camera, poses
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import sight, touches_border
 
@@ -14,10 +14,10 @@ PEOPLE = np.array([[0.0, 8.0], [2.5, 12.0], [-3.0, 20.0], [1.0, 30.0]])
 WHOLE = np.zeros(4, bool)
 
 
-def seen(box_px, cam, cut=None, place=(0.0, 0.0), **knobs):
+def seen(box_px, cam, cut=None, place=(0.0, 0.0), **parameters):
     cut = np.zeros(len(box_px), bool) if cut is None else cut
     where = poses(cam, len(box_px), place)
-    return sight(box_px, cut, cam, where, where.place, GroundKnobs(**{"body_height_m": 1.75, **knobs}))
+    return sight(box_px, cut, cam, where, where.place, GroundParameters(**{"body_height_m": 1.75, **parameters}))
 
 
 @pytest.mark.parametrize("use", ["height", "feet", "both"])
@@ -114,13 +114,13 @@ def test_the_error_of_the_persons_height_is_the_derivative_of_the_place():
 )
 def test_95_percent_ellipses_hold_93_to_97_percent(use, distance, pitch):
     rng, n = np.random.default_rng(4), 1500
-    cam, knobs = camera(pitch_rad=pitch, heading_rad=0.7), GroundKnobs(use=use)
+    cam, parameters = camera(pitch_rad=pitch, heading_rad=0.7), GroundParameters(use=use)
     person = distance * np.array([[np.sin(0.9), np.cos(0.9)]])
     box = np.concatenate(
         [
             boxes(
                 person,
-                knobs.body_height_m + rng.normal(0, knobs.body_height_sigma_m),
+                parameters.body_height_m + rng.normal(0, parameters.body_height_sigma_m),
                 replace(
                     cam,
                     heading_rad=0.7 + rng.normal(0, cam.heading_sigma_rad),
@@ -134,9 +134,9 @@ def test_95_percent_ellipses_hold_93_to_97_percent(use, distance, pitch):
         ]
     )
     tall = box[:, 3].copy()
-    feet = box[:, 1] + tall + rng.normal(0, 1, n) * np.hypot(knobs.feet_sigma * tall, 0.5)
-    box[:, 0] += rng.normal(0, 1, n) * np.hypot(knobs.feet_sigma * tall, 0.5)
-    box[:, 3] += rng.normal(0, 1, n) * np.hypot(knobs.height_sigma * tall, 0.5)
+    feet = box[:, 1] + tall + rng.normal(0, 1, n) * np.hypot(parameters.feet_sigma * tall, 0.5)
+    box[:, 0] += rng.normal(0, 1, n) * np.hypot(parameters.feet_sigma * tall, 0.5)
+    box[:, 3] += rng.normal(0, 1, n) * np.hypot(parameters.height_sigma * tall, 0.5)
     box[:, 1] = feet - box[:, 3]
     found = seen(box, cam, use=use)
     off = found.east_north_m - person

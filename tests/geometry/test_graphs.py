@@ -10,7 +10,7 @@ import pytest
 
 import torchvision_dddas
 from torchvision_dddas import runtime as graphs
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import onnx_plane as onboard_plane
 from torchvision_dddas.people import onnx_scorer as onboard_people
@@ -143,7 +143,7 @@ def test_both_onboard_back_ends_refuse_tampered_graphs(folder: Path, monkeypatch
     for name in (NAME, "people_scores.onnx"):
         (folder / name).write_bytes((folder / name).read_bytes() + b"\0")
     with pytest.raises(InputError, match=r"people_scores.onnx is not the graph"):
-        onboard_people.OnboardRecognizer(PeopleKnobs(graphs=str(folder)), LinearSvm(_nothing(), 0.0, "none"))
+        onboard_people.OnnxScorer(PeopleParameters(graphs=str(folder)), LinearSvm(_nothing(), 0.0, "none"))
     monkeypatch.setattr(onboard_plane, "SHIPPED", folder)
     with pytest.raises(InputError, match=r"homography.onnx is not the graph"):
         onboard_plane.opened.__wrapped__("homography")
@@ -158,4 +158,4 @@ def test_shipped_graphs_that_are_damaged_ask_for_a_new_installation(folder: Path
 def _nothing() -> Any:
     import numpy as np
 
-    return np.zeros(PeopleKnobs().features, np.float32)
+    return np.zeros(PeopleParameters().features, np.float32)

@@ -4,7 +4,7 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks
-from torchvision_dddas.types import CameraPose, Fix, Grounded, Marks, Positions
+from torchvision_dddas.types import AerialLocations, CameraPose, Fix, LandmarkObservations, Positions
 
 ORIGIN = (-110.95, 32.23)
 NAMES = ("alpha", "bravo", "charlie", "delta & <co>")
@@ -36,7 +36,7 @@ def grounded(frame, east_north=((1, 2), (3, 4)), by="pose", rate=10.0, states=("
     adjustments = rest.pop("adjustments", ())
     pose = CameraPose(np.array([0.1 * frame, -5.0, 50.0]), DOWN) if by == "pose" else None
     fix = Fix(frame, by, rest.pop("pose", pose), landmark=np.arange(seen), state=states, **rest)
-    marks = Marks(
+    marks = LandmarkObservations(
         np.arange(seen),
         np.zeros((seen, 2)),
         np.array([[-20, -20], [20, -20], [20, 20], [-20, 20.0]])[:seen],
@@ -45,7 +45,7 @@ def grounded(frame, east_north=((1, 2), (3, 4)), by="pose", rate=10.0, states=("
         np.zeros(seen),
     )
     velocity = np.tile((3.0, 4.0), (n, 1))
-    return Grounded(
+    return AerialLocations(
         frame,
         (frame - 1) / rate,
         at,

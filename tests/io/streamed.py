@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.io.ground import ORIGIN, START, grounded
 from torchvision_dddas.io.streams import About
-from torchvision_dddas.types import Confirmed, Detections, Followed, Frame, Surveyed, Tracks
+from torchvision_dddas.types import Confirmation, Detections, Frame, FrameResult, TrackedFrame, Tracks
 
 NAMES = ("alpha", "bravo", "charlie", "delta & <co>")
 ABOUT = About(START, geographic=True, landmarks=NAMES)
@@ -25,19 +25,19 @@ def followed(number=1, targets=2, kind="moving", rate=10.0, **rest):
     rows = np.array([*range(seen), -1][:targets], np.int64)
     tracks = Tracks(number, np.arange(1, targets + 1), boxes[:targets], np.full(targets, 0.875), rows)
     frame = Frame(number, (number - 1) / rate, np.zeros((4, 4), np.uint8), taken_s=rest.pop("taken_s", float("nan")))
-    return Followed(number, frame, found, tracks, **rest)
+    return TrackedFrame(number, frame, found, tracks, **rest)
 
 
 def surveyed(number=1, targets=2, origin=ORIGIN, on_ground=True, rate=10.0, **rest):
     """A frame of which every target but the last is located."""
     own = followed(number, targets, rate=rate, **rest)
     if not on_ground:
-        return Surveyed(own)
+        return FrameResult(own)
     places = [(k, 2 * k) for k in range(targets - 1)]
     ground = grounded(number, places, rate=rate, origin=origin)
     degrees = None if origin is None else np.tile(ORIGIN, (len(ground.marks), 1))
     seen = len(places)
-    confirmed = Confirmed(
+    confirmed = Confirmation(
         number,
         np.arange(seen),
         ("human",) * seen,
@@ -48,7 +48,7 @@ def surveyed(number=1, targets=2, origin=ORIGIN, on_ground=True, rate=10.0, **re
         np.ones(seen),
         np.ones(seen),
     )
-    return Surveyed(own, ground, ("motion",) * 4, degrees, confirmed)
+    return FrameResult(own, ground, ("motion",) * 4, degrees, confirmed)
 
 
 class Clock:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import classifier_of
@@ -27,9 +27,9 @@ def write(folder, name, content):
 
 
 def test_the_shipped_classifier_is_opencvs_default_people_detector():
-    svm = classifier_of(PeopleKnobs())
+    svm = classifier_of(PeopleParameters())
     theirs = np.ravel(cv2.HOGDescriptor.getDefaultPeopleDetector())
-    assert PeopleKnobs().features == 3780
+    assert PeopleParameters().features == 3780
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), theirs, rtol=0, atol=1e-8)
 
 
@@ -42,8 +42,8 @@ def test_the_shipped_classifier_is_opencvs_default_people_detector():
         ({"bins": 18, "signed": True}, 7 * 15 * 72),
     ],
 )
-def test_the_length_of_a_descriptor_is_opencvs(knobs, length):
-    made = PeopleKnobs(**knobs)
+def test_the_length_of_a_descriptor_is_opencvs(parameters, length):
+    made = PeopleParameters(**parameters)
     window, stride = (made.window_width_px, made.window_height_px), (made.block_stride_px,) * 2
     theirs = cv2.HOGDescriptor(window, (16, 16), stride, (8, 8), made.bins).getDescriptorSize()
     assert made.features == theirs == length
@@ -75,15 +75,15 @@ def test_without_a_bias_it_is_zero(tmp_path):
 
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])
 def test_what_opencvs_descriptor_saves_is_read_with_its_layout(tmp_path, ending):
-    knobs = PeopleKnobs(window_width_px=32, window_height_px=64, classifier=str(tmp_path / f"hog.{ending}"))
-    numbers = np.random.default_rng(0).normal(size=knobs.features + 1).astype(np.float32)
+    parameters = PeopleParameters(window_width_px=32, window_height_px=64, classifier=str(tmp_path / f"hog.{ending}"))
+    numbers = np.random.default_rng(0).normal(size=parameters.features + 1).astype(np.float32)
     theirs = cv2.HOGDescriptor((32, 64), (16, 16), (8, 8), (8, 8), 9, 1, -1, 0, 0.2, True)
     theirs.setSVMDetector(numbers)
-    theirs.save(knobs.classifier)
-    svm = classifier_of(knobs)
+    theirs.save(parameters.classifier)
+    svm = classifier_of(parameters)
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), numbers, rtol=1e-6)
     with pytest.raises(InputError, match=r"clip of 0\.2, the settings say 0\.3; change people\.clip"):
-        classifier_of(knobs.model_copy(update={"clip": 0.3}))
+        classifier_of(parameters.model_copy(update={"clip": 0.3}))
 
 
 @pytest.mark.parametrize("kind", [cv2.ml.SVM_C_SVC, cv2.ml.SVM_NU_SVC, cv2.ml.SVM_EPS_SVR])
@@ -156,7 +156,7 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
 def test_a_mistake_gets_one_line_that_says_what_to_do(tmp_path, name, content, wanted, capfd):
     path = write(tmp_path, name, content)
     with pytest.raises(InputError) as error:
-        read_classifier(path, 6, PeopleKnobs().descriptor)
+        read_classifier(path, 6, PeopleParameters().descriptor)
     assert "\n" not in str(error.value)
     for part in [str(path), *wanted]:
         assert part in str(error.value)

@@ -1,4 +1,4 @@
-"""The course of a run over time: knobs as steps, time spent by stage, and what happened when."""
+"""The course of a run over time: parameters as steps, time spent by stage, and what happened when."""
 
 import re
 
@@ -8,20 +8,22 @@ import pytest
 from torchvision_dddas.io.output.run_log import WORLD, Entry
 from torchvision_dddas.io.report.run_plots import Course
 from torchvision_dddas.io.report.timeline import plots
-from torchvision_dddas.types import Adjustment, Detections, Followed, Frame, Surveyed, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Frame, FrameResult, TrackedFrame, Tracks
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 
 
 def frame(number, cause=""):
-    return Surveyed(Followed(number, Frame(number, number / 10, PICTURE), Detections(), Tracks(number), cause=cause))
+    return FrameResult(
+        TrackedFrame(number, Frame(number, number / 10, PICTURE), Detections(), Tracks(number), cause=cause)
+    )
 
 
 def course(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=()):
-    """A run in which knobs are moved at frames: (frame, knob, old, new)."""
+    """A run in which parameters are moved at frames: (frame, parameter, old, new)."""
     kept = Course(names)
     for number in frames:
-        moved = [Adjustment(number, knob, old, new, "why") for at, knob, old, new in moves if at == number]
+        moved = [Adjustment(number, parameter, old, new, "why") for at, parameter, old, new in moves if at == number]
         kept.add(frame(number), seconds(number), moved)
     return kept
 
@@ -34,7 +36,7 @@ def curves(kept, title):
     return next(lines for name, lines in kept.panels() if name == title)
 
 
-def test_a_knob_holds_its_first_value_before_it_is_moved_and_each_new_one_from_its_frame_on():
+def test_a_parameter_holds_its_first_value_before_it_is_moved_and_each_new_one_from_its_frame_on():
     kept = course([(4, "a.b", 1, 3), (8, "a.b", 3, 2)])
     assert kept.values("a.b").tolist() == [1, 1, 1, 3, 3, 3, 3, 2, 2, 2]
 
@@ -45,7 +47,7 @@ def test_a_value_that_is_no_number_is_left_out_of_the_plot():
     assert "nan" not in plots(kept) and "inf" not in plots(kept)
 
 
-def test_a_knob_that_was_set_at_first_and_stayed_has_no_plot():
+def test_a_parameter_that_was_set_at_first_and_stayed_has_no_plot():
     kept = course([(1, "gates.min_size_px", 0, 5), (5, "interval.frames", 1, 2)])
     assert "interval.frames" in titles(kept) and "gates.min_size_px" not in titles(kept)
 
@@ -58,7 +60,7 @@ def test_what_is_adjusted_of_each_vehicle_is_one_plot():
 
 
 def test_plots_of_knobs_are_limited_to_those_moved_most_often():
-    moves = [(k, f"group.knob{n:02d}", 0, k) for n in range(30) for k in range(2, 3 + n // 4)]
+    moves = [(k, f"group.parameter{n:02d}", 0, k) for n in range(30) for k in range(2, 3 + n // 4)]
     shown = [title for title in titles(course(moves, range(1, 15))) if title.startswith("group")]
     assert 6 <= len(shown) <= 15 and "group.knob29" in shown and "group.knob00" not in shown
 

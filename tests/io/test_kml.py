@@ -6,7 +6,7 @@ import pytest
 from tests.io.ground import NAMES, ORIGIN, positions, tracks
 from torchvision_dddas.io.maps.kml import kml, plain
 from torchvision_dddas.io.output.position_output import PositionOutput
-from torchvision_dddas.types import Located, Sightings
+from torchvision_dddas.types import GroundLocations, Sightings
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
 ORDER = ["name", "description", "TimeStamp", "styleUrl", "geometry"]
@@ -124,7 +124,9 @@ def test_people_located_from_the_ground_are_written_too(tmp_path):
             for frame in walk(3, origin=ORIGIN if geographic else None):
                 members = np.zeros((2, 1), int)
                 number = int(frame.frame[0])
-                output.write(Located(number, frame, members, sightings, none, none, none, none, np.zeros((0, 4))))
+                output.write(
+                    GroundLocations(number, frame, members, sightings, none, none, none, none, np.zeros((0, 4)))
+                )
         if geographic:
             root = ElementTree.parse(tmp_path / "tracks.kml").getroot()
             assert [m.findtext(f"{KML}name") for m in marks_of(root, "tracks")] == ["target 1", "target 2"]

@@ -8,14 +8,14 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output.people_output import PeopleOutput
-from torchvision_dddas.types import Adjustment, Frame, People, Recognized
+from torchvision_dddas.types import Adjustment, Frame, People, PeopleFrame
 
 
 def recognized(number, share=1.0, cause="", adjustments=()):
     box_px = np.array([[10, 20, 30, 90.0], [60, 5, 30, 80]])
     people = People(box_px, np.array([0.9, 0.4]), np.ones(2), np.array([False, True]), box_px) if share else People()
     frame = Frame(number, 0.1 * number, np.zeros((120, 160, 3), np.uint8))
-    return Recognized(
+    return PeopleFrame(
         frame, people, None if share == 1 else np.zeros((3, 4)), share, cause, adjustments, {"score": 0.02}
     )
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.io.overlay.people_overlay import CUT, PERSON, SEARCHED, UNLIKELY, Still, drawn_people
-from torchvision_dddas.types import Frame, People, Recognized
+from torchvision_dddas.types import Frame, People, PeopleFrame
 
 
 def recognized(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause="", score=0.9):
@@ -19,7 +19,7 @@ def recognized(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cau
         box_px,
     )
     image = np.full((240, 320) if grey else (240, 320, 3), 90, np.uint8)
-    return Recognized(Frame(3, 0.2, image), people, regions, 0.25, cause)
+    return PeopleFrame(Frame(3, 0.2, image), people, regions, 0.25, cause)
 
 
 def shows(picture, colour):

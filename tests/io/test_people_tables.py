@@ -7,7 +7,7 @@ import pytest
 
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.output.people_tables import COLUMNS, PeopleTables, csv_lines, mot_lines
-from torchvision_dddas.types import Frame, People, Recognized
+from torchvision_dddas.types import Frame, People, PeopleFrame
 
 PEOPLE = People(
     np.array([[10, 20, 30, 90.5], [-4, 2, 40, 100]]),
@@ -19,7 +19,7 @@ PEOPLE = People(
 
 
 def recognized(number=7, people=PEOPLE):
-    return Recognized(Frame(number, 0.6, np.zeros((120, 160), np.uint8)), people)
+    return PeopleFrame(Frame(number, 0.6, np.zeros((120, 160), np.uint8)), people)
 
 
 def test_mot_lines_hold_the_probability_and_no_identity():

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.io.streamed import ABOUT, NAMES, followed, surveyed
 from torchvision_dddas.io.streams import About
 from torchvision_dddas.io.streams.json_lines import json_lines
-from torchvision_dddas.types import Adjustment, Followed, Surveyed, Tracks
+from torchvision_dddas.types import Adjustment, FrameResult, TrackedFrame, Tracks
 
 PAGE = Path(__file__).parents[2] / "docs" / "stream.md"
 
@@ -98,7 +98,9 @@ def test_a_target_has_its_identity_its_box_and_its_place():
 def test_what_was_not_looked_for_is_null_and_what_was_not_found_is_empty():
     fields = one(surveyed(1, 0, on_ground=False), None, About())
     assert (fields["people"], fields["ground"], fields["utc"]) == (None, None, None)
-    nothing = Surveyed(Followed(5, None, followed(1, 0).detections, Tracks(5), cause="the picture cannot be read"))
+    nothing = FrameResult(
+        TrackedFrame(5, None, followed(1, 0).detections, Tracks(5), cause="the picture cannot be read")
+    )
     fields = one(nothing, None, ABOUT)
     assert (fields["time_s"], fields["utc"], fields["cause"]) == (None, None, "the picture cannot be read")
     assert one(None, followed(1, 1, kind="person"), ABOUT)["targets"] is None

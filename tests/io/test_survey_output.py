@@ -17,17 +17,17 @@ from torchvision_dddas.io.output.run_log import PROBLEM
 from torchvision_dddas.io.overlay.survey_overlay import STATES, SurveyPictures
 from torchvision_dddas.types import (
     Adjustment,
+    AerialLocations,
     Command,
-    Confirmed,
+    Confirmation,
     Detections,
     Fix,
-    Followed,
     Frame,
-    Grounded,
-    Marks,
+    FrameResult,
+    LandmarkObservations,
     Order,
     Positions,
-    Surveyed,
+    TrackedFrame,
     Tracks,
 )
 
@@ -40,10 +40,10 @@ def surveyed(frame, by="pose", cause="", states=("used", "excluded"), geographic
     boxes = np.array([[10, 12, 8, 8.0]])
     found = Detections(boxes, np.ones(1), np.full(1, 64.0), unknown, unknown)
     picture = np.full((120, 200, 3), 128, np.uint8)
-    followed = Followed(
+    followed = TrackedFrame(
         frame, Frame(frame, frame / 10, picture), found, Tracks(frame, np.array([3]), boxes, np.ones(1), np.array([0]))
     )
-    marks = Marks(
+    marks = LandmarkObservations(
         np.arange(2),
         np.array([[40.0, 30], [120, 50]]),
         np.array([[1.0, 2], [3, 4]]),
@@ -57,11 +57,11 @@ def surveyed(frame, by="pose", cause="", states=("used", "excluded"), geographic
     )
     nothing = np.zeros((at, 2, 2))
     fix = Fix(frame, by, landmark=np.arange(2), state=states, cause=cause)
-    grounded = Grounded(
+    grounded = AerialLocations(
         frame, frame / 10, positions, np.arange(at), nothing, np.full((at, 2), np.nan), boxes, fix, marks
     )
     degrees = np.array([[-110.95, 32.23], [-110.94, 32.24]]) if geographic else None
-    return Surveyed(followed, grounded, ("motion", "colour"), degrees)
+    return FrameResult(followed, grounded, ("motion", "colour"), degrees)
 
 
 def rows(path):
@@ -127,7 +127,7 @@ def test_the_caption_says_why_a_frame_is_not_located():
 
 
 def test_a_frame_that_nothing_lays_on_the_ground_is_drawn_with_its_tracks():
-    drawn = SurveyPictures((200, 120), ())(Surveyed(surveyed(1).followed))
+    drawn = SurveyPictures((200, 120), ())(FrameResult(surveyed(1).followed))
     assert drawn.shape == (120, 200, 3)
     assert cv2.absdiff(drawn, np.full_like(drawn, 128)).any()
 
@@ -140,7 +140,7 @@ def confirmed(surveyed, kind, by=()):
     """The same, with what ground vehicles say of its target."""
     one = np.ones(1)
     probability = {"human": 0.96, "not_human": 0.04, "unseen": 0.5}[kind]
-    said = Confirmed(
+    said = Confirmation(
         surveyed.followed.number, np.zeros(1, np.int64), (kind,), probability * one, (by,), 4 * np.ones(1, np.int64),
         0.3 * one, 0.5 * one, np.nan * one,
     )  # fmt: skip
@@ -262,7 +262,7 @@ def test_a_run_that_locates_nothing_has_a_log_and_a_report_without_a_map(tmp_pat
         output.begin({"input": "clip"}, 10.0, (200, 120))
         output.event(3, "frame 3 could not be read", None, PROBLEM)
         for k in (1, 2, 3):
-            output.write(Surveyed(replace(surveyed(k).followed, adjustments=(change,) if k == 2 else ())))
+            output.write(FrameResult(replace(surveyed(k).followed, adjustments=(change,) if k == 2 else ())))
     assert [line.split()[2] for line in log(tmp_path)] == ["adjusted", "problem"]
     text = (tmp_path / "report.html").read_text()
     assert "data:image/png" not in text and text.count("data:image/jpeg") == 3
@@ -274,7 +274,7 @@ def test_a_report_that_is_not_wanted_is_not_made_and_an_old_one_goes(tmp_path):
     for save, there in ((("report",), True), ((), False)):
         with FoundOutput(tmp_path, save) as output:
             output.begin({"input": "clip"}, 10.0, (200, 120))
-            output.write(Surveyed(surveyed(1).followed))
+            output.write(FrameResult(surveyed(1).followed))
         assert (tmp_path / "report.html").exists() is there
         assert (tmp_path / "log.txt").exists()
 
@@ -291,7 +291,7 @@ def test_an_order_is_an_arrow_from_the_vehicle_towards_its_goal():
     """Three landmarks at 10 px a metre, north up, tell where east is; the first is sent there."""
     item = surveyed(1)
     place = np.array([[0.0, 0], [5, 0], [0, 4]])
-    marks = Marks(np.arange(3), place * (10, -10) + (60, 50), place, np.ones(3), np.ones(3), np.zeros(3))
+    marks = LandmarkObservations(np.arange(3), place * (10, -10) + (60, 50), place, np.ones(3), np.ones(3), np.zeros(3))
     fix = replace(item.grounded.fix, landmark=np.arange(3), state=("used",) * 3)
     item = replace(item, grounded=replace(item.grounded, marks=marks, fix=fix))
     sent = replace(item, command=Command(orders=(Order("a", np.array([30.0, 0]), 2.0),)))

@@ -4,7 +4,7 @@ import pytest
 
 from torchvision_dddas.io.overlay.detection_overlay import Overlay
 from torchvision_dddas.io.overlay.track_overlay import TrackPictures, colour_of
-from torchvision_dddas.types import Detections, Followed, Frame, Tracks
+from torchvision_dddas.types import Detections, Frame, TrackedFrame, Tracks
 
 SIZE = (120, 90)
 
@@ -16,7 +16,7 @@ def followed(number, boxes, identities, grey=False, read=True, row=None, cause="
     shown = np.arange(len(identities)) if row is None else np.array(row)
     tracks = Tracks(number, np.array(identities, int), boxes[: len(shown)], np.ones(len(shown)), shown)
     frame = Frame(number, 0.1 * number, np.full(shape, 90, np.uint8)) if read else None
-    return Followed(number, frame, given, tracks, cause=cause)
+    return TrackedFrame(number, frame, given, tracks, cause=cause)
 
 
 def shows(picture, colour):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.io.output.track_tables import COLUMNS, TrackTables, csv_lines, mot_lines
 from torchvision_dddas.io.overlay.trails import Trails
-from torchvision_dddas.types import Detections, Followed, Tracks
+from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 
 def followed(number, boxes, identity=None, row=None, score=None, **rest):
@@ -18,7 +18,7 @@ def followed(number, boxes, identity=None, row=None, score=None, **rest):
     score = np.ones(n) if score is None else np.array(score, float)
     given = Detections(boxes[row >= 0], score[row >= 0], np.zeros(0), np.zeros(0), np.zeros(0), "given")
     tracks = Tracks(number, np.arange(n) + 1 if identity is None else np.array(identity), boxes, score, row)
-    return Followed(number, None, given, tracks, **rest)
+    return TrackedFrame(number, None, given, tracks, **rest)
 
 
 def read(text):
@@ -37,14 +37,14 @@ def test_every_detection_is_in_the_csv_with_its_line_and_what_became_of_it():
     boxes = np.array([[0, 0, 9, 9], [20, 0, 9, 9], [40, 0, 9, 9.0]])
     given = Detections(boxes[[2, 0]], np.array([0.5, 0.9]), np.zeros(0), np.zeros(0), np.zeros(0), "given")
     tracks = Tracks(4, np.array([8, 5]), boxes[:2], np.array([0.9, 0.7]), np.array([1, -1]))
-    rows = read(csv_lines(Followed(4, None, given, tracks, lines=np.array([31, 17])), {8: (90.0, 2.5)}))
+    rows = read(csv_lines(TrackedFrame(4, None, given, tracks, lines=np.array([31, 17])), {8: (90.0, 2.5)}))
     assert [(r["identity"], r["kind"], r["row"], r["x_px"]) for r in rows] == [
         ("8", "detection", "17", "0.00"),
         ("5", "bridge", "", "20.00"),
         ("", "untracked", "31", "40.00"),
     ]
     assert [(r["heading_deg"], r["speed_px_per_frame"]) for r in rows] == [("90.0", "2.500"), ("", ""), ("", "")]
-    assert mot_lines(Followed(4, None, given, tracks)).count("\n") == 2
+    assert mot_lines(TrackedFrame(4, None, given, tracks)).count("\n") == 2
 
 
 def test_own_detections_are_numbered_within_their_frame():

@@ -1,4 +1,4 @@
-"""The page of tuning: the loss, each knob, and what it was worth on both sets of clips."""
+"""The page of tuning: the loss, each parameter, and what it was worth on both sets of clips."""
 
 import math
 
@@ -36,7 +36,7 @@ def record(**changed):
         }
         for k in range(5)
     ]
-    knobs = {
+    parameters = {
         name: {
             "before": 4,
             "after": 8.0,
@@ -53,7 +53,7 @@ def record(**changed):
         "family": "motion",
         "plan": {"batch": 8, "seed": 3, "steps": 4, "watched": 0.25},
         "examples": 20,
-        "knobs": knobs,
+        "knobs": parameters,
         "best": 4,
         "taken": 4,
         "ended": "all 4 steps were taken",
@@ -84,7 +84,7 @@ def test_it_says_first_what_tuning_was_worth_on_clips_tuned_on_and_held_out():
     assert "4.00 s a step" in said(tuning_report(record(taken=2)))
 
 
-def test_each_knob_has_its_plot_and_its_row_and_one_without_a_slope_is_told():
+def test_each_parameter_has_its_plot_and_its_row_and_one_without_a_slope_is_told():
     text = tuning_report(record())
     assert text.count("<svg") >= 4
     for name in NAMES:
@@ -99,15 +99,15 @@ def test_without_clips_held_out_it_says_how_to_have_some():
 
 def test_a_descent_that_was_stopped_says_so_at_once():
     failed = "the loss of motion is no number for one, frame 3, with difference.threshold = 12, at step 2"
-    assert f"Stopped: {failed}. The knobs are the last good ones." in said(tuning_report(record(failed=failed)))
+    assert f"Stopped: {failed}. The parameters are the last good ones." in said(tuning_report(record(failed=failed)))
 
 
-def test_what_time_costs_is_told_knob_by_knob():
+def test_what_time_costs_is_told_parameter_by_parameter():
     curves = [{"knob": NAMES[0], "values": [2.0, 4.0], "times": [1.3, 1.0]}]
     text = said(tuning_report(record(cost={"weight": 0.1, "seconds": 0.02, "expected": 0.015, "curves": curves})))
     assert "a loss of 0.1. Expected: 20.0 → 15.0 ms a frame." in text and "1.3, 1" in text
     none = said(tuning_report(record(cost={"weight": 0.1, "seconds": 0.02, "expected": 0.02, "curves": []})))
-    assert "No knob changed the time by more than repeats differ." in none
+    assert "No parameter changed the time by more than repeats differ." in none
 
 
 def test_clips_without_any_result_make_a_page_too():

@@ -13,7 +13,7 @@ import pytest
 
 from tests.io.clips import number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
 from tests.live.streams import PATIENCE_S, FakeClock, FakeStream, Gate, Streams, after, grey, taken
-from torchvision_dddas.config import LiveKnobs
+from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live import Health, LiveSource
 
@@ -23,7 +23,7 @@ APART_S = 0.04
 class Camera:
     """A live source before streams that play scripts; the first one begins when pictures are taken."""
 
-    def __init__(self, *scripts: list[Any] | None, rate_hz: float | None = 25.0, **knobs: Any) -> None:
+    def __init__(self, *scripts: list[Any] | None, rate_hz: float | None = 25.0, **parameters: Any) -> None:
         self.health, self.clock, self.rest = Health(), FakeClock(), Gate()
         first, *more = scripts
         assert first is not None
@@ -33,8 +33,10 @@ class Camera:
         self.opener = Streams(*self.streams)
         self.source: LiveSource | None = None
         self.built = threading.Event()
-        knobs = {"queue_frames": 64, "stall_s": 5.0, "retry_s": 0.5, "retry_most_s": 4.0} | knobs
-        self.source = LiveSource("camera:0", LiveKnobs(**knobs), self.health, opener=self.opener, clock=self.clock)
+        parameters = {"queue_frames": 64, "stall_s": 5.0, "retry_s": 0.5, "retry_most_s": 4.0} | parameters
+        self.source = LiveSource(
+            "camera:0", LiveParameters(**parameters), self.health, opener=self.opener, clock=self.clock
+        )
         self.built.set()
         self.frames = iter(self.source)
 
@@ -323,14 +325,14 @@ def test_a_camera_that_hangs_at_the_start_is_one_line_too() -> None:
 @pytest.mark.parametrize("spec", ["tcp://127.0.0.1:9", "camera:x", "nowhere.mp4"])
 def test_an_input_that_is_not_there_is_one_line(spec) -> None:
     with pytest.raises(InputError) as error:
-        LiveSource(spec, LiveKnobs(stall_s=1.0))
+        LiveSource(spec, LiveParameters(stall_s=1.0))
     assert spec in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_password_in_an_address_is_never_told() -> None:
     with pytest.raises(InputError) as error:
-        LiveSource("rtsp://pilot:s3cret@127.0.0.1:9/a", LiveKnobs(stall_s=1.0))
+        LiveSource("rtsp://pilot:s3cret@127.0.0.1:9/a", LiveParameters(stall_s=1.0))
     assert "rtsp://127.0.0.1:9/a" in str(error.value)
     opener = Streams(FakeStream(itertools.repeat(grey(1))))
     source = LiveSource("rtsp://pilot:s3cret@drone/a", opener=opener, clock=FakeClock())
@@ -362,7 +364,7 @@ def test_a_step_is_timed_from_a_picture_to_the_next_request(camera) -> None:
 def test_a_recording_plays_at_its_pace_with_its_own_times_and_ends(tmp_path: Path, pace: float) -> None:
     path = write_video(tmp_path / "clip.avi", "MJPG", frames=20)
     clock = FakeClock()
-    source = LiveSource(str(path), LiveKnobs(pace=pace, queue_frames=64), clock=clock)
+    source = LiveSource(str(path), LiveParameters(pace=pace, queue_frames=64), clock=clock)
     frames = list(source)
     assert [f.number for f in frames] == list(range(1, 21))
     assert [number_of(f.image) for f in frames] == pytest.approx(range(1, 21), abs=1)
@@ -376,7 +378,7 @@ def test_a_recording_plays_at_its_pace_with_its_own_times_and_ends(tmp_path: Pat
 def test_a_recording_without_pace_waits_for_the_run(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.avi", "MJPG", frames=20)
     health = Health()
-    source = LiveSource(str(path), LiveKnobs(pace=0, queue_frames=1), health)
+    source = LiveSource(str(path), LiveParameters(pace=0, queue_frames=1), health)
     assert [(f.number, f.skipped) for f in source] == [(n, 0) for n in range(1, 21)]
     assert source.apart_s == 0
     assert "dropped" not in health.snapshot().counts
@@ -387,7 +389,7 @@ def test_a_damaged_recording_is_played_on(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.avi", "MJPG", frames=20)
     spoil_avi_frame(path, 12)
     health = Health()
-    frames = list(LiveSource(str(path), LiveKnobs(pace=0), health))
+    frames = list(LiveSource(str(path), LiveParameters(pace=0), health))
     assert [f.number for f in frames] == [n for n in range(1, 21) if n != 12]
     assert health.snapshot().counts["undecoded"] == 1
     assert [(e.kind, e.frame) for e in health.snapshot().events] == [("stream", 12)]
@@ -396,13 +398,13 @@ def test_a_damaged_recording_is_played_on(tmp_path: Path) -> None:
 def test_an_image_of_another_size_among_others_is_left_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "frames", range(1, 6))
     cv2.imwrite(str(folder / "frame3.png"), picture(3, 32, 24))
-    source = LiveSource(str(folder), LiveKnobs(pace=0))
+    source = LiveSource(str(folder), LiveParameters(pace=0))
     assert [f.number for f in source] == [1, 2, 4, 5]
     assert "32x24" in source.problems[0].what
 
 
 def test_a_recording_that_is_left_in_the_middle_leaves_no_thread(tmp_path: Path) -> None:
-    source = LiveSource(str(write_video(tmp_path / "clip.avi", "MJPG")), LiveKnobs(pace=0.001))
+    source = LiveSource(str(write_video(tmp_path / "clip.avi", "MJPG")), LiveParameters(pace=0.001))
     next(iter(source))
     source.close()
     assert not any(thread.is_alive() for thread in source._feed.threads)
@@ -429,8 +431,8 @@ def test_a_network_stream_that_is_cut_is_read_on_by_a_new_connection(tmp_path: P
     server = threading.Thread(target=serve)
     server.start()
     health = Health()
-    knobs = LiveKnobs(retry_s=0.01, retry_most_s=0.1, stall_s=20, queue_frames=64)
-    source = LiveSource(f"tcp://127.0.0.1:{listener.getsockname()[1]}", knobs, health)
+    parameters = LiveParameters(retry_s=0.01, retry_most_s=0.1, stall_s=20, queue_frames=64)
+    source = LiveSource(f"tcp://127.0.0.1:{listener.getsockname()[1]}", parameters, health)
     assert source.size == (64, 48)
     for frame in source:
         assert frame.image.shape == (48, 64, 3)

@@ -9,7 +9,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.runner import Failing, Feed, hand_on, results, told
 from torchvision_dddas.live.watchdog import Watchdog
-from torchvision_dddas.types import Detections, Followed, Frame, Surveyed, Telemetry, Tracks
+from torchvision_dddas.types import Detections, Frame, FrameResult, Telemetry, TrackedFrame, Tracks
 
 PICTURE = np.zeros((4, 4), np.uint8)
 
@@ -37,11 +37,11 @@ def result_of(frame, identity=1, person=None):
     def followed(known):
         box_px, one = np.array([[0.0, 0, 2, 2]]), np.ones(1)
         found = Detections(box_px, one, one, one, one)
-        return Followed(
+        return TrackedFrame(
             frame.number, frame, found, Tracks(frame.number, np.array([known]), box_px, one, np.zeros(1, int))
         )
 
-    return Surveyed(followed(identity)), None if person is None else followed(person)
+    return FrameResult(followed(identity)), None if person is None else followed(person)
 
 
 def path(broken=(), seen=None):

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tests.live.streams import FakeClock
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.live import Health, Shedding
 from torchvision_dddas.types import Adjustment, Frame
 
-BASE = with_knobs(
+BASE = with_parameters(
     Settings(),
     {"registration.keypoints": 400, "live.least_keypoints": 100, "live.maximum_every": 4, "live.load": 0.8},
 )
@@ -47,9 +47,9 @@ def test_long_looks_change_settings_and_the_source_and_are_told() -> None:
     source, clock, health = Source(), FakeClock(), Health()
     shedding = Shedding(source, BASE, health, clock=clock)
     moved = fed(shedding, source, [0.1] * 7, clock)
-    assert {(a.knob, a.new) for a in moved} == {("registration.keypoints", 100), ("sampling.every", 4)}
+    assert {(a.parameter, a.new) for a in moved} == {("registration.keypoints", 100), ("sampling.every", 4)}
     assert shedding.settings.registration.keypoints == 100
-    assert shedding.settings == with_knobs(BASE, {"registration.keypoints": 100})
+    assert shedding.settings == with_parameters(BASE, {"registration.keypoints": 100})
     assert source.every == 4
     told = health.snapshot()
     assert (told.gauges["every"], told.gauges["keypoints"]) == (4, 100)
@@ -62,7 +62,7 @@ def test_what_was_measured_before_a_change_does_not_count_after_it() -> None:
     source, clock = Source(), FakeClock()
     shedding = Shedding(source, BASE, clock=clock)
     moved = fed(shedding, source, [0.036] * 6 + [0.02] * 30, clock)
-    assert [(a.knob, a.new) for a in moved] == [("registration.keypoints", 200)]
+    assert [(a.parameter, a.new) for a in moved] == [("registration.keypoints", 200)]
 
 
 def test_a_burst_is_over_and_all_is_as_it_was() -> None:
@@ -76,11 +76,11 @@ def test_a_burst_is_over_and_all_is_as_it_was() -> None:
 
 
 def test_people_are_searched_for_less_widely_before_pictures_are_left_out() -> None:
-    settings = with_knobs(BASE, {"people.search": "regions"})
+    settings = with_parameters(BASE, {"people.search": "regions"})
     source, clock = Source(), FakeClock()
     shedding = Shedding(source, settings, people=True, clock=clock)
     moved = fed(shedding, source, [0.036] * 22, clock)
-    assert [(a.knob, a.new) for a in moved if a.knob.startswith("people")][:1] == [("people.look_share", 0.5)]
+    assert [(a.parameter, a.new) for a in moved if a.parameter.startswith("people")][:1] == [("people.look_share", 0.5)]
     assert source.every == 1
     assert shedding.settings.people.look_share < settings.people.look_share
 
@@ -90,7 +90,7 @@ def test_other_settings_between_frames_are_what_the_next_frames_are_seen_with(ke
     rng = np.random.default_rng(3)
     ground = rng.integers(0, 255, (140, 200), np.uint8).repeat(2, 0).repeat(2, 1)
     frames = [Frame(k + 1, k / 10, np.ascontiguousarray(ground[:240, k : 320 + k])) for k in range(14)]
-    later = with_knobs(BASE, {"registration.keypoints": keypoints})
+    later = with_parameters(BASE, {"registration.keypoints": keypoints})
     record = Adjustment(8, "registration.keypoints", 400, keypoints, "a test")
 
     def retune(frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:

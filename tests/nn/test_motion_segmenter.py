@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.nn.motion_segmenter import Core, Differences, Regions, SoftMotion
 
 KNOBS: dict[str, float] = {
@@ -15,9 +15,9 @@ KNOBS: dict[str, float] = {
     "difference.peak": 5.0,
     "gates.min_area_px": 20,
 }
-SETTINGS = with_knobs(Settings(), KNOBS)
+SETTINGS = with_parameters(Settings(), KNOBS)
 # Where noise is the unit, nothing is many units above it.
-NOISY = with_knobs(SETTINGS, {"difference.threshold": 1.5, "difference.peak": 1.6})
+NOISY = with_parameters(SETTINGS, {"difference.threshold": 1.5, "difference.peak": 1.6})
 
 
 def differences(
@@ -50,7 +50,7 @@ def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> 
 
 @pytest.mark.parametrize("kind", ["normalized", "to_reference"])
 def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
-    settings = with_knobs(SETTINGS, {"difference.kind": kind})
+    settings = with_parameters(SETTINGS, {"difference.kind": kind})
     motion, windows = SoftMotion(settings), differences()
     given, tuned = motion(windows, {}, 0.1), motion(windows, values(), 0.1)
     torch.testing.assert_close(given.mask, tuned.mask)
@@ -58,7 +58,7 @@ def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_the_gradient_of_every_knob_of_the_core_is_right(noisy: bool) -> None:
+def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> None:
     """In double precision, between whole sizes, and where nothing is rounded."""
     windows = differences(torch.float64, noisy)
     motion = SoftMotion(NOISY if noisy else SETTINGS, whole=False)
@@ -66,8 +66,8 @@ def test_the_gradient_of_every_knob_of_the_core_is_right(noisy: bool) -> None:
     at = (4.1, 0.16, 1.6 if noisy else 3.9, 4.3, 2.4, 5.6)
     weight = torch.rand(2, 1, 24, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
-    def total(*knobs: torch.Tensor) -> torch.Tensor:
-        return (motion(windows, dict(zip(names, knobs, strict=True)), 0.2).mask * weight).sum()
+    def total(*parameters: torch.Tensor) -> torch.Tensor:
+        return (motion(windows, dict(zip(names, parameters, strict=True)), 0.2).mask * weight).sum()
 
     starts = tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in at)
     # The unit of noise is told in whole steps and so has jumps; small steps stay between them.
@@ -108,15 +108,15 @@ def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
     assert float(slope) < 0
 
 
-def test_every_knob_has_a_finite_gradient_that_is_not_nothing() -> None:
+def test_every_parameter_has_a_finite_gradient_that_is_not_nothing() -> None:
     windows = differences(noisy=True)
     motion = SoftMotion(NOISY)
     near = {"difference.blur_px": 4.5, "difference.threshold": 1.5, "difference.peak": 1.6}
-    knobs = {name: value.requires_grad_() for name, value in values(near).items()}
-    core = motion(windows, knobs, 0.3)
-    motion.outlined(core, regions(core), knobs, 0.3).sum().backward()
-    slopes = np.array([float(value.grad) if value.grad is not None else np.nan for value in knobs.values()])
-    assert np.isfinite(slopes).all() and (slopes != 0).all(), dict(zip(knobs, slopes, strict=True))
+    parameters = {name: value.requires_grad_() for name, value in values(near).items()}
+    core = motion(windows, parameters, 0.3)
+    motion.outlined(core, regions(core), parameters, 0.3).sum().backward()
+    slopes = np.array([float(value.grad) if value.grad is not None else np.nan for value in parameters.values()])
+    assert np.isfinite(slopes).all() and (slopes != 0).all(), dict(zip(parameters, slopes, strict=True))
 
 
 def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
@@ -128,10 +128,10 @@ def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
         16.0,
         240.0,
     )
-    knobs = {name: value.requires_grad_() for name, value in values().items()}
+    parameters = {name: value.requires_grad_() for name, value in values().items()}
     motion = SoftMotion(SETTINGS)
-    core = motion(empty, knobs, 0.1)
+    core = motion(empty, parameters, 0.1)
     none = torch.zeros(1, 1, 20, 20, dtype=torch.int64)
-    mask = motion.outlined(core, Regions(none, none, 0), knobs, 0.1)
+    mask = motion.outlined(core, Regions(none, none, 0), parameters, 0.1)
     mask.sum().backward()
-    assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in knobs.values())
+    assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in parameters.values())

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import ConfirmKnobs, GroundKnobs, PeopleKnobs
+from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters
 from torchvision_dddas.people.collaboration import Beliefs, Look, View, confirm_boxes, evidence, look, view_of
 from torchvision_dddas.types import Camera
 
-KNOBS = ConfirmKnobs(spread_m=0.0)
+KNOBS = ConfirmParameters(spread_m=0.0)
 NORTH = View(np.zeros(2), 0.0, math.radians(30), 2.0, 20.0)
 
 
@@ -19,10 +19,12 @@ def square(sigma_m, n):
     return np.tile(sigma_m**2 * np.eye(2), (n, 1, 1))
 
 
-def seen(blobs, people=(), views=(NORTH,), knobs=KNOBS, blob_sigma=0.3, person_sigma=0.1, score=None):
+def seen(blobs, people=(), views=(NORTH,), parameters=KNOBS, blob_sigma=0.3, person_sigma=0.1, score=None):
     blobs, people = np.reshape(blobs, (-1, 2)).astype(float), np.reshape(people, (-1, 2)).astype(float)
     score = np.ones(len(people)) if score is None else np.array(score)
-    return look(blobs, square(blob_sigma, len(blobs)), people, square(person_sigma, len(people)), score, views, knobs)
+    return look(
+        blobs, square(blob_sigma, len(blobs)), people, square(person_sigma, len(people)), score, views, parameters
+    )
 
 
 def test_a_person_inside_the_gate_is_at_the_blob_and_the_distance_is_kept():
@@ -131,13 +133,13 @@ def test_nothing_changes_when_the_whole_scene_is_turned_and_moved(angle, east, n
 def test_a_cameras_view_reaches_as_far_as_bodies_are_large_enough():
     camera = Camera("ugv", (800, 600), (1000.0, 1000.0), (399.5, 299.5))
     view = view_of(
-        camera, np.zeros(2), 0.0, PeopleKnobs(enlarge=1.0, height_share=0.75), GroundKnobs(body_height_m=1.8)
+        camera, np.zeros(2), 0.0, PeopleParameters(enlarge=1.0, height_share=0.75), GroundParameters(body_height_m=1.8)
     )
     assert view.far_m == pytest.approx(1000 * 1.8 / 96)
     assert view.near_m == pytest.approx(3.0)
     assert view.half_rad == pytest.approx(math.atan(0.4))
-    twice = PeopleKnobs(enlarge=2.0, scale_step=2**0.25, height_share=0.75)  # whole steps to twice the size
-    closer = view_of(camera, np.zeros(2), 0.0, twice, GroundKnobs(body_height_m=1.8))
+    twice = PeopleParameters(enlarge=2.0, scale_step=2**0.25, height_share=0.75)  # whole steps to twice the size
+    closer = view_of(camera, np.zeros(2), 0.0, twice, GroundParameters(body_height_m=1.8))
     assert closer.far_m == pytest.approx(2 * view.far_m)
 
 
@@ -147,21 +149,21 @@ def one(looked, people=0, best=0.0):
 
 
 def test_a_look_weighs_as_bayes_says():
-    knobs = ConfirmKnobs(detection_rate=0.8, false_rate=0.1, prior=0.25)
-    beliefs = Beliefs(knobs)
+    parameters = ConfirmParameters(detection_rate=0.8, false_rate=0.1, prior=0.25)
+    beliefs = Beliefs(parameters)
     beliefs.add(["blob"], [("ugv", one(True, 1, 1.0))])
     assert beliefs.probability("blob") == pytest.approx(0.25 * 0.8 / (0.25 * 0.8 + 0.75 * 0.1))
-    assert evidence(one(True), knobs)[0] == pytest.approx(math.log(0.2 / 0.9))
-    assert evidence(one(False), knobs)[0] == 0
+    assert evidence(one(True), parameters)[0] == pytest.approx(math.log(0.2 / 0.9))
+    assert evidence(one(False), parameters)[0] == 0
 
 
 def test_a_less_probable_person_is_weaker_evidence_and_none_is_proof():
-    knobs = ConfirmKnobs()
-    weights = [evidence(one(True, 1, score), knobs)[0] for score in (0.5, 0.7, 0.9, 1.0)]
+    parameters = ConfirmParameters()
+    weights = [evidence(one(True, 1, score), parameters)[0] for score in (0.5, 0.7, 0.9, 1.0)]
     assert weights == sorted(weights)
     assert weights[0] == 0
     assert weights[1] == pytest.approx(math.log(0.7 / 0.3))
-    assert weights[-1] == pytest.approx(math.log(knobs.detection_rate / knobs.false_rate))
+    assert weights[-1] == pytest.approx(math.log(parameters.detection_rate / parameters.false_rate))
 
 
 def test_an_improbable_person_leaves_the_blob_in_doubt():
@@ -187,25 +189,27 @@ def test_one_chance_hit_makes_no_crowd_of_a_car():
 
 
 def test_what_was_never_seen_keeps_the_prior_and_is_unseen():
-    beliefs = Beliefs(ConfirmKnobs(prior=0.3))
+    beliefs = Beliefs(ConfirmParameters(prior=0.3))
     beliefs.add(["blob"], [("ugv", one(False))])
     assert beliefs.kind("blob") == "unseen"
     assert beliefs.probability("blob") == pytest.approx(0.3)
 
 
 def test_looks_of_two_vehicles_add_up_and_later_ones_of_the_same_weigh_less():
-    knobs = ConfirmKnobs(limit=50)
-    two, again = Beliefs(knobs), Beliefs(knobs)
+    parameters = ConfirmParameters(limit=50)
+    two, again = Beliefs(parameters), Beliefs(parameters)
     two.add(["blob"], [("a", one(True, 1, 1.0)), ("b", one(True, 1, 1.0))])
     for _ in range(2):
         again.add(["blob"], [("a", one(True, 1, 1.0))])
-    odds = knobs.detection_rate / knobs.false_rate
+    odds = parameters.detection_rate / parameters.false_rate
     assert two.probability("blob") == pytest.approx(odds**2 / (1 + odds**2))
-    assert again.probability("blob") == pytest.approx(odds ** (1 + knobs.fresh) / (1 + odds ** (1 + knobs.fresh)))
+    assert again.probability("blob") == pytest.approx(
+        odds ** (1 + parameters.fresh) / (1 + odds ** (1 + parameters.fresh))
+    )
 
 
 def test_a_belief_can_still_be_turned_after_a_long_time():
-    beliefs = Beliefs(ConfirmKnobs())
+    beliefs = Beliefs(ConfirmParameters())
     for _ in range(1000):
         beliefs.add(["blob"], [("a", one(True))])
     assert (beliefs.kind("blob"), beliefs.probability("blob") < 0.01) == ("not_human", True)
@@ -215,7 +219,7 @@ def test_a_belief_can_still_be_turned_after_a_long_time():
 
 
 def test_targets_do_not_mix():
-    beliefs = Beliefs(ConfirmKnobs())
+    beliefs = Beliefs(ConfirmParameters())
     looks = Look(np.array([True, True]), np.array([1, 0]), *(np.full(2, np.nan),) * 2, np.array([1.0, 0.0]))
     beliefs.add(["one", "other"], [("a", looks)])
     assert (beliefs.kind("one"), beliefs.kind("other")) == ("human", "not_human")
@@ -224,12 +228,14 @@ def test_targets_do_not_mix():
 def test_with_rates_as_stated_the_probabilities_are_calibrated():
     # Simulated: half of the blobs are people, each is looked at by two vehicles once.
     rng = np.random.default_rng(0)
-    knobs = ConfirmKnobs()
-    human = rng.random(20_000) < knobs.prior
-    beliefs = Beliefs(knobs)
+    parameters = ConfirmParameters()
+    human = rng.random(20_000) < parameters.prior
+    beliefs = Beliefs(parameters)
     names = list(range(len(human)))
     for vehicle in "ab":
-        people = (rng.random(len(human)) < np.where(human, knobs.detection_rate, knobs.false_rate)).astype(int)
+        people = (rng.random(len(human)) < np.where(human, parameters.detection_rate, parameters.false_rate)).astype(
+            int
+        )
         nothing = np.full(len(human), np.nan)
         looks = Look(np.ones(len(human), bool), people, nothing, nothing, people.astype(float))
         beliefs.add(names, [(vehicle, looks)])

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people import onnx_scorer as onboard_people
 from torchvision_dddas.people import opencv_gradient as onboard_gradient
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import OnboardRecognizer
+from torchvision_dddas.people.onnx_scorer import OnnxScorer
 from torchvision_dddas.people.opencv_gradient import Gradient
 from torchvision_dddas.people.scratch import Scratch, spans
 from torchvision_dddas.runtime import SHIPPED, manifest
@@ -40,7 +40,7 @@ def whole(image: np.ndarray) -> Part:
 
 
 def scored(image: np.ndarray, part: Part | None = None) -> np.ndarray:
-    ((found,),) = OnboardRecognizer(PeopleKnobs(), SVM).scores([image], [[part or whole(image)]])
+    ((found,),) = OnnxScorer(PeopleParameters(), SVM).scores([image], [[part or whole(image)]])
     return found
 
 
@@ -71,7 +71,7 @@ def test_how_the_work_is_cut_changes_nothing(monkeypatch, tile_px, gradient_px, 
 
 
 def test_arrays_that_are_used_again_leave_nothing_of_an_earlier_picture():
-    recognizer = OnboardRecognizer(PeopleKnobs(), SVM)
+    recognizer = OnnxScorer(PeopleParameters(), SVM)
     images = [picture(2), np.full((300, 260, 3), 255, np.uint8), picture(3, 140, 90)[..., 0].copy(), picture(2)]
     first, _, small, again = (recognizer.scores([image], [[whole(image)]])[0][0] for image in images)
     np.testing.assert_array_equal(first, again)
@@ -79,7 +79,7 @@ def test_arrays_that_are_used_again_leave_nothing_of_an_earlier_picture():
 
 
 def test_a_recognizer_may_be_asked_by_several_threads_at_once():
-    recognizer = OnboardRecognizer(PeopleKnobs(), SVM)
+    recognizer = OnnxScorer(PeopleParameters(), SVM)
     images = [picture(seed, 200, 180) for seed in range(6)]
     with ThreadPoolExecutor(3) as threads:
         together = list(threads.map(lambda image: recognizer.scores([image], [[whole(image)]])[0][0], images))
@@ -128,7 +128,7 @@ def test_an_array_is_made_anew_only_where_it_was_too_small():
 
 def test_graphs_of_another_layout_are_refused_with_what_makes_them():
     with pytest.raises(InputError, match=r"people.cell_px = 8, not 4.*dddas export --graph people.*people.cell_px=4"):
-        OnboardRecognizer(PeopleKnobs(cell_px=4), read_classifier("opencv", 3780))
+        OnnxScorer(PeopleParameters(cell_px=4), read_classifier("opencv", 3780))
 
 
 @pytest.mark.parametrize(("x", "y"), [(-40, 8), (-200, -160), (136, 0), (176, 200), (-16, -300)])
@@ -148,19 +148,19 @@ def test_a_folder_without_graphs_is_refused(tmp_path: Path, text: str | None):
     if text is not None:
         (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"people.graphs: .*dddas export"):
-        OnboardRecognizer(PeopleKnobs(graphs=str(tmp_path)), SVM)
+        OnnxScorer(PeopleParameters(graphs=str(tmp_path)), SVM)
 
 
 def test_a_manifest_without_its_graphs_is_refused(tmp_path: Path):
     shutil.copy(SHIPPED / "manifest.json", tmp_path)
     with pytest.raises(InputError, match=r"people_histograms.onnx"):
-        OnboardRecognizer(PeopleKnobs(graphs=str(tmp_path)), SVM)
+        OnnxScorer(PeopleParameters(graphs=str(tmp_path)), SVM)
 
 
 def test_the_shipped_graphs_are_small_and_fit_the_default_settings():
     assert sum(path.stat().st_size for path in SHIPPED.glob("*.onnx")) < 100_000
     made_for = manifest(SHIPPED)["graphs"]["people_scores.onnx"]["knobs"]
-    assert made_for == {name: int(getattr(PeopleKnobs(), name)) for name in onboard_people.BAKED}
+    assert made_for == {name: int(getattr(PeopleParameters(), name)) for name in onboard_people.BAKED}
 
 
 def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
@@ -170,22 +170,22 @@ def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
         from pathlib import Path
         import cv2
         import numpy as np
-        from torchvision_dddas.config import PeopleKnobs
+        from torchvision_dddas.config import PeopleParameters
         from torchvision_dddas.people.classifiers import read_classifier
         from torchvision_dddas.targets import scan
-        from torchvision_dddas.people.scorer import load_recognizer
+        from torchvision_dddas.people.scorer import load_scorer
 
         def peak_mb():
             lines = Path("/proc/self/status").read_text().splitlines()
             return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
         cv2.setNumThreads(2)
-        knobs = PeopleKnobs(scale_step=1.2)
-        recognizer = load_recognizer("auto", knobs, read_classifier("opencv", 3780))
+        parameters = PeopleParameters(scale_step=1.2)
+        recognizer = load_scorer("auto", parameters, read_classifier("opencv", 3780))
         image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
         peaks = []
         for _ in range(6):
-            recognizer.scores([image], [scan.everywhere((640, 480), knobs)])
+            recognizer.scores([image], [scan.everywhere((640, 480), parameters)])
             peaks.append(peak_mb())
         print(json.dumps({"name": recognizer.name, "torch": "torch" in sys.modules, "peaks": peaks}))
     """)

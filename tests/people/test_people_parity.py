@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people import suppression as suppress
 from torchvision_dddas.people import torch_scorer as torch_people
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.scorer import Recognizer, load_recognizer
-from torchvision_dddas.people.torch_scorer import TorchRecognizer
+from torchvision_dddas.people.scorer import WindowScorer, load_scorer
+from torchvision_dddas.people.torch_scorer import TorchScorer
 from torchvision_dddas.types import LinearSvm, Part
 
 BACK_ENDS = "torch", "onboard"
@@ -42,24 +42,37 @@ def scene(seed: int, height: int, width: int) -> np.ndarray:
     return picture
 
 
-def descriptor(knobs: PeopleKnobs) -> cv2.HOGDescriptor:
-    window = knobs.window_width_px, knobs.window_height_px
-    block, stride, cell = ((side, side) for side in (knobs.block_px, knobs.block_stride_px, knobs.cell_px))
+def descriptor(parameters: PeopleParameters) -> cv2.HOGDescriptor:
+    window = parameters.window_width_px, parameters.window_height_px
+    block, stride, cell = (
+        (side, side) for side in (parameters.block_px, parameters.block_stride_px, parameters.cell_px)
+    )
     return cv2.HOGDescriptor(
-        window, block, stride, cell, knobs.bins, 1, -1, 0, knobs.clip, knobs.gamma, knobs.max_levels, knobs.signed
+        window,
+        block,
+        stride,
+        cell,
+        parameters.bins,
+        1,
+        -1,
+        0,
+        parameters.clip,
+        parameters.gamma,
+        parameters.max_levels,
+        parameters.signed,
     )
 
 
-def opencv(knobs: PeopleKnobs, svm: LinearSvm) -> cv2.HOGDescriptor:
-    made = descriptor(knobs)
+def opencv(parameters: PeopleParameters, svm: LinearSvm) -> cv2.HOGDescriptor:
+    made = descriptor(parameters)
     made.setSVMDetector(np.append(svm.weights, svm.bias).astype(np.float32))
     return made
 
 
-def opencv_map(level: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm = SVM) -> np.ndarray:
+def opencv_map(level: np.ndarray, parameters: PeopleParameters, svm: LinearSvm = SVM) -> np.ndarray:
     """Of every window of a level."""
-    stride, pad = knobs.window_stride_px, knobs.padding_px
-    hits = opencv(knobs, svm).detect(level, -1e9, (stride, stride), (pad, pad))
+    stride, pad = parameters.window_stride_px, parameters.padding_px
+    hits = opencv(parameters, svm).detect(level, -1e9, (stride, stride), (pad, pad))
     places, found = (np.asarray(hit) for hit in hits)
     columns, rows = ((places + pad) // stride).T
     wanted = np.full((rows.max() + 1, columns.max() + 1), np.nan)
@@ -68,9 +81,9 @@ def opencv_map(level: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm = SVM) -> n
     return wanted
 
 
-def random_svm(knobs: PeopleKnobs) -> LinearSvm:
+def random_svm(parameters: PeopleParameters) -> LinearSvm:
     """Of mixed signs, so that about half of all windows score above zero."""
-    weights = descriptor(knobs).getDescriptorSize()
+    weights = descriptor(parameters).getDescriptorSize()
     return LinearSvm((np.random.default_rng(0).normal(size=weights) * 6 / weights**0.5).astype(np.float32), -0.05)
 
 
@@ -94,15 +107,15 @@ KNOBS = {
 @pytest.mark.parametrize("given", KNOBS.values(), ids=KNOBS)
 @pytest.mark.parametrize("grey", [False, True])
 def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
-    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1} | given)
+    parameters = PeopleParameters(**PLAIN | {"scale_step": 1.1} | given)
     picture = scene(0, 171, 203)
     picture = picture[..., 1].copy() if grey else picture
-    parts = scan.everywhere((203, 171), knobs)
-    (maps,) = load_recognizer(backend, knobs, SVM).scores([picture], [parts])
+    parts = scan.everywhere((203, 171), parameters)
+    (maps,) = load_scorer(backend, parameters, SVM).scores([picture], [parts])
     assert len(maps) == len(parts) >= 2
     for part, found in zip(parts, maps, strict=True):
         level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        wanted = opencv_map(level, knobs)
+        wanted = opencv_map(level, parameters)
         assert found.shape == wanted.shape and found.dtype == np.float32
         np.testing.assert_allclose(found, wanted, atol=2e-5, rtol=0)
         assert ((found > 0) == (wanted > 0)).all()
@@ -111,14 +124,16 @@ def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
 @pytest.mark.parametrize("backend", BACK_ENDS)
 @pytest.mark.parametrize("size", [(48, 96), (96, 96), (16, 32)])
 def test_a_window_of_another_size_scores_as_in_opencv(backend, size):
-    knobs = PeopleKnobs(**PLAIN | {"window_width_px": size[0], "window_height_px": size[1], "scale_step": 1.3})
-    svm = random_svm(knobs)
+    parameters = PeopleParameters(
+        **PLAIN | {"window_width_px": size[0], "window_height_px": size[1], "scale_step": 1.3}
+    )
+    svm = random_svm(parameters)
     picture = scene(1, 120, 150)
-    parts = scan.everywhere((150, 120), knobs)
-    (maps,) = load_recognizer(backend, knobs, svm).scores([picture], [parts])
+    parts = scan.everywhere((150, 120), parameters)
+    (maps,) = load_scorer(backend, parameters, svm).scores([picture], [parts])
     for part, found in zip(parts, maps, strict=True):
         level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        np.testing.assert_allclose(found, opencv_map(level, knobs, svm), atol=5e-5, rtol=0)
+        np.testing.assert_allclose(found, opencv_map(level, parameters, svm), atol=5e-5, rtol=0)
 
 
 LAYOUTS = {
@@ -132,28 +147,30 @@ LAYOUTS = {
 @pytest.mark.parametrize("stride", [4, 6, 16])
 @pytest.mark.parametrize("given", LAYOUTS.values(), ids=LAYOUTS)
 def test_another_descriptor_scores_as_in_opencv_at_any_stride(given, stride):
-    knobs = PeopleKnobs(**PLAIN | given | {"window_stride_px": stride, "padding_px": stride, "scale_step": 1.5})
-    svm = random_svm(knobs)
+    parameters = PeopleParameters(
+        **PLAIN | given | {"window_stride_px": stride, "padding_px": stride, "scale_step": 1.5}
+    )
+    svm = random_svm(parameters)
     picture = scene(2, 140, 160)
-    parts = scan.everywhere((160, 140), knobs)
-    (maps,) = load_recognizer("torch", knobs, svm).scores([picture], [parts])
+    parts = scan.everywhere((160, 140), parameters)
+    (maps,) = load_scorer("torch", parameters, svm).scores([picture], [parts])
     for part, found in zip(parts, maps, strict=True):
         level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        np.testing.assert_allclose(found, opencv_map(level, knobs, svm), atol=1e-4, rtol=0)
+        np.testing.assert_allclose(found, opencv_map(level, parameters, svm), atol=1e-4, rtol=0)
 
 
 @pytest.fixture(scope="module", params=BACK_ENDS)
-def recognizer(request) -> Recognizer:
-    return load_recognizer(request.param, PeopleKnobs(**PLAIN), SVM)
+def recognizer(request) -> WindowScorer:
+    return load_scorer(request.param, PeopleParameters(**PLAIN), SVM)
 
 
 @effort(max_examples=25, deadline=None)
 @given(st.data())
 def test_a_part_scores_as_in_a_search_everywhere(recognizer, data):
-    knobs = PeopleKnobs(**PLAIN | {"padding_px": 16, "scale_step": 1.1})
+    parameters = PeopleParameters(**PLAIN | {"padding_px": 16, "scale_step": 1.1})
     picture = scene(3, 160, 190)
-    whole = data.draw(st.sampled_from(scan.everywhere((190, 160), knobs)))
-    stride = knobs.window_stride_px
+    whole = data.draw(st.sampled_from(scan.everywhere((190, 160), parameters)))
+    stride = parameters.window_stride_px
     column = data.draw(st.integers(0, (whole.width - 64) // stride))
     row = data.draw(st.integers(0, (whole.height - 128) // stride))
     width = data.draw(st.integers(64, whole.width - column * stride))
@@ -166,9 +183,9 @@ def test_a_part_scores_as_in_a_search_everywhere(recognizer, data):
 
 def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
     pictures = [scene(4, 150, 170), scene(5, 150, 170), scene(6, 150, 170)[..., 0].copy(), scene(7, 180, 140)]
-    knobs = PeopleKnobs(**PLAIN | {"scale_step": 1.1})
+    parameters = PeopleParameters(**PLAIN | {"scale_step": 1.1})
     parts = [
-        scan.everywhere(picture.shape[1::-1], knobs)[::step]
+        scan.everywhere(picture.shape[1::-1], parameters)[::step]
         for picture, step in zip(pictures, (1, 2, 1, 1), strict=True)
     ]
     parts[1] = parts[1][::-1]
@@ -179,7 +196,7 @@ def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
 
 
 def test_how_many_pictures_share_a_batch_changes_nothing(monkeypatch):
-    recognizer = TorchRecognizer(PeopleKnobs(**PLAIN), SVM, "cpu")
+    recognizer = TorchScorer(PeopleParameters(**PLAIN), SVM, "cpu")
     pictures, part = [scene(seed, 140, 90) for seed in range(5)], Part((84, 131), 0, 0, 84, 131)
     at_once = recognizer.scores(pictures, [[part]] * 5)
     monkeypatch.setattr(torch_people, "_PIXELS", {"cpu": 2 * 84 * 131})
@@ -218,12 +235,12 @@ def test_a_view_into_a_larger_picture_scores_as_its_copy(recognizer):
     ("stride", "pad", "step", "least"), [(8, 0, 1.05, 2), (8, 32, 1.05, 2), (4, 8, 1.1, 3), (8, 8, 1.2, 0)]
 )
 def test_detections_by_opencvs_grouping_are_opencvs(backend, stride, pad, step, least):
-    knobs = PeopleKnobs(
+    parameters = PeopleParameters(
         **PLAIN | {"window_stride_px": stride, "padding_px": pad, "scale_step": step, "threshold": -0.3},
         suppression="opencv",
         group=least,
     )
-    assert same_boxes(scene(10, 233, 311), knobs, SVM, backend) >= 2
+    assert same_boxes(scene(10, 233, 311), parameters, SVM, backend) >= 2
 
 
 SMALL: dict[str, Any] = {
@@ -246,38 +263,40 @@ SMALL: dict[str, Any] = {
     seed=st.integers(0, 10_000),
 )
 def test_detections_in_any_picture_are_opencvs(size, stride, pads, step, threshold, least, seed):
-    knobs = PeopleKnobs(
+    parameters = PeopleParameters(
         **PLAIN | SMALL | {"window_stride_px": stride, "padding_px": pads * stride, "scale_step": step},
         suppression="opencv",
         group=least,
     )
     noise = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), np.uint8)
     picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), noise, 0, 255, cv2.NORM_MINMAX)
-    svm = random_svm(knobs)
+    svm = random_svm(parameters)
     # No window scores so near the threshold that the order of a sum decides.
-    (maps,) = load_recognizer("torch", knobs, svm).scores([picture], [scan.everywhere(size, knobs)])
+    (maps,) = load_scorer("torch", parameters, svm).scores([picture], [scan.everywhere(size, parameters)])
     near = np.sort(np.concatenate([scored.ravel() for scored in maps]))
     near = np.concatenate([[threshold], near[(near > threshold) & (near < threshold + 0.1)], [threshold + 0.1]])
     widest = int(np.diff(near).argmax())
     middle = float(near[widest] + near[widest + 1]) / 2
-    same_boxes(picture, knobs.model_copy(update={"threshold": middle}), svm, "torch")
+    same_boxes(picture, parameters.model_copy(update={"threshold": middle}), svm, "torch")
 
 
-def same_boxes(picture: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm, backend: str) -> int:
+def same_boxes(picture: np.ndarray, parameters: PeopleParameters, svm: LinearSvm, backend: str) -> int:
     """Asserts that grouped detections are those of detectMultiScale, and says how many there are."""
-    size, stride, pad = picture.shape[1::-1], knobs.window_stride_px, knobs.padding_px
-    rectangles, weights = opencv(knobs, svm).detectMultiScale(
+    size, stride, pad = picture.shape[1::-1], parameters.window_stride_px, parameters.padding_px
+    rectangles, weights = opencv(parameters, svm).detectMultiScale(
         picture,
-        hitThreshold=knobs.threshold,
+        hitThreshold=parameters.threshold,
         winStride=(stride, stride),
         padding=(pad, pad),
-        scale=knobs.scale_step,
-        groupThreshold=knobs.group,
+        scale=parameters.scale_step,
+        groupThreshold=parameters.group,
     )
     wanted = np.column_stack([np.reshape(rectangles, (-1, 4)), np.ravel(weights)])
-    parts = scan.everywhere(size, knobs)
-    (maps,) = load_recognizer(backend, knobs, svm).scores([picture], [parts])
-    boxes, scores = suppress.group(*scan.windows(parts, maps, size, knobs), knobs.group, knobs.group_distance)
+    parts = scan.everywhere(size, parameters)
+    (maps,) = load_scorer(backend, parameters, svm).scores([picture], [parts])
+    boxes, scores = suppress.group(
+        *scan.windows(parts, maps, size, parameters), parameters.group, parameters.group_distance
+    )
     # OpenCV cuts the boxes at the picture's border, last of all; here a body's place in its window needs all of it.
     low, high = np.maximum(boxes[:, :2], 0), np.minimum(boxes[:, :2] + boxes[:, 2:], size)
     found = np.column_stack([low, high - low, scores])[(high > low).all(axis=1)]
@@ -288,7 +307,7 @@ def same_boxes(picture: np.ndarray, knobs: PeopleKnobs, svm: LinearSvm, backend:
 
 
 def test_gradients_reach_the_levels_of_the_picture_and_the_weights():
-    recognizer = TorchRecognizer(PeopleKnobs(), SVM, "cpu")
+    recognizer = TorchScorer(PeopleParameters(), SVM, "cpu")
     recognizer.weights.requires_grad_()
     picture = torch.from_numpy(scene(11, 150, 90)).permute(2, 0, 1)[None].float().requires_grad_()
     found = recognizer.score(picture, Part((80, 134), 0, 0, 80, 134))
@@ -301,7 +320,7 @@ def test_gradients_reach_the_levels_of_the_picture_and_the_weights():
 @pytest.mark.parametrize("backend", BACK_ENDS)
 def test_a_classifier_of_another_length_is_refused_with_both_lengths(backend):
     with pytest.raises(InputError, match=r"file\.txt has 3000 weights.* has 3780"):
-        load_recognizer(backend, PeopleKnobs(), LinearSvm(np.zeros(3000, np.float32), 0.0, "file.txt"))
+        load_scorer(backend, PeopleParameters(), LinearSvm(np.zeros(3000, np.float32), 0.0, "file.txt"))
 
 
 @pytest.mark.parametrize("backend", BACK_ENDS)
@@ -310,7 +329,7 @@ def test_pictures_that_must_not_be_written_to_or_lie_otherwise_in_memory_score_t
     locked = picture.copy()
     locked.flags.writeable = False
     others = [locked, np.asfortranarray(picture), np.ascontiguousarray(picture[:, ::-1])[:, ::-1]]
-    wanted, *found = load_recognizer(backend, PeopleKnobs(), SVM).scores([picture, *others], [parts] * 4)
+    wanted, *found = load_scorer(backend, PeopleParameters(), SVM).scores([picture, *others], [parts] * 4)
     for scored in found:
         np.testing.assert_array_equal(scored[0], wanted[0])
     assert not recwarn.list

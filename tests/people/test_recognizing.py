@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import PeopleKnobs, Settings
+from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.people.detector import UNREAD, checked, people_in, recognize
@@ -57,8 +57,8 @@ class Clip:
             yield Frame(number, (number - 1) / self.rate_hz, self.images.get(number, image))
 
 
-def settings(**knobs):
-    return Settings(people=PeopleKnobs(**knobs))
+def settings(**parameters):
+    return Settings(people=PeopleParameters(**parameters))
 
 
 def table(rows):
@@ -166,7 +166,7 @@ def test_what_is_no_picture_is_one_line(image, says):
 def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
     images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
     with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
-        people_in(images, Brightest(), PeopleKnobs())
+        people_in(images, Brightest(), PeopleParameters())
 
 
 def test_one_channel_is_grey():
@@ -178,7 +178,7 @@ def test_pictures_at_hand_give_the_people_of_the_clip():
     clip = Clip(numbers=(1, 2, 3), last=3)
     images = [frame.image for frame in clip]
     for one, r in zip(
-        people_in(images, Brightest(), PeopleKnobs()), recognize(clip, Brightest(), settings()), strict=True
+        people_in(images, Brightest(), PeopleParameters()), recognize(clip, Brightest(), settings()), strict=True
     ):
         assert isinstance(one, People) and same(one, r.people)
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.search_regions import Expected, Search, around_blobs
 from torchvision_dddas.types import People
 
 SIZE = (640, 480)
-KNOBS = PeopleKnobs(search="regions", rescan_frames=10)
+KNOBS = PeopleParameters(search="regions", rescan_frames=10)
 
 
 def people(*boxes):
@@ -36,9 +36,9 @@ def inside(box, region):
 
 
 def test_the_whole_picture_is_searched_in_every_frame_by_default():
-    made = looks(Search(PeopleKnobs()), lambda n: people(walker(n)), 12)
+    made = looks(Search(PeopleParameters()), lambda n: people(walker(n)), 12)
     assert all(look.regions_px is None and look.share == 1 and not look.adjustments for look in made.values())
-    assert made[5].parts == scan.everywhere(SIZE, PeopleKnobs())
+    assert made[5].parts == scan.everywhere(SIZE, PeopleParameters())
 
 
 def test_a_walker_is_searched_for_where_he_will_be_and_the_first_look_is_at_all():
@@ -51,9 +51,9 @@ def test_a_walker_is_searched_for_where_he_will_be_and_the_first_look_is_at_all(
 
 @pytest.mark.parametrize("rescan", [1, 2, 3, 10, 17, 60])
 def test_every_level_has_its_turn_once_in_a_round_and_no_window_is_searched_twice(rescan):
-    knobs = KNOBS.model_copy(update={"rescan_frames": rescan})
-    everywhere = scan.everywhere(SIZE, knobs)
-    made = looks(Search(knobs), lambda n: people(walker(n)), 1 + 2 * rescan)
+    parameters = KNOBS.model_copy(update={"rescan_frames": rescan})
+    everywhere = scan.everywhere(SIZE, parameters)
+    made = looks(Search(parameters), lambda n: people(walker(n)), 1 + 2 * rescan)
     for begin in (2, 2 + rescan):
         whole = [part for n in range(begin, begin + rescan) for part in made[n].parts if part in everywhere]
         assert sorted(whole, key=str) == sorted(everywhere, key=str)
@@ -155,13 +155,15 @@ def windows_of(part):
 def test_the_record_has_a_line_where_the_share_changes_and_not_one_a_frame():
     made = looks(Search(KNOBS), lambda n: people(walker(n)), 110)
     lines = [a for look in made.values() for a in look.adjustments]
-    assert [(a.frame, a.knob, a.old, a.cause) for a in lines] == [(2, "people.regions_share", 1.0, "1 person expected")]
+    assert [(a.frame, a.parameter, a.old, a.cause) for a in lines] == [
+        (2, "people.regions_share", 1.0, "1 person expected")
+    ]
     assert 0 < lines[0].new < 0.1
 
 
 def test_regions_that_would_cost_nearly_all_are_given_up_for_the_whole_picture():
-    knobs = PeopleKnobs(search="regions", region_margin=5, region_scales=4)
-    made = looks(Search(knobs), lambda n: people(*((x, 150, 60, 150) for x in range(0, 600, 60))), 3)
+    parameters = PeopleParameters(search="regions", region_margin=5, region_scales=4)
+    made = looks(Search(parameters), lambda n: people(*((x, 150, 60, 150) for x in range(0, 600, 60))), 3)
     assert all(look.regions_px is None for look in made.values())
 
 
@@ -174,17 +176,17 @@ def test_after_a_gap_longer_than_a_round_the_whole_picture_is_searched():
 
 def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where_there_are_none():
     blobs = {1: np.array([[200, 100, 50, 120.0]])}
-    made = looks(Search(PeopleKnobs(), lambda n: blobs.get(n, np.zeros((0, 4)))), lambda n: people(), 25)
+    made = looks(Search(PeopleParameters(), lambda n: blobs.get(n, np.zeros((0, 4)))), lambda n: people(), 25)
     assert len(made[1].regions_px) == 1 and 0 < made[1].share < 0.2
     assert all(look.share == 0 and look.parts == [] and len(look.regions_px) == 0 for n, look in made.items() if n > 1)
 
 
 def test_with_blobs_alone_nothing_else_is_searched_however_much_they_cover():
     blobs = np.array([[x, y, 200, 150.0] for x in range(0, 640, 100) for y in range(0, 480, 100)])
-    look = Search(PeopleKnobs(), lambda n: blobs).look(1, SIZE)
+    look = Search(PeopleParameters(), lambda n: blobs).look(1, SIZE)
     assert look.regions_px is not None and len(look.regions_px) == len(blobs)
     assert look.share > 0.3
-    assert set(look.parts) != set(scan.everywhere(SIZE, PeopleKnobs()))
+    assert set(look.parts) != set(scan.everywhere(SIZE, PeopleParameters()))
 
 
 def test_with_blobs_and_regions_both_are_searched_and_the_whole_picture_at_first():

@@ -9,7 +9,7 @@ import pytest
 from torchvision_dddas.simulation.aerial import AerialCamera
 from torchvision_dddas.simulation.camera import axes, view_of
 from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import CameraKnobs, Scenario, WorldKnobs
+from torchvision_dddas.simulation.scenario import CameraParameters, Scenario, WorldParameters
 from torchvision_dddas.simulation.world import World, build
 from torchvision_dddas.types import Bodies, CameraPose, Elevation
 
@@ -28,13 +28,13 @@ CLEAR = {
 @pytest.fixture(scope="module")
 def bare() -> World:
     """Grey ground with some relief and nothing on it."""
-    knobs = WorldKnobs(side_m=SIDE_M, relief_m=4, bushes_per_ha=0, trees_per_ha=0, buildings=0)
-    world = build(knobs, seed=1)
+    parameters = WorldParameters(side_m=SIDE_M, relief_m=4, bushes_per_ha=0, trees_per_ha=0, buildings=0)
+    world = build(parameters, seed=1)
     return replace(world, albedo=np.full_like(world.albedo, 120), surface=np.zeros_like(world.surface))
 
 
 def scenario(**camera: float) -> Scenario:
-    return Scenario(camera=CameraKnobs.model_validate({**CLEAR, **camera}), seed=5)
+    return Scenario(camera=CameraParameters.model_validate({**CLEAR, **camera}), seed=5)
 
 
 def people(places: np.ndarray, world: World, target: np.ndarray | int = 1, facing: float = 0.4) -> Bodies:
@@ -273,10 +273,10 @@ def test_vehicles_have_their_length_and_lie_along_their_heading(bare, kind):
 
 
 def test_a_picture_depends_on_the_seed_and_its_moment_alone(bare):
-    world = build(WorldKnobs(side_m=SIDE_M), seed=2)
-    knobs = Scenario(seed=7)
+    world = build(WorldParameters(side_m=SIDE_M), seed=2)
+    parameters = Scenario(seed=7)
     crowd = people(np.array([[0.0, 1.0], [2.0, 2.0]]), world)
-    first, second = AerialCamera(world, knobs), AerialCamera(world, knobs)
+    first, second = AerialCamera(world, parameters), AerialCamera(world, parameters)
     for number in (1, 2, 3):
         first.take(moment(world, crowd, number=number))
     ours, theirs = (camera.take(moment(world, crowd, number=4)) for camera in (first, second))

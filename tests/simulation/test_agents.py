@@ -10,16 +10,16 @@ from torchvision_dddas import geometry
 from torchvision_dddas.simulation.agents import Agents
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import (
-    AircraftKnobs,
+    AircraftParameters,
     CarPlan,
-    ClipKnobs,
+    ClipParameters,
     CrowdPlan,
     Fault,
-    GpsKnobs,
+    GpsParameters,
     Happening,
     Scenario,
-    TeamKnobs,
-    WorldKnobs,
+    TeamParameters,
+    WorldParameters,
 )
 from torchvision_dddas.types import Command, Order
 
@@ -38,7 +38,7 @@ def world_of(side_m: float = 200.0, trees: int = 12, seed: int = 3) -> Any:
 def busy(**changed: object) -> Scenario:
     given: dict[str, object] = {
         "seed": 5,
-        "world": WorldKnobs(side_m=200.0),
+        "world": WorldParameters(side_m=200.0),
         "crowd": (
             CrowdPlan(people=10, start_m=(-30.0, 10.0)),
             CrowdPlan(people=8, start_m=(25.0, 0.0), behaviour="random"),
@@ -49,8 +49,8 @@ def busy(**changed: object) -> Scenario:
             Happening(time_s=2.0, what="split", crowds=(1,)),
             Happening(time_s=3.0, what="scatter", crowds=(2,)),
         ),
-        "gps": GpsKnobs(error95_m=3.5, common_m=0.5),
-        "uav": AircraftKnobs(way_m=((20.0, 0.0), (20.0, 20.0))),
+        "gps": GpsParameters(error95_m=3.5, common_m=0.5),
+        "uav": AircraftParameters(way_m=((20.0, 0.0), (20.0, 20.0))),
     }
     return scenario_of(given | changed)
 
@@ -111,7 +111,7 @@ def test_the_first_moment_is_frame_one_at_time_nought() -> None:
 
 def test_nobody_leaves_the_world() -> None:
     scenario = busy(
-        world=WorldKnobs(side_m=80.0),
+        world=WorldParameters(side_m=80.0),
         crowd=tuple(CrowdPlan(people=5, start_m=(0.0, 0.0), speed_m_s=6.0, heading_deg=h) for h in (0.0, 45.0, 170.0)),
         car=(CarPlan(speed_m_s=12.0, heading_deg=30.0), CarPlan(start_m=(5.0, 20.0), way_m=((500.0, 0.0),))),
         happening=(Happening(time_s=1.0, what="scatter", crowds=(1, 2)),),
@@ -160,7 +160,7 @@ def test_bodies_keep_their_numbers_and_vehicles_their_targets() -> None:
 
 
 def test_a_world_without_people_and_vehicles_goes_on() -> None:
-    empty = scenario_of({"team": TeamKnobs(ugvs=0)})
+    empty = scenario_of({"team": TeamParameters(ugvs=0)})
     last = moments(empty, 30)[-1]
     assert len(last.bodies) == 0
     assert last.reports == ()
@@ -170,7 +170,7 @@ def test_a_world_without_people_and_vehicles_goes_on() -> None:
 
 @pytest.mark.parametrize("rate_hz", [1.0, 7.0, 30.0])
 def test_any_rate_of_frames_will_do(rate_hz: float) -> None:
-    scenario = busy(clip=ClipKnobs(rate_hz=rate_hz))
+    scenario = busy(clip=ClipParameters(rate_hz=rate_hz))
     found = moments(scenario, 20)
     assert found[-1].time_s == pytest.approx(20 / rate_hz)
     frames = sorted({r.frame for one in found for r in one.reports if not r.planned})
@@ -180,8 +180,8 @@ def test_any_rate_of_frames_will_do(rate_hz: float) -> None:
 def faulty(what: str, **more: object) -> list[Moment]:
     scenario = busy(
         fault=(Fault.model_validate({"what": what, "time_s": 2.0, "seconds": 1.5, "vehicle": 2} | more),),
-        team=TeamKnobs(patrol="along", ugvs=4),
-        gps=GpsKnobs(),
+        team=TeamParameters(patrol="along", ugvs=4),
+        gps=GpsParameters(),
     )
     return moments(scenario, 60)
 

@@ -10,7 +10,7 @@ from torchvision_dddas.simulation.aircraft import Aircraft, Swaying, Telemetry
 from torchvision_dddas.simulation.camera import view_of
 from torchvision_dddas.simulation.obstacles import Obstacles
 from torchvision_dddas.simulation.receiver import Receivers
-from torchvision_dddas.simulation.scenario import AircraftKnobs, TeamKnobs
+from torchvision_dddas.simulation.scenario import AircraftParameters, TeamParameters
 from torchvision_dddas.simulation.team import ACCELERATION_M_S2, TURN_RAD_S, Team, plates
 from torchvision_dddas.simulation.ways import Way
 from torchvision_dddas.types import Camera, CameraPose
@@ -69,11 +69,11 @@ def test_exact_receivers_do_not_err() -> None:
 # --- the team
 
 
-def team_of(discs: tuple[tuple[float, float, float], ...] = (), seed: int = 4, **knobs: object) -> Team:
+def team_of(discs: tuple[tuple[float, float, float], ...] = (), seed: int = 4, **parameters: object) -> Team:
     places = np.array(discs, float).reshape(-1, 3)
     things = SimpleNamespace(kind=("tree",) * len(places), east_north_m=places[:, :2], radius_m=places[:, 2])
-    flight = AircraftKnobs(way_m=((40.0, 0.0),), speed_m_s=1.5)
-    return Team(TeamKnobs.model_validate(knobs), flight, 200.0, Obstacles(things, 200.0), seed)
+    flight = AircraftParameters(way_m=((40.0, 0.0),), speed_m_s=1.5)
+    return Team(TeamParameters.model_validate(parameters), flight, 200.0, Obstacles(things, 200.0), seed)
 
 
 def drive(team: Team, seconds: float, people: np.ndarray = NOBODY) -> dict[str, np.ndarray]:
@@ -209,12 +209,12 @@ def fly(aircraft: Aircraft, seconds: float, step_s: float = 0.1, start_s: float 
     return found
 
 
-def craft(half_m: float = 200.0, up_m: object = level, seed: int = 0, **knobs: object) -> Aircraft:
-    return Aircraft(AircraftKnobs.model_validate(knobs), half_m, up_m, seed)  # type: ignore[arg-type]
+def craft(half_m: float = 200.0, up_m: object = level, seed: int = 0, **parameters: object) -> Aircraft:
+    return Aircraft(AircraftParameters.model_validate(parameters), half_m, up_m, seed)  # type: ignore[arg-type]
 
 
-def calm(half_m: float = 200.0, up_m: object = level, **knobs: object) -> Aircraft:
-    return craft(half_m, up_m, 0, **({"wind_m_s": 0.0, "shake_deg": 0.0} | knobs))
+def calm(half_m: float = 200.0, up_m: object = level, **parameters: object) -> Aircraft:
+    return craft(half_m, up_m, 0, **({"wind_m_s": 0.0, "shake_deg": 0.0} | parameters))
 
 
 @pytest.mark.parametrize("pitch_deg", [90.0, 60.0, 45.0])
@@ -324,10 +324,12 @@ def test_it_is_not_sent_out_of_the_world() -> None:
 
 
 def test_its_telemetry_errs_lastingly_by_what_the_knobs_say() -> None:
-    knobs = AircraftKnobs(angle_error_deg=1.0, heading_error_deg=3.0, altitude_error=0.02, place_error95_m=3.5)
+    parameters = AircraftParameters(
+        angle_error_deg=1.0, heading_error_deg=3.0, altitude_error=0.02, place_error95_m=3.5
+    )
     errors = []
     for seed in range(800):
-        telemetry = Telemetry(knobs, seed)
+        telemetry = Telemetry(parameters, seed)
         errors.append([telemetry.errors(0.1) for _ in range(2)])
     found = np.array(errors)
     sigma = np.array([np.radians(1), np.radians(1), np.radians(3), 0.02, 1.43, 1.43])

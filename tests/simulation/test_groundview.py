@@ -7,12 +7,12 @@ import pytest
 
 from torchvision_dddas.simulation.groundview import GroundCamera
 from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import GpsKnobs, Scenario, TeamKnobs, WorldKnobs
+from torchvision_dddas.simulation.scenario import GpsParameters, Scenario, TeamParameters, WorldParameters
 from torchvision_dddas.simulation.world import World, build
 from torchvision_dddas.types import Bodies, CameraPose
 
-BARE = WorldKnobs(side_m=80, texel_m=0.1, relief_m=0, bushes_per_ha=0, trees_per_ha=0, buildings=0)
-SMALL = Scenario(seed=3, world=BARE, team=TeamKnobs(width_px=320, height_px=240), gps=GpsKnobs(error95_m=3.5))
+BARE = WorldParameters(side_m=80, texel_m=0.1, relief_m=0, bushes_per_ha=0, trees_per_ha=0, buildings=0)
+SMALL = Scenario(seed=3, world=BARE, team=TeamParameters(width_px=320, height_px=240), gps=GpsParameters(error95_m=3.5))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_a_vehicle_that_is_silent_takes_no_picture(bare: World) -> None:
 
 
 def test_an_exact_receiver_is_still_not_without_error(bare: World) -> None:
-    exact = SMALL.model_copy(update={"gps": GpsKnobs(error95_m=0)})
+    exact = SMALL.model_copy(update={"gps": GpsParameters(error95_m=0)})
     picture = GroundCamera(bare, exact).take(moment((0, 8)), 0)
     assert picture is not None
     assert picture.camera.position_sigma_m == 0.02

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from tests.simulation.small import as_file, small
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.scenario import Scenario, as_toml, check, load, names, settings_of
 
@@ -67,34 +67,34 @@ def test_an_override_can_bring_a_whole_list():
     assert scenario.car[0].start_m == (1, 2)
 
 
-def test_settings_of_a_scenario_are_the_systems_knobs():
+def test_settings_of_a_scenario_are_the_systems_parameters():
     scenario = load("joining", ["settings.crowds.join_m=4"])
     assert settings_of(scenario) == {"crowds.join_m": 4}
-    assert with_knobs(Settings(), settings_of(scenario)).crowds.join_m == 4
+    assert with_parameters(Settings(), settings_of(scenario)).crowds.join_m == 4
 
 
 @pytest.mark.parametrize(
     ("override", "line"),
     [
         ("uav.altitude_m=1", "uav.altitude_m = 1 will not do; wanted 2 to 2000 m"),
-        ("uav.altitud_m=9", "unknown knob 'uav.altitud_m'; did you mean uav.altitude_m"),
-        ("crowd.1.peple=9", "unknown knob 'crowd.1.peple'; did you mean crowd.1.people"),
+        ("uav.altitud_m=9", "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
+        ("crowd.1.peple=9", "unknown parameter 'crowd.1.peple'; did you mean crowd.1.people"),
         ("crowd.1.people=0.5", "crowd.1.people = 0.5 will not do; wanted a whole number, 1 to 5000 people"),
         ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ..., of which there are 2"),
-        ("crowd.people=2", "'crowd.people' names no knob; wanted such as crowd.1.people"),
+        ("crowd.people=2", "'crowd.people' names no parameter; wanted such as crowd.1.people"),
         ("crowd=3", "crowd = 3 will not do; wanted a list of tables"),
         ("uav=3", "uav = 3 will not do; wanted a table"),
-        ("weather.rain=3", "unknown knob 'weather'; its tables are clip, world, uav"),
+        ("weather.rain=3", "unknown parameter 'weather'; its tables are clip, world, uav"),
         ("seed=-1", "seed = -1 will not do; wanted a whole number"),
         ("crowd.1.start_m=3", "crowd.1.start_m = 3 will not do; wanted two numbers, [east, north]"),
         ("crowd.1.way_m=[[1, 2], 3]", "crowd.1.way_m = 3 will not do; wanted a list of places"),
         ("happening.1.what=jump", "happening.1.what = 'jump' will not do; wanted join or split or scatter"),
-        ("settings.crowds.join=3", "settings: unknown knob 'crowds.join'; did you mean crowds.join_m"),
+        ("settings.crowds.join=3", "settings: unknown parameter 'crowds.join'; did you mean crowds.join_m"),
         ("settings.crowds.join_m=-3", "settings: crowds.join_m = -3 will not do; wanted 0 to 100 m"),
-        ("uav.altitude_m", "is no override; wanted group.knob=value"),
+        ("uav.altitude_m", "is no override; wanted group.parameter=value"),
     ],
 )
-def test_a_wrong_knob_is_refused_with_what_was_wanted(override, line):
+def test_a_wrong_parameter_is_refused_with_what_was_wanted(override, line):
     with pytest.raises(InputError) as refusal:
         load("joining", [override])
     assert line in str(refusal.value)
@@ -163,7 +163,7 @@ def test_a_missing_file_is_named(tmp_path):
         ("[crowd]\npeople = 5\n", "will not do; wanted a list of tables"),
         ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown knob"),
         ("[settings]\ncrowds = 5\n", "wanted a table"),
-        ("altitude_m = 5\n", "unknown knob 'altitude_m'; did you mean uav.altitude_m"),
+        ("altitude_m = 5\n", "unknown parameter 'altitude_m'; did you mean uav.altitude_m"),
     ],
 )
 def test_a_bad_file_is_refused_by_its_name(tmp_path, text, line):

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.scenario import CameraKnobs
+from torchvision_dddas.simulation.scenario import CameraParameters
 from torchvision_dddas.simulation.sensor import Sensor
 
 SIZE = (320, 240)
 CLEAR = {"sharpness_px": 0, "shot_noise": 0, "read_noise": 0, "drift": 0, "quality": 100}
 
 
-def sensor(seed: int = 0, stream: int = 0, **knobs: Any) -> Sensor:
-    return Sensor(CameraKnobs.model_validate({**CLEAR, **knobs}), SIZE, seed, stream)
+def sensor(seed: int = 0, stream: int = 0, **parameters: Any) -> Sensor:
+    return Sensor(CameraParameters.model_validate({**CLEAR, **parameters}), SIZE, seed, stream)
 
 
 def grey(level: int) -> np.ndarray:
@@ -49,11 +49,17 @@ def test_exposure_drifts_slowly_and_no_further_than_asked():
 
 
 def test_a_picture_depends_on_seed_stream_and_number_and_on_nothing_before_it():
-    knobs: dict[str, Any] = {"shot_noise": 0.2, "read_noise": 1.0, "drift": 0.05, "quality": 90, "sharpness_px": 0.6}
-    first, second = sensor(3, **knobs), sensor(3, **knobs)
+    parameters: dict[str, Any] = {
+        "shot_noise": 0.2,
+        "read_noise": 1.0,
+        "drift": 0.05,
+        "quality": 90,
+        "sharpness_px": 0.6,
+    }
+    first, second = sensor(3, **parameters), sensor(3, **parameters)
     first.expose(grey(90), 1, 0.1)
     assert np.array_equal(first.expose(grey(90), 2, 0.2), second.expose(grey(90), 2, 0.2))
-    for other in (sensor(4, **knobs), sensor(3, stream=1, **knobs)):
+    for other in (sensor(4, **parameters), sensor(3, stream=1, **parameters)):
         assert not np.array_equal(other.expose(grey(90), 2, 0.2), second.expose(grey(90), 2, 0.2))
     assert not np.array_equal(second.expose(grey(90), 3, 0.2), second.expose(grey(90), 2, 0.2))
 

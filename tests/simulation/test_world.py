@@ -6,13 +6,13 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation import world as worlds
-from torchvision_dddas.simulation.scenario import WorldKnobs
+from torchvision_dddas.simulation.scenario import WorldParameters
 from torchvision_dddas.simulation.sunlight import above_ground, on_slopes, towards
 from torchvision_dddas.simulation.world import build
 from torchvision_dddas.types import Elevation, Ortho
 
-KNOBS = WorldKnobs(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
-BARE = WorldKnobs(side_m=60, bushes_per_ha=0, trees_per_ha=0, buildings=0, relief_m=0)
+KNOBS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
+BARE = WorldParameters(side_m=60, bushes_per_ha=0, trees_per_ha=0, buildings=0, relief_m=0)
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +40,10 @@ def test_same_seed_gives_the_same_world_and_another_seed_another(world):
 
 
 @pytest.mark.parametrize("knobs", [KNOBS, BARE])
-def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, knobs):
-    whole = build(knobs, seed=3).albedo.astype(int)
+def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, parameters):
+    whole = build(parameters, seed=3).albedo.astype(int)
     monkeypatch.setattr(worlds, "_AT_ONCE", 72 * 600)
-    off = np.abs(build(knobs, seed=3).albedo.astype(int) - whole)
+    off = np.abs(build(parameters, seed=3).albedo.astype(int) - whole)
     # Rounding of a filter that begins elsewhere.
     assert off.max() <= 1
     assert np.mean(off > 0) < 0.01
@@ -104,9 +104,9 @@ def test_an_elevation_that_does_not_cover_the_world_is_refused(hole):
 
 
 def test_a_world_of_too_many_pixels_is_refused_with_the_texel_that_would_do():
-    knobs = BARE.model_copy(update={"side_m": 4000.0})
+    parameters = BARE.model_copy(update={"side_m": 4000.0})
     with pytest.raises(InputError, match=r"40000 of them .* set world.texel_m to 0.334 or more"):
-        build(knobs, seed=0)
+        build(parameters, seed=0)
 
 
 def test_things_stand_where_the_list_says_and_nowhere_else(world):
@@ -168,8 +168,8 @@ def test_slopes_towards_the_sun_are_brighter_and_level_ground_is_as_it_is():
 
 
 def test_ground_in_shadow_is_darker_and_bluer():
-    knobs = BARE.model_copy(update={"buildings": 1, "sun_height_deg": 30.0})
-    lit, shaded = build(BARE.model_copy(update={"sun_height_deg": 30.0}), seed=5), build(knobs, seed=5)
+    parameters = BARE.model_copy(update={"buildings": 1, "sun_height_deg": 30.0})
+    lit, shaded = build(BARE.model_copy(update={"sun_height_deg": 30.0}), seed=5), build(parameters, seed=5)
     (place,), (radius,), (height,) = shaded.things.east_north_m, shaded.things.radius_m, shaded.things.height_m
     assert height > 2
     way = -lit.to_sun[:2] / np.hypot(*lit.to_sun[:2])

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.tracking.appearance_score import blended, in_doubt, likeness_scores, visible_share
 
 KNOBS = Settings().track
@@ -35,9 +35,9 @@ def test_the_same_look_scores_best_and_a_mixture_of_two_between_them():
 
 def test_there_is_an_end_to_what_an_unlike_look_says_against_a_link():
     """Light and turning change a look at once, so a larger weight makes the likes of it count more, not the unlikes."""
-    heavy = with_knobs(Settings(), {"track.appearance_weight": 100}).track
+    heavy = with_parameters(Settings(), {"track.appearance_weight": 100}).track
     apart = np.eye(12)[:2]
-    score, more = (likeness_scores(apart, apart, np.ones(2), knobs) for knobs in (KNOBS, heavy))
+    score, more = (likeness_scores(apart, apart, np.ones(2), parameters) for parameters in (KNOBS, heavy))
     assert more[0, 0] > score[0, 0]
     assert more[0, 1] == score[0, 1] < 0
 
@@ -56,7 +56,7 @@ def test_the_less_of_a_target_is_seen_the_less_its_look_says():
 
 
 def test_no_weight_no_word():
-    without = with_knobs(Settings(), {"track.appearance_weight": 0}).track
+    without = with_parameters(Settings(), {"track.appearance_weight": 0}).track
     assert not likeness_scores(looks(3), looks(4, 1), np.ones(4), without).any()
 
 

@@ -15,13 +15,13 @@ class Counted:
     """A back end that counts its registrations."""
 
     def __init__(self) -> None:
-        self.vision, self.count = load_engine("onboard", Settings()), 0
-        self.name, self.knobs = self.vision.name, self.vision.knobs
-        self.prepare, self.foreground = self.vision.prepare, self.vision.foreground
+        self.engine, self.count = load_engine("onboard", Settings()), 0
+        self.name, self.parameters = self.engine.name, self.engine.parameters
+        self.prepare, self.foreground = self.engine.prepare, self.engine.foreground
 
     def register(self, pairs):
         self.count += len(pairs)
-        return self.vision.register(pairs)
+        return self.engine.register(pairs)
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +40,10 @@ def shift(x, y=0.0):
 
 
 def test_a_camera_that_stands_still_is_never_registered(ground):
-    vision = Counted()
-    camera = Camera(vision)
+    engine = Counted()
+    camera = Camera(engine)
     assert [camera.step(seen(ground, shift(0), k)) for k in range(40)] == [(None, "")] * 40
-    assert vision.count == 0
+    assert engine.count == 0
 
 
 def test_a_large_target_before_a_standing_camera_moves_nothing(ground):
@@ -59,15 +59,15 @@ def test_a_large_target_before_a_standing_camera_moves_nothing(ground):
 @pytest.mark.parametrize("speed_px", [0.05, 0.2, 0.7, 6.0])
 def test_a_pan_however_slow_is_not_lost(ground, speed_px):
     """What has been followed so far never differs from what was panned by more than the stillness that is allowed."""
-    vision, steps = Counted(), []
-    camera, looks = Camera(vision), 30
+    engine, steps = Counted(), []
+    camera, looks = Camera(engine), 30
     for k in range(looks):
         now_from_before, cause = camera.step(seen(ground, shift(speed_px * k), k))
         assert cause == ""
         steps += [] if now_from_before is None else [now_from_before]
         followed = transfer(chain(steps), np.array([[320.0, 240.0]]))[0]
         assert np.abs(followed - (320 - speed_px * k, 240)).max() < 0.25 + 0.01 * k
-    assert vision.count < looks * min(1, 8 * speed_px)
+    assert engine.count < looks * min(1, 8 * speed_px)
 
 
 @pytest.mark.parametrize("turn", ["zoom", "roll"])

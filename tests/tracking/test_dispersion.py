@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import PaperKnobs
+from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.tracking.dispersion import (
     clusters,
     dispersion,
@@ -84,5 +84,5 @@ def test_each_reading_of_the_window_is_its_own():
         ("newest", (0.9, 0.9)),
         ("smallest_if_counts_differ", (0.9, 0.4)),
     ):
-        knobs = PaperKnobs.model_validate({"dispersion_of": reading})
-        assert (of_window(values, same, knobs), of_window(values, differ, knobs)) == wanted
+        parameters = PaperParameters.model_validate({"dispersion_of": reading})
+        assert (of_window(values, same, parameters), of_window(values, differ, parameters)) == wanted

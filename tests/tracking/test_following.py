@@ -137,12 +137,12 @@ def test_a_moving_camera_s_steps_reach_the_record(tmp_path):
 
 def test_what_is_settled_while_a_clip_runs_is_what_the_whole_run_gives():
     table = table_of(walkers(range(1, 41), lanes=(60, 64, 140)))
-    vision = load_engine("onboard", SETTINGS)
-    whole = all_of(follow_clip(Clip(40), table, vision, SETTINGS, 1))
+    engine = load_engine("onboard", SETTINGS)
+    whole = all_of(follow_clip(Clip(40), table, engine, SETTINGS, 1))
     for end in (3, 11, 25):
         clip = Clip(40)
         early: dict[int, dict] = {}
-        for followed in follow_clip(clip, table, vision, SETTINGS, 1):
+        for followed in follow_clip(clip, table, engine, SETTINGS, 1):
             if clip.given > end:
                 break
             early |= all_of([followed])

@@ -47,8 +47,8 @@ def found(tracks):
 @pytest.mark.parametrize(("mode", "score"), [("default", 1.0), ("default", 0.97), ("paper", 1.0)])
 @pytest.mark.parametrize(("memory", "hits"), [(1, 1), (9, 3), (20, 6)])
 def test_a_long_stretch_without_rows_is_left_out_and_changes_no_track(interval, mode, score, memory, hits):
-    knobs = {"memory_frames": memory, "hits": hits, "mode": mode, "look_ahead": "true" if hits > 1 else "false"}
-    settings = load_config(overrides=[f"track.{name}={value}" for name, value in knobs.items()])
+    parameters = {"memory_frames": memory, "hits": hits, "mode": mode, "look_ahead": "true" if hits > 1 else "false"}
+    settings = load_config(overrides=[f"track.{name}={value}" for name, value in parameters.items()])
     table = table_of(
         [*range(1, 60), *range(200, 260), *range(262, 280), *range(400, 440), *range(450, 460)], score=score
     )
@@ -126,8 +126,8 @@ def test_the_table_of_a_clip_s_own_detections_is_followed_as_these_are_with_and_
         detections = Detections(here.box_px, here.score, here.area_px, here.heading_rad, here.speed_px)
         scenes.append(Scene(frame, np.zeros((240, 320), np.uint16), detections, 3))
     wanted = found(f.tracks for f in follow_scenes(scenes, SETTINGS, 1, SIZE))
-    vision = load_engine("onboard", SETTINGS)
-    assert found(f.tracks for f in follow_clip(cast(Source, Blank()), table, vision, SETTINGS, 1)) == wanted
+    engine = load_engine("onboard", SETTINGS)
+    assert found(f.tracks for f in follow_clip(cast(Source, Blank()), table, engine, SETTINGS, 1)) == wanted
     alone = list(follow_table(table, SETTINGS, 1))
     assert all(sorted(f.tracks.identity.tolist()) == [1, 2] for f in alone)
     assert all(f.tracks.score.tolist() == [0.55, 0.55] for f in alone)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import PaperKnobs, Settings, load_config, with_knobs
+from torchvision_dddas.config import PaperParameters, Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
 from torchvision_dddas.tracking import jaccard
@@ -36,13 +36,13 @@ def never() -> np.ndarray:
     raise AssertionError("histograms were made")
 
 
-def knobs(**values: object) -> PaperKnobs:
-    return PaperKnobs.model_validate(values)
+def parameters(**values: object) -> PaperParameters:
+    return PaperParameters.model_validate(values)
 
 
 def tracked(frames: Sequence[Detections], appearance: Sequence | None = None, **values: object) -> list[list[int]]:
     """The identities of each frame's targets."""
-    tracker = PaperTracker(with_knobs(Settings(), {f"paper.{k}": v for k, v in values.items()}), 5)
+    tracker = PaperTracker(with_parameters(Settings(), {f"paper.{k}": v for k, v in values.items()}), 5)
     found = []
     for number, detections in enumerate(frames):
         (tracks,) = tracker.feed(1 + 5 * number, detections, None, appearance[number] if appearance else None)
@@ -89,14 +89,14 @@ def test_histograms_are_not_made_while_targets_are_scattered_and_once_when_they_
 def test_without_pictures_location_alone_decides():
     frames = [Look(at((400, 300), (404, 300)).box_px, None), Look(at((404, 300), (400, 300)).box_px, None)]
     for rule in ("dispersion", "fixed"):
-        found = associate(frames, knobs(window=2, rule=rule, weight=0.0))
+        found = associate(frames, parameters(window=2, rule=rule, weight=0.0))
         assert (found.weight, found.appearance_dispersion) == (1.0, None)
         assert found.rows.tolist() == [[1, 2], [2, 1]]
 
 
 def test_appearance_tells_apart_who_changed_places():
     frames = [Look(at((400, 300), (404, 300)).box_px, coloured(*c)) for c in ((10, 200), (200, 10))]
-    found = associate(frames, knobs(window=2))
+    found = associate(frames, parameters(window=2))
     assert (found.weight, found.location_dispersion, found.appearance_dispersion) == (0.0, 0.0, 1.0)
     assert found.rows.tolist() == [[1, 2], [2, 1]]
 
@@ -105,7 +105,7 @@ def test_counts_tell_a_large_box_from_a_small_one_and_shares_do_not():
     small, large = coloured(10)(), 3 * coloured(10)()
     close = at((400, 300), (404, 300)).box_px
     looks = [Look(close, partial(np.concatenate, both)) for both in ((small, large), (large, small))]
-    by_count = associate(looks, knobs(window=2, rule="fixed", weight=0.0, histogram="count"))
+    by_count = associate(looks, parameters(window=2, rule="fixed", weight=0.0, histogram="count"))
     assert by_count.rows.tolist() == [[1, 2], [2, 1]]
     shares = [look.histogram("channel") for look in looks]
     np.testing.assert_array_equal(jaccard.similarity(*shares), np.ones((2, 2)))
@@ -120,8 +120,8 @@ def test_histograms_of_another_shape_are_refused_in_one_line():
 def test_gating_features_or_their_sum_by_hand():
     location, appearance = (np.pad(np.array([[s]]), ((1, 0), (1, 0))) for s in (0.5, 0.9))
     # Features: the pair 0.7 · 0.5 + 0.3 · 0.9 = 0.62 against two dummies at 0.7 · 0.6. The sum: 0.62 is not below 0.6.
-    assert assign(location, appearance, 0.7, knobs(window=2)).tolist() == [[0, 1], [1, 0]]
-    assert assign(location, appearance, 0.7, knobs(window=2, gated="affinity")).tolist() == [[1, 1]]
+    assert assign(location, appearance, 0.7, parameters(window=2)).tolist() == [[0, 1], [1, 0]]
+    assert assign(location, appearance, 0.7, parameters(window=2, gated="affinity")).tolist() == [[1, 1]]
 
 
 @given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 1000), st.floats(0.1, 0.9))
@@ -129,7 +129,7 @@ def test_gating_features_or_their_sum_by_hand():
 def test_pairs_are_the_best_of_all_assignments_with_the_dummy(count, older, seed, threshold):
     score = np.pad(np.random.default_rng(seed).random((count, older)), ((1, 0), (1, 0)))
     gated = gate(score, threshold, "one_dummy")
-    found = assign(score, None, 1.0, knobs(window=2, threshold=threshold))
+    found = assign(score, None, 1.0, parameters(window=2, threshold=threshold))
     for axis, size in enumerate((count, older)):
         assert sorted(found[found[:, axis] > 0, axis]) == list(range(1, size + 1))
     best = max(
@@ -198,8 +198,8 @@ def test_the_weight_rule_loses_to_a_fixed_weight_where_looks_change():
 
     window = [Look(at(*((u + 2 * n, v) for u, v in centres)).box_px, partial(looks, n)) for n in (1, 0)]
     known = [np.arange(4)] * 2
-    ruled = associate(window, knobs(window=2))
-    fixed = associate(window, knobs(window=2, rule="fixed", weight=0.7))
+    ruled = associate(window, parameters(window=2))
+    fixed = associate(window, parameters(window=2, rule="fixed", weight=0.7))
     assert ruled.weight == 0.0
     assert accuracy_ratio(ruled.rows, known) == 0.0
     assert accuracy_ratio(fixed.rows, known) == 1.0

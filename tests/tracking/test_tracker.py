@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import Settings, TrackKnobs, with_knobs
+from torchvision_dddas.config import Settings, TrackParameters, with_parameters
 from torchvision_dddas.tracking import tracker as tracks
 from torchvision_dddas.tracking.kalman import carried_boxes
 from torchvision_dddas.tracking.scores import Sight, link_scores
@@ -33,8 +33,10 @@ def seen(*centres: Sequence[float], score: float | Sequence[float] = 1.0) -> Det
     return Detections(boxes(*centres), np.broadcast_to(np.asarray(score, float), len(centres)).copy())
 
 
-def tracker(interval: int = 5, size: tuple[float, float] | None = SIZE, **knobs: Any) -> Tracker:
-    return Tracker(with_knobs(Settings(), {f"track.{name}": value for name, value in knobs.items()}), interval, size)
+def tracker(interval: int = 5, size: tuple[float, float] | None = SIZE, **parameters: Any) -> Tracker:
+    return Tracker(
+        with_parameters(Settings(), {f"track.{name}": value for name, value in parameters.items()}), interval, size
+    )
 
 
 def tracked(
@@ -43,10 +45,10 @@ def tracked(
     size: tuple[float, float] | None = SIZE,
     steps: Sequence[np.ndarray | None] | None = None,
     pictures: Sequence[Callable[[], np.ndarray]] | None = None,
-    **knobs: Any,
+    **parameters: Any,
 ) -> list[Tracks]:
     """All frames' tracks, frames 1, 1 + interval, ..."""
-    run, found = tracker(interval, size, **knobs), []
+    run, found = tracker(interval, size, **parameters), []
     for n, detections in enumerate(frames):
         step, look = steps[n] if steps else None, pictures[n] if pictures else None
         found += run.feed(1 + interval * n, detections, step, look)
@@ -174,10 +176,10 @@ def test_identities_begin_at_one_leave_none_out_and_are_per_run():
 
 
 def test_only_a_good_detection_begins_a_track_but_a_fair_one_may_go_on_with_it():
-    knobs = with_knobs(Settings(), {}).track
-    fair = (knobs.min_score + knobs.birth_score) / 2
+    parameters = with_parameters(Settings(), {}).track
+    fair = (parameters.min_score + parameters.birth_score) / 2
     assert not any(names(tracked([seen((300, 300), score=fair)] * 9)))
-    good_then_fair = [seen((300, 300), score=knobs.birth_score)] + [seen((300, 300), score=fair)] * 8
+    good_then_fair = [seen((300, 300), score=parameters.birth_score)] + [seen((300, 300), score=fair)] * 8
     assert names(tracked(good_then_fair)) == [{0: 1}] * 9
 
 
@@ -494,9 +496,11 @@ def spied(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, Sight]]:
     """What is told to `link_scores` from now on: who was last seen at the border, and the sight."""
     told = []
 
-    def spy(state: np.ndarray, left: np.ndarray, box_px: np.ndarray, sight: Sight, knobs: TrackKnobs) -> np.ndarray:
+    def spy(
+        state: np.ndarray, left: np.ndarray, box_px: np.ndarray, sight: Sight, parameters: TrackParameters
+    ) -> np.ndarray:
         told.append((left, sight))
-        return link_scores(state, left, box_px, sight, knobs)
+        return link_scores(state, left, box_px, sight, parameters)
 
     monkeypatch.setattr(tracks, "link_scores", spy)
     return told

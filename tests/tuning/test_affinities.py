@@ -4,14 +4,14 @@ import pytest
 import torch
 
 from tests.tuning.test_identities import walk
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.tuning.affinities import WINDOWS, Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import family_of, with_loss
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 
-PAPER = with_knobs(load_config("paper"), {"paper.window": 2})
+PAPER = with_parameters(load_config("paper"), {"paper.window": 2})
 
 
 def test_a_clip_becomes_stretches_of_windows_each_with_a_loss_that_no_company_changes():
@@ -20,7 +20,7 @@ def test_a_clip_becomes_stretches_of_windows_each_with_a_loss_that_no_company_ch
     assert [len(example.content.windows) for example in examples] == 2 * [WINDOWS, WINDOWS, 9]
     assert [example.frame for example in examples] == 2 * [6, 6 + 5 * WINDOWS, 6 + 10 * WINDOWS]
     assert len(told) == len(examples)
-    values = Knobs(PAPER, ["paper.threshold"]).values()
+    values = Parameters(PAPER, ["paper.threshold"]).values()
     for loss in ("wrong", "likelihood"):
         chosen = with_loss(family, loss)
         found = chosen.loss(values, examples, 0.05)
@@ -30,11 +30,11 @@ def test_a_clip_becomes_stretches_of_windows_each_with_a_loss_that_no_company_ch
 
 
 def test_a_threshold_is_learned_where_people_come_and_go():
-    settings = with_knobs(PAPER, {"paper.threshold": 0.6})
+    settings = with_parameters(PAPER, {"paper.threshold": 0.6})
     clips = [walk(str(seed), people=5, seed=seed) for seed in range(3)]
     family = family_of("paper")
     examples = family.examples(clips, settings)
-    found = descend(family, Knobs(settings, ["paper.threshold"]), examples, Plan(5, 8, 0.3, look_every=5))
+    found = descend(family, Parameters(settings, ["paper.threshold"]), examples, Plan(5, 8, 0.3, look_every=5))
     assert not found.failed
     assert found.idle == ()
     first, last = found.history[0].watched, found.history[-1].watched
@@ -53,8 +53,8 @@ def test_a_threshold_is_learned_where_people_come_and_go():
         ("paper.threshold", {"paper.gated": "affinity"}, "add --set paper.gated=features"),
     ],
 )
-def test_a_knob_that_would_be_tuned_for_nothing_is_refused_with_what_to_set(name, values, said):
-    settings = with_knobs(PAPER, values)
+def test_a_parameter_that_would_be_tuned_for_nothing_is_refused_with_what_to_set(name, values, said):
+    settings = with_parameters(PAPER, values)
     with pytest.raises(InputError) as raised:
         Affinities().check([name], settings)
     assert said in str(raised.value)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.costing import Curve, TimeCost, measured, points, read, write
@@ -42,7 +42,7 @@ def test_as_the_settings_are_the_term_is_nothing_and_twice_the_time_costs_the_we
 
 
 def test_the_points_are_allowed_values_on_either_side_of_the_knobs_own() -> None:
-    settings = with_knobs(Settings(), {THRESHOLD: 200.0, BLUR: 5})
+    settings = with_parameters(Settings(), {THRESHOLD: 200.0, BLUR: 5})
     assert points(settings, [THRESHOLD, BLUR]) == [
         ("", 0.0),
         (THRESHOLD, 100.0),
@@ -52,8 +52,8 @@ def test_the_points_are_allowed_values_on_either_side_of_the_knobs_own() -> None
     ]
 
 
-def test_what_depends_on_a_knob_is_found_and_what_does_not_costs_nothing() -> None:
-    settings = with_knobs(Settings(), {THRESHOLD: 8.0})
+def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() -> None:
+    settings = with_parameters(Settings(), {THRESHOLD: 8.0})
     noise = iter(1 + 0.01 * k for k in (0, 1, -1, 2, 0, 1, -2, 0, 1, 0, 2, -1, 1, 0, -1, 0, 1, 2, 0, 0))
 
     def timed(changed: Settings) -> float:
@@ -61,7 +61,7 @@ def test_what_depends_on_a_knob_is_found_and_what_does_not_costs_nothing() -> No
 
     cost = measured(CLIP, "motion", settings, [THRESHOLD, CLOSE], 1.0, timed=timed)
     (curve,) = cost.curves
-    assert curve.knob == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
+    assert curve.parameter == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
     assert curve.times == pytest.approx((2, 1, 0.5), rel=0.05) and cost.seconds == pytest.approx(0.1, rel=0.05)
 
 

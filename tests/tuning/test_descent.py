@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from tests.tuning.toys import Bowl, pieces
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 
 THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
 QUICK = Plan(steps=12, batch=4, rate=0.1, look_every=3)
 
 
-def knobs(threshold: float = 12.0) -> Knobs:
-    return Knobs(with_knobs(Settings(), {THRESHOLD: threshold}), [THRESHOLD, NOISE])
+def parameters(threshold: float = 12.0) -> Parameters:
+    return Parameters(with_parameters(Settings(), {THRESHOLD: threshold}), [THRESHOLD, NOISE])
 
 
 class Stopped(Exception):
@@ -40,7 +40,7 @@ def after(steps: int):
 
 
 def same(one: Descended, other: Descended) -> bool:
-    states = [found.knobs.state_dict() for found in (one, other)]
+    states = [found.parameters.state_dict() for found in (one, other)]
     histories = [
         [replace(step, loss=0.0 if math.isnan(step.loss) else step.loss) for step in f.history] for f in (one, other)
     ]
@@ -48,35 +48,37 @@ def same(one: Descended, other: Descended) -> bool:
 
 
 def test_it_gets_to_the_bottom() -> None:
-    found = descend(Bowl(), knobs(), pieces(spread=0.0), Plan(steps=150, rate=0.1))
+    found = descend(Bowl(), parameters(), pieces(spread=0.0), Plan(steps=150, rate=0.1))
     assert found.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.02)
     assert found.settings.difference.noise_levels == pytest.approx(1, rel=0.05)
     assert found.failed == "" and found.idle == ()
 
 
 def test_the_same_arguments_give_the_same_steps_and_another_seed_gives_others() -> None:
-    first, again = (descend(Bowl(), knobs(), pieces(), QUICK) for _ in range(2))
-    other = descend(Bowl(), knobs(), pieces(), replace(QUICK, seed=1))
+    first, again = (descend(Bowl(), parameters(), pieces(), QUICK) for _ in range(2))
+    other = descend(Bowl(), parameters(), pieces(), replace(QUICK, seed=1))
     assert same(first, again)
-    assert first.history[-1].knobs != other.history[-1].knobs
+    assert first.history[-1].parameters != other.history[-1].parameters
 
 
 @pytest.mark.parametrize("stop", [0, 1, 5, 6, 12])
 def test_a_descent_that_was_broken_off_goes_on_as_if_it_had_not_been(tmp_path: Path, stop: int) -> None:
-    whole = descend(Bowl(), knobs(), pieces(), QUICK)
+    whole = descend(Bowl(), parameters(), pieces(), QUICK)
     place = tmp_path / "here" / "checkpoint.pt"
     with pytest.raises(Stopped):
-        descend(Bowl(), knobs(), pieces(), QUICK, tell=after(stop), place=place)
+        descend(Bowl(), parameters(), pieces(), QUICK, tell=after(stop), place=place)
     told = list[int]()
-    resumed = descend(Bowl(), knobs(), pieces(), QUICK, tell=lambda s: told.append(s.step), place=place, resume=True)
+    resumed = descend(
+        Bowl(), parameters(), pieces(), QUICK, tell=lambda s: told.append(s.step), place=place, resume=True
+    )
     assert same(whole, resumed) and resumed.best == whole.best and resumed.ended == whole.ended
     assert told == list(range(13))
 
 
 def test_a_descent_that_is_over_is_not_begun_again(tmp_path: Path) -> None:
     place = tmp_path / "checkpoint.pt"
-    first, bowl = descend(Bowl(), knobs(), pieces(), QUICK, place=place), Bowl()
-    assert same(first, descend(bowl, knobs(), pieces(), QUICK, place=place, resume=True))
+    first, bowl = descend(Bowl(), parameters(), pieces(), QUICK, place=place), Bowl()
+    assert same(first, descend(bowl, parameters(), pieces(), QUICK, place=place, resume=True))
     assert bowl.calls == []
 
 
@@ -86,14 +88,14 @@ def test_a_descent_that_is_over_is_not_begun_again(tmp_path: Path) -> None:
         ({"plan": replace(QUICK, steps=13)}, "other steps, 12 and not 13"),
         ({"plan": replace(QUICK, seed=2)}, "other seed, 0 and not 2"),
         ({"examples": pieces(("one",))}, "other examples"),
-        ({"knobs": Knobs(Settings(), [THRESHOLD])}, "other knobs"),
-        ({"knobs": knobs(13.0)}, "other settings"),
+        ({"knobs": Parameters(Settings(), [THRESHOLD])}, "other knobs"),
+        ({"knobs": parameters(13.0)}, "other settings"),
     ],
 )
 def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict, words: str) -> None:
     place = tmp_path / "checkpoint.pt"
-    descend(Bowl(), knobs(), pieces(), QUICK, place=place)
-    asked = {"knobs": knobs(), "examples": pieces(), "plan": QUICK} | change
+    descend(Bowl(), parameters(), pieces(), QUICK, place=place)
+    asked = {"knobs": parameters(), "examples": pieces(), "plan": QUICK} | change
     with pytest.raises(InputError, match=words):
         descend(Bowl(), place=place, resume=True, **asked)
 
@@ -103,11 +105,11 @@ def test_a_damaged_checkpoint_is_told_in_a_line(tmp_path: Path, content: bytes) 
     place = tmp_path / "checkpoint.pt"
     place.write_bytes(content)
     with pytest.raises(InputError, match="is no checkpoint, or is damaged"):
-        descend(Bowl(), knobs(), pieces(), QUICK, place=place, resume=True)
+        descend(Bowl(), parameters(), pieces(), QUICK, place=place, resume=True)
 
 
 def test_softness_goes_down_evenly_in_its_logarithm() -> None:
-    found = descend(Bowl(), knobs(), pieces(), QUICK)
+    found = descend(Bowl(), parameters(), pieces(), QUICK)
     softness = [step.softness for step in found.history[1:]]
     assert softness[0] == pytest.approx(1) and softness[-1] == pytest.approx(0.1)
     ratios = [b / a for a, b in pairwise(softness)]
@@ -117,73 +119,73 @@ def test_softness_goes_down_evenly_in_its_logarithm() -> None:
 def test_it_stops_where_the_watched_examples_gain_no_more_and_keeps_their_best_state() -> None:
     # What is learned from lies far above what is watched: every step beyond the watched ones' place is a loss.
     seen = [replace(one, content=one.content + (2.0 if one.frame <= 6 else 0.0)) for one in pieces(spread=0.0)]
-    asked = Knobs(with_knobs(Settings(), {THRESHOLD: 12.0}), [THRESHOLD])
+    asked = Parameters(with_parameters(Settings(), {THRESHOLD: 12.0}), [THRESHOLD])
     found = descend(Bowl(), asked, seen, Plan(steps=200, rate=0.1, look_every=2, patience=3))
     assert "no gain" in found.ended and found.history[-1].step == found.best + 6 < 200
     assert found.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.2)
-    assert found.history[-1].knobs[THRESHOLD] > found.settings.difference.threshold * 1.2
+    assert found.history[-1].parameters[THRESHOLD] > found.settings.difference.threshold * 1.2
 
 
 def test_where_nothing_is_gained_the_settings_are_as_they_were() -> None:
-    start = with_knobs(Settings(), {THRESHOLD: 10.0, NOISE: 2.0})
+    start = with_parameters(Settings(), {THRESHOLD: 10.0, NOISE: 2.0})
     away = [
         replace(one, content=one.content + (5.0 if one.frame <= 6 else math.log(10) - 3)) for one in pieces(spread=0.0)
     ]
-    found = descend(Bowl(), Knobs(start, [THRESHOLD]), away, replace(QUICK, patience=2))
+    found = descend(Bowl(), Parameters(start, [THRESHOLD]), away, replace(QUICK, patience=2))
     assert found.best == 0 and found.settings == start
 
 
-def test_a_loss_that_is_no_number_names_clip_frame_and_knob_and_keeps_the_last_good_state() -> None:
+def test_a_loss_that_is_no_number_names_clip_frame_and_parameter_and_keeps_the_last_good_state() -> None:
     bowl = Bowl(place=4.0, wrong=("two", 3), wrong_above=20.0)
-    found = descend(bowl, knobs(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=1))
+    found = descend(bowl, parameters(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=1))
     assert "two, frame 3" in found.failed and f"{THRESHOLD} = 2" in found.failed and NOISE not in found.failed
     assert 12 < found.settings.difference.threshold < 26
-    assert all(math.isfinite(value) for step in found.history for value in step.knobs.values())
+    assert all(math.isfinite(value) for step in found.history for value in step.parameters.values())
     assert found.best == found.history[-1].step or found.best > 0
 
 
 def test_a_watched_loss_that_is_no_number_stops_it_too() -> None:
     bowl = Bowl(place=4.0, wrong=("one", 8), wrong_above=20.0)
-    found = descend(bowl, knobs(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=5))
+    found = descend(bowl, parameters(), pieces(spread=0.0), Plan(steps=60, batch=4, rate=0.1, look_every=5))
     assert "one, frame 8" in found.failed and "at step" in found.failed
     assert found.settings.difference.threshold < 20 and found.history[-1].watched is None
 
 
-def test_a_slope_that_is_no_number_names_clip_frame_and_knob() -> None:
-    found = descend(Bowl(steep=("one", 2)), knobs(), pieces(), replace(QUICK, batch=99))
+def test_a_slope_that_is_no_number_names_clip_frame_and_parameter() -> None:
+    found = descend(Bowl(steep=("one", 2)), parameters(), pieces(), replace(QUICK, batch=99))
     assert f"slope of the loss in {THRESHOLD}" in found.failed and "one, frame 2" in found.failed
     assert found.best == 0
 
 
 def test_a_loss_that_is_no_number_from_the_start_is_bad_input() -> None:
     bowl = Bowl(wrong=("two", 8))
-    with pytest.raises(InputError, match="two, frame 8, whatever the knobs, before the first step"):
-        descend(bowl, knobs(), pieces(), QUICK)
+    with pytest.raises(InputError, match="two, frame 8, whatever the parameters, before the first step"):
+        descend(bowl, parameters(), pieces(), QUICK)
 
 
 def test_a_failed_descent_is_told_again_when_it_is_taken_up(tmp_path: Path) -> None:
     bowl, place = Bowl(place=4.0, wrong=("two", 3), wrong_above=14.0), tmp_path / "checkpoint.pt"
-    first = descend(bowl, knobs(), pieces(spread=0.0), QUICK, place=place)
-    again = descend(bowl, knobs(), pieces(spread=0.0), QUICK, place=place, resume=True)
+    first = descend(bowl, parameters(), pieces(spread=0.0), QUICK, place=place)
+    again = descend(bowl, parameters(), pieces(spread=0.0), QUICK, place=place, resume=True)
     assert first.failed == again.failed != "" and same(first, again)
 
 
 def test_knobs_without_a_slope_are_named() -> None:
-    asked = Knobs(Settings(), [THRESHOLD, "gates.min_area_px"])
+    asked = Parameters(Settings(), [THRESHOLD, "gates.min_area_px"])
     found = descend(Bowl(), asked, pieces(), QUICK)
     assert found.idle == ("gates.min_area_px",)
     assert found.settings.gates.min_area_px == Settings().gates.min_area_px
 
 
 def test_it_ends_when_its_time_is_over() -> None:
-    found = descend(Bowl(), knobs(), pieces(), replace(QUICK, most_s=0.0))
+    found = descend(Bowl(), parameters(), pieces(), replace(QUICK, most_s=0.0))
     assert found.ended == "0 s are over" and len(found.history) == 1 and found.best == 0
 
 
 def test_when_its_time_is_over_the_last_state_has_its_say(monkeypatch) -> None:
     clock = iter(range(1000))
     monkeypatch.setattr("torchvision_dddas.tuning.descent.time.perf_counter", lambda: float(next(clock)))
-    found = descend(Bowl(), knobs(), pieces(spread=0.0), Plan(steps=99, rate=0.1, look_every=50, most_s=4.0))
+    found = descend(Bowl(), parameters(), pieces(spread=0.0), Plan(steps=99, rate=0.1, look_every=50, most_s=4.0))
     assert "are over" in found.ended and found.best == found.history[-1].step == 3
     first, last = found.history[0].watched, found.history[-1].watched
     assert first is not None and last is not None and last < first
@@ -199,7 +201,7 @@ class Dear:
 
 def test_what_time_costs_moves_the_bottom() -> None:
     plan = Plan(steps=150, rate=0.1)
-    free, charged = (descend(Bowl(), knobs(), pieces(spread=0.0), plan, cost) for cost in (None, Dear()))
+    free, charged = (descend(Bowl(), parameters(), pieces(spread=0.0), plan, cost) for cost in (None, Dear()))
     # (x - 3)² + x is least at 2.5.
     assert free.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.02)
     assert charged.settings.difference.threshold == pytest.approx(math.exp(2.5), rel=0.02)
@@ -208,7 +210,7 @@ def test_what_time_costs_moves_the_bottom() -> None:
 def test_a_pull_keeps_knobs_near_where_they_began_and_the_stronger_the_nearer() -> None:
     plan = Plan(steps=80, rate=0.1)
     ends = [
-        descend(Bowl(), knobs(), pieces(spread=0.0), replace(plan, pull=pull)).settings.difference.threshold
+        descend(Bowl(), parameters(), pieces(spread=0.0), replace(plan, pull=pull)).settings.difference.threshold
         for pull in (0.0, 0.3, 3.0)
     ]
     assert 12.0 < ends[2] < ends[1] < ends[0] - 0.1
@@ -216,7 +218,7 @@ def test_a_pull_keeps_knobs_near_where_they_began_and_the_stronger_the_nearer() 
 
 def test_without_examples_there_is_one_line() -> None:
     with pytest.raises(InputError, match="nothing to tune motion on"):
-        descend(Bowl(), knobs(), [], QUICK)
+        descend(Bowl(), parameters(), [], QUICK)
 
 
 @pytest.mark.parametrize(
@@ -230,14 +232,14 @@ def test_a_plan_that_will_not_do_is_refused(wrong: dict) -> None:
 class _Between(Bowl):
     """Best half way between whole sizes, which no setting can have."""
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        side = knobs["morphology.erode_px"]
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        side = parameters["morphology.erode_px"]
         return ((2 * torch.pi * side).cos() + 0.1 * side).expand(len(batch))
 
 
 def test_states_are_looked_at_as_the_settings_round_them() -> None:
-    found = descend(_Between(), Knobs(Settings(), ["morphology.erode_px"]), pieces(), Plan(steps=20, look_every=1))
-    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    found = descend(_Between(), Parameters(Settings(), ["morphology.erode_px"]), pieces(), Plan(steps=20, look_every=1))
+    sides = [step.parameters["morphology.erode_px"] for step in found.history]
     watched = [step.watched for step in found.history]
     assert any(abs(side - round(side)) > 0.3 for side in sides)
     assert watched == pytest.approx([1 + 0.1 * round(side) for side in sides])
@@ -246,56 +248,58 @@ def test_states_are_looked_at_as_the_settings_round_them() -> None:
 class _Sized(Bowl):
     """A bowl that is deeper where the erosion is wider."""
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        return super().loss(knobs, batch, softness) - 0.1 * knobs["morphology.erode_px"]
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        return super().loss(parameters, batch, softness) - 0.1 * parameters["morphology.erode_px"]
 
 
 def test_in_the_second_half_sizes_stay_and_the_rest_follows() -> None:
     names = ["morphology.erode_px", THRESHOLD]
-    start, plan = with_knobs(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0)
-    found = descend(_Sized(), Knobs(start, names), pieces(), plan)
-    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    start, plan = with_parameters(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0)
+    found = descend(_Sized(), Parameters(start, names), pieces(), plan)
+    sides = [step.parameters["morphology.erode_px"] for step in found.history]
     assert len(set(sides[:11])) == 11 and len(set(sides[10:])) == 1
-    assert len({step.knobs[THRESHOLD] for step in found.history[10:]}) > 5
+    assert len({step.parameters[THRESHOLD] for step in found.history[10:]}) > 5
 
 
 def test_sizes_that_stay_are_not_pulled_back() -> None:
-    start, plan = with_knobs(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0, pull=0.1)
-    found = descend(_Sized(), Knobs(start, ["morphology.erode_px", THRESHOLD]), pieces(), plan)
-    sides = [step.knobs["morphology.erode_px"] for step in found.history]
+    start, plan = with_parameters(Settings(), {THRESHOLD: 9.0}), Plan(steps=20, watched=0, pull=0.1)
+    found = descend(_Sized(), Parameters(start, ["morphology.erode_px", THRESHOLD]), pieces(), plan)
+    sides = [step.parameters["morphology.erode_px"] for step in found.history]
     assert sides[10] != sides[0] and len(set(sides[10:])) == 1
 
 
 class _Idle(Bowl):
     """A bowl in the erosion alone."""
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        return (knobs["morphology.erode_px"].log() - 2).square().expand(len(batch))
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        return (parameters["morphology.erode_px"].log() - 2).square().expand(len(batch))
 
 
 def test_sizes_go_on_where_nothing_else_has_a_say() -> None:
-    found = descend(_Idle(), Knobs(Settings(), ["morphology.erode_px", NOISE]), pieces(), Plan(steps=20, watched=0))
+    found = descend(
+        _Idle(), Parameters(Settings(), ["morphology.erode_px", NOISE]), pieces(), Plan(steps=20, watched=0)
+    )
     assert found.idle == (NOISE,)
-    assert len({step.knobs["morphology.erode_px"] for step in found.history}) == 21
+    assert len({step.parameters["morphology.erode_px"] for step in found.history}) == 21
 
 
 @pytest.mark.parametrize("pull", [0.0, 0.1])
-def test_a_knob_without_a_say_is_told_and_not_pulled_about(pull: float) -> None:
+def test_a_parameter_without_a_say_is_told_and_not_pulled_about(pull: float) -> None:
     class Deaf(Bowl):
-        def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
             return torch.ones(len(batch), dtype=torch.float64)
 
     with pytest.raises(InputError, match=f"the loss of motion does not depend on {NOISE}"):
-        descend(Deaf(), Knobs(Settings(), [NOISE]), pieces(), replace(QUICK, pull=pull))
+        descend(Deaf(), Parameters(Settings(), [NOISE]), pieces(), replace(QUICK, pull=pull))
 
 
-def test_examples_on_which_no_knob_has_a_say_stop_nothing() -> None:
+def test_examples_on_which_no_parameter_has_a_say_stop_nothing() -> None:
     class Hush(Bowl):
-        def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-            lost = super().loss(knobs, batch, softness)
+        def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+            lost = super().loss(parameters, batch, softness)
             return lost.detach() if batch[0].clip == "two" else lost
 
-    found = descend(Hush(), knobs(), pieces(), replace(QUICK, batch=1))
+    found = descend(Hush(), parameters(), pieces(), replace(QUICK, batch=1))
     assert found.failed == "" and found.history[-1].step == 12 and found.idle == ()
 
 
@@ -313,6 +317,6 @@ class _Timed(Bowl):
 )
 def test_a_checkpoint_of_another_task_or_interval_is_refused(tmp_path: Path, other: Bowl, words: str) -> None:
     place = tmp_path / "checkpoint.pt"
-    descend(_Timed(), knobs(), pieces(), QUICK, place=place)
+    descend(_Timed(), parameters(), pieces(), QUICK, place=place)
     with pytest.raises(InputError, match=words):
-        descend(other, knobs(), pieces(), QUICK, place=place, resume=True)
+        descend(other, parameters(), pieces(), QUICK, place=place, resume=True)

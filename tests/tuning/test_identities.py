@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
@@ -19,7 +19,7 @@ from torchvision_dddas.tuning import identities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Timed, family_of
 from torchvision_dddas.tuning.identities import Identities, together
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.types import Detections
 
 PERSON = np.array([20.0, 50.0])
@@ -58,7 +58,7 @@ def test_a_clip_becomes_stretches_of_its_looks_in_order_each_with_a_loss():
     assert [example.frame for example in examples] == [1, 1 + 5 * identities.LOOKS]
     assert [example.clip for example in examples] == ["walk", "walk"]
     assert len(told) == 2
-    values = Knobs(settings, ["track.scatter", "track.prior"]).values()
+    values = Parameters(settings, ["track.scatter", "track.prior"]).values()
     losses = family.loss(values, examples, 1.0)
     assert losses.shape == (2,)
     assert (losses > 0).all()
@@ -110,7 +110,7 @@ def test_a_clip_without_identities_is_refused_by_name():
 
 
 def test_knobs_that_the_sources_association_never_asks_are_refused():
-    settings = with_knobs(Settings(), {"track.mode": "paper"})
+    settings = with_parameters(Settings(), {"track.mode": "paper"})
     with pytest.raises(InputError, match=r"track.speed: no say under track.mode=paper; add --set track.mode=default"):
         Identities().check(["track.speed"], settings)
     Identities().check(["track.speed"], Settings())
@@ -179,7 +179,8 @@ def test_links_to_false_alarms_are_never_true(tmp_path: Path):
     for false in (0, 6):
         clip = seen(walk(), tmp_path, false)
         of = [
-            family.loss(Knobs(s, ["track.tail"]).values(), family.examples([clip], s), 1.0) for s in (lax, Settings())
+            family.loss(Parameters(s, ["track.tail"]).values(), family.examples([clip], s), 1.0)
+            for s in (lax, Settings())
         ]
         losses.append((of[0] - of[1]).mean().item())
     assert losses[1] > losses[0] + 0.1
@@ -191,18 +192,18 @@ def test_a_true_link_to_a_detection_is_asked_for_with_a_margin(tmp_path: Path):
     family = Identities().at(5, "tracking")
     slopes = []
     for one in (replace(family, missed=0.0), family):
-        knobs = Knobs(settings, ["track.prior"])
-        one.loss(knobs.values(), one.examples([clip], settings), 1.0).mean().backward()
-        slopes.append(knobs.free[0].grad.item())
+        parameters = Parameters(settings, ["track.prior"])
+        one.loss(parameters.values(), one.examples([clip], settings), 1.0).mean().backward()
+        slopes.append(parameters.free[0].grad.item())
     assert family.missed > 0
     assert Identities().at(5, "association").missed == 0
     assert slopes[1] < slopes[0] - 0.01
 
 
-def test_a_wrong_knob_gets_better_by_descending():
+def test_a_wrong_parameter_gets_better_by_descending():
     settings = Settings().model_copy(update={"track": Settings().track.model_copy(update={"scatter": 0.5})})
     family = Identities(interval=5)
-    knobs = Knobs(settings, ["track.scatter"])
-    done = descend(family, knobs, family.examples([walk()], settings), Plan(6, 2, 0.3, look_every=3))
+    parameters = Parameters(settings, ["track.scatter"])
+    done = descend(family, parameters, family.examples([walk()], settings), Plan(6, 2, 0.3, look_every=3))
     assert done.settings.track.scatter < 0.3
     assert not done.failed

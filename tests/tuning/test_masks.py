@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
@@ -14,9 +14,9 @@ from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
 from torchvision_dddas.tuning.masks import Masks, masks_of, together
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
-SETTINGS = with_knobs(
+SETTINGS = with_parameters(
     Settings(), {"gates.min_area_px": 30, "morphology.close_px": 7, "registration.keypoints": 200, "small.on": False}
 )
 CPU = torch.device("cpu")
@@ -45,41 +45,41 @@ def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example
 
 
 def test_the_loss_tends_to_that_of_hard_masks(examples: list[Example]) -> None:
-    knobs = {"difference.threshold": torch.tensor(4.0)}
+    parameters = {"difference.threshold": torch.tensor(4.0)}
     family = Masks()
-    hard = family.loss(knobs, examples, 0.0)
-    misses = [float((family.loss(knobs, examples, softness) - hard).abs().mean()) for softness in (0.5, 0.1, 0.01)]
+    hard = family.loss(parameters, examples, 0.0)
+    misses = [float((family.loss(parameters, examples, softness) - hard).abs().mean()) for softness in (0.5, 0.1, 0.01)]
     assert misses[0] > misses[1] > misses[2] and misses[2] < 0.02
 
 
 def test_the_loss_of_an_example_does_not_depend_on_its_batch(examples: list[Example]) -> None:
-    knobs, family = {"difference.threshold": torch.tensor(3.5)}, Masks()
-    whole = family.loss(knobs, examples, 0.2)
-    single = torch.stack([family.loss(knobs, [example], 0.2)[0] for example in examples])
+    parameters, family = {"difference.threshold": torch.tensor(3.5)}, Masks()
+    whole = family.loss(parameters, examples, 0.2)
+    single = torch.stack([family.loss(parameters, [example], 0.2)[0] for example in examples])
     torch.testing.assert_close(whole, single)
 
 
 def test_straight_through_gives_the_loss_of_hard_masks_and_a_gradient(examples: list[Example]) -> None:
-    knobs = Knobs(SETTINGS, ["difference.threshold"])
-    passing = Masks(passing=True).loss(knobs.values(), examples[3:5], 0.1)
-    assert torch.equal(passing.detach(), Masks().loss(knobs.values(), examples[3:5], 0.0).detach())
+    parameters = Parameters(SETTINGS, ["difference.threshold"])
+    passing = Masks(passing=True).loss(parameters.values(), examples[3:5], 0.1)
+    assert torch.equal(passing.detach(), Masks().loss(parameters.values(), examples[3:5], 0.0).detach())
     passing.sum().backward()
-    assert knobs.free[0].grad is not None and float(knobs.free[0].grad) != 0
+    assert parameters.free[0].grad is not None and float(parameters.free[0].grad) != 0
 
 
-def test_every_knob_of_motion_has_a_finite_gradient(examples: list[Example]) -> None:
-    knobs = Knobs(SETTINGS, [name for name, knob in TUNABLE.items() if knob.family == "motion"])
-    Masks().loss(knobs.values(), examples[3:6], 0.2).sum().backward()
-    for name, free in zip(knobs.names, knobs.free, strict=True):
+def test_every_parameter_of_motion_has_a_finite_gradient(examples: list[Example]) -> None:
+    parameters = Parameters(SETTINGS, [name for name, parameter in TUNABLE.items() if parameter.family == "motion"])
+    Masks().loss(parameters.values(), examples[3:6], 0.2).sum().backward()
+    for name, free in zip(parameters.names, parameters.free, strict=True):
         assert free.grad is not None and bool(free.grad.isfinite()) and float(free.grad) != 0, name
 
 
 def test_a_step_down_the_slope_of_a_threshold_that_is_too_high_lowers_it(clip: Clip) -> None:
-    family, settings = Masks(after=False), with_knobs(SETTINGS, {"difference.threshold": 10.0})
+    family, settings = Masks(after=False), with_parameters(SETTINGS, {"difference.threshold": 10.0})
     examples = family.examples([clip], settings)[3:6]
-    knobs = Knobs(settings, ["difference.threshold"])
-    family.loss(knobs.values(), examples, 0.3).sum().backward()
-    assert float(knobs.free[0].grad) > 0
+    parameters = Parameters(settings, ["difference.threshold"])
+    family.loss(parameters.values(), examples, 0.3).sum().backward()
+    assert float(parameters.free[0].grad) > 0
 
 
 def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
@@ -89,7 +89,7 @@ def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
         with pytest.raises(InputError, match="bare has no masks of what moves; choose with --clips"):
             Masks().examples([clip, bare], SETTINGS, lambda: pytest.fail("a clip was computed before"))
     with pytest.raises(InputError, match=r"difference\.halved"):
-        Masks().examples([clip], with_knobs(SETTINGS, {"difference.halved": True}))
+        Masks().examples([clip], with_parameters(SETTINGS, {"difference.halved": True}))
 
 
 def test_of_a_clip_in_which_nothing_moves_whatever_is_found_is_false(clip: Clip) -> None:
@@ -112,13 +112,13 @@ def test_unlabelled_pixels_are_known_to_be_so(clip: Clip, examples: list[Example
 
 
 def test_a_loss_of_another_name_is_another_loss_of_the_same_masks(examples: list[Example]) -> None:
-    knobs = {"difference.threshold": torch.tensor(4.0)}
+    parameters = {"difference.threshold": torch.tensor(4.0)}
     found = {}
     for name in Masks().losses:
         family = with_loss(Masks(passing=True), name)
         assert isinstance(family, Masks) and family.passing and loss_of(family) == name
-        found[name] = family.loss(knobs, examples, 0.1)
-    assert loss_of(Masks()) == "f" and torch.equal(found["f"], Masks(passing=True).loss(knobs, examples, 0.1))
+        found[name] = family.loss(parameters, examples, 0.1)
+    assert loss_of(Masks()) == "f" and torch.equal(found["f"], Masks(passing=True).loss(parameters, examples, 0.1))
     assert not torch.allclose(found["f"], found["focal"])
     # Squares of hard masks are the masks.
     torch.testing.assert_close(found["f"], found["dice"])

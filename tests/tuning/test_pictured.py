@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.overflight import ORIGIN, Overflight
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
@@ -74,7 +74,7 @@ def test_landmarks_that_say_how_well_they_are_known_are_not_tuned(tmp_path):
 
 def test_what_is_said_of_reports_changes_no_share_of_them(tmp_path):
     clip = flown(tmp_path, Overflight(frames=1, gps_m=0.5), sigma=False)
-    (look,) = looks(clip, with_knobs(Settings(), {"landmarks.sigma_m": 0.0}))
+    (look,) = looks(clip, with_parameters(Settings(), {"landmarks.sigma_m": 0.0}))
     assert look.places.gain["landmarks.sigma_m"].tolist() == pytest.approx([1] * 4)
 
 

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from tests import airborne
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.plane import ground_points
 from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.tuning.aerial_examples import SPREADS, Seen, kept, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.places import UNPLACED, family
 
 HFOV = float(np.radians(70.0))
@@ -40,7 +40,7 @@ def values(settings: Settings, names=SPREADS) -> dict[str, torch.Tensor]:
 
 
 def test_the_loss_is_that_of_the_hard_registrar():
-    settings = with_knobs(Settings(), {"aerial.correlation_s": 0.0, "aerial.tilt_sigma_deg": 1.7})
+    settings = with_parameters(Settings(), {"aerial.correlation_s": 0.0, "aerial.tilt_sigma_deg": 1.7})
     found = family().loss({}, looks(3, settings), 1.0)
     for seed in range(3):
         look = airborne.look(seed)
@@ -55,15 +55,15 @@ def test_the_loss_is_that_of_the_hard_registrar():
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
 def test_the_gradient_is_that_of_the_hard_loss(tilt_deg):
-    settings = with_knobs(Settings(), {"landmarks.sigma_m": 1.0, "aerial.heading_sigma_deg": 3.0})
+    settings = with_parameters(Settings(), {"landmarks.sigma_m": 1.0, "aerial.heading_sigma_deg": 3.0})
     batch = looks(4, settings, tilt_deg=tilt_deg)
-    knobs = {name: value.requires_grad_() for name, value in values(settings).items() if float(value) > 0}
-    family().loss(knobs, batch, 1.0).sum().backward()
+    parameters = {name: value.requires_grad_() for name, value in values(settings).items() if float(value) > 0}
+    family().loss(parameters, batch, 1.0).sum().backward()
     checked = 0
-    for name, value in knobs.items():
+    for name, value in parameters.items():
         with torch.no_grad():
             step = 1e-3 * value
-            more, less = (family().loss({**knobs, name: value + s}, batch, 1.0).sum() for s in (step, -step))
+            more, less = (family().loss({**parameters, name: value + s}, batch, 1.0).sum() for s in (step, -step))
         # By the knob's logarithm, so that all are alike.
         slope = float(more - less) / 2e-3
         mine = 0.0 if value.grad is None else float(value.grad * value.detach())
@@ -84,21 +84,21 @@ def test_a_picture_that_no_pose_explains_costs_and_has_no_slope():
     (example,) = looks(1, settings)
     look = example.content.look
     upward = replace(look, targets_px=np.full_like(look.targets_px, 1e7))
-    knob = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-    found = family().loss({"aerial.tilt_sigma_deg": knob}, [Example("looks", 0, Seen(upward, settings))], 1.0)
+    parameter = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    found = family().loss({"aerial.tilt_sigma_deg": parameter}, [Example("looks", 0, Seen(upward, settings))], 1.0)
     found.sum().backward()
     assert float(found.detach()) == UNPLACED
-    assert knob.grad is not None
-    assert float(knob.grad) == 0
+    assert parameter.grad is not None
+    assert float(parameter.grad) == 0
 
 
 def test_a_fit_that_is_kept_is_right_about_its_settings():
     settings = Settings()
     batch = looks(4, settings, tilt_deg=30.0)
     quick = [replace(one, content=kept(one.content)) for one in batch]
-    for knobs in ({}, {"aerial.tilt_sigma_deg": torch.tensor(1.5)}, {"landmarks.sigma_m": torch.tensor(1.0)}):
-        hard, near = (family().loss(knobs, some, 1.0) for some in (batch, quick))
-        assert near.tolist() == pytest.approx(hard.tolist(), abs=0.02 if knobs else 1e-4)
+    for parameters in ({}, {"aerial.tilt_sigma_deg": torch.tensor(1.5)}, {"landmarks.sigma_m": torch.tensor(1.0)}):
+        hard, near = (family().loss(parameters, some, 1.0) for some in (batch, quick))
+        assert near.tolist() == pytest.approx(hard.tolist(), abs=0.02 if parameters else 1e-4)
 
 
 def test_swapped_landmarks_are_no_matter_of_noise():
@@ -113,8 +113,8 @@ def test_swapped_landmarks_are_no_matter_of_noise():
 
 
 def test_noise_that_was_thought_too_small_is_found():
-    thought = with_knobs(Settings(), {"landmarks.sigma_m": 0.5})
+    thought = with_parameters(Settings(), {"landmarks.sigma_m": 0.5})
     batch = looks(24, thought)
-    knobs = Knobs(thought, ["landmarks.sigma_m"])
-    done = descend(family(), knobs, batch, Plan(steps=20, batch=12, rate=0.2, look_every=10, watched=0))
+    parameters = Parameters(thought, ["landmarks.sigma_m"])
+    done = descend(family(), parameters, batch, Plan(steps=20, batch=12, rate=0.2, look_every=10, watched=0))
     assert done.settings.landmarks.sigma_m == pytest.approx(airborne.GPS_M, rel=0.3)

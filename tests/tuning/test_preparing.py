@@ -1,4 +1,4 @@
-"""From a study to what is tuned: the family of the knobs, clips apart, and what cannot be."""
+"""From a study to what is tuned: the family of the parameters, clips apart, and what cannot be."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def test_examples_are_of_the_clips_that_are_not_held_out(clips) -> None:
     frames = [example.frame for example in ready.examples]
     assert frames == sorted(frames)
     assert ready.spec.tasks == ("motion",) and ready.goal.name == "motion.pixels.f"
-    assert set(ready.knobs.names) >= {"difference.threshold", "difference.noise_levels"}
+    assert set(ready.parameters.names) >= {"difference.threshold", "difference.noise_levels"}
 
 
 def test_a_clip_without_the_truth_that_is_needed_is_named(clips) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
@@ -15,7 +15,7 @@ from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.ground_examples import KNOBS, sighted, sightings_of
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.places import UNPLACED, family
 from torchvision_dddas.types import Camera
 
@@ -65,26 +65,26 @@ def test_the_loss_is_that_of_the_hard_places():
 
 def test_the_gradient_is_that_of_the_hard_loss():
     settings = Settings()
-    knobs = Knobs(settings, KNOBS)
+    parameters = Parameters(settings, KNOBS)
     batch = [example(seed, settings) for seed in range(3)]
-    family().loss(knobs.values(), batch, 1.0).sum().backward()
-    for free in knobs.free:
+    family().loss(parameters.values(), batch, 1.0).sum().backward()
+    for free in parameters.free:
         assert free.grad is not None
         wanted = []
         for step in (1e-3, -1e-3):
             with torch.no_grad():
                 free += step
-                wanted.append(float(family().loss(knobs.values(), batch, 1.0).sum()))
+                wanted.append(float(family().loss(parameters.values(), batch, 1.0).sum()))
                 free -= step
         assert float(free.grad) == pytest.approx((wanted[0] - wanted[1]) / 2e-3, rel=0.01, abs=0.01)
 
 
 def test_ellipses_hold_as_many_places_as_they_say_on_people_not_tuned_on():
     errors = {"feet": 0.015, "tall": 0.15, "body": 0.1}
-    thought = with_knobs(Settings(), {"ground.feet_sigma": 0.05, "ground.height_sigma": 0.03})
-    knobs = Knobs(thought, ["ground.feet_sigma", "ground.height_sigma"])
+    thought = with_parameters(Settings(), {"ground.feet_sigma": 0.05, "ground.height_sigma": 0.03})
+    parameters = Parameters(thought, ["ground.feet_sigma", "ground.height_sigma"])
     batch = [example(seed, thought, 120, **errors) for seed in range(3)]
-    tuned = descend(family(), knobs, batch, Plan(steps=40, batch=3, rate=0.2, look_every=20, watched=0)).settings
+    tuned = descend(family(), parameters, batch, Plan(steps=40, batch=3, rate=0.2, look_every=20, watched=0)).settings
 
     def held(settings: Settings) -> float:
         shares = []
@@ -103,11 +103,11 @@ def test_people_without_a_place_cost_and_have_no_slope():
     box, true = people(0, 1)
     box[:, 1] -= 400  # above the horizon
     seen = sighted(CAMERA, box, np.ones(1, bool), true)
-    knobs = Knobs(settings, ["ground.feet_sigma"])
-    found = family().loss(knobs.values(), [Example("ground", 1, (seen, settings))], 1.0)
+    parameters = Parameters(settings, ["ground.feet_sigma"])
+    found = family().loss(parameters.values(), [Example("ground", 1, (seen, settings))], 1.0)
     found.sum().backward()
     assert float(found.detach()) == UNPLACED
-    assert float(knobs.free[0].grad or 0) == 0
+    assert float(parameters.free[0].grad or 0) == 0
 
 
 def written(folder: Path) -> Clip:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import PeopleKnobs, Settings, with_knobs
+from torchvision_dddas.config import PeopleParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
@@ -14,14 +14,14 @@ from torchvision_dddas.people.boxes import body
 from torchvision_dddas.tuning import recognition
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.recognition import Scored, family, scored
 
 NAMES = [f"people.{name}" for name in recognition.KNOBS]
 
 
-def picture(seed: int, true: PeopleKnobs) -> Scored:
-    """Detections drawn by the knobs that are true: probabilities and the shares of bodies."""
+def picture(seed: int, true: PeopleParameters) -> Scored:
+    """Detections drawn by the parameters that are true: probabilities and the shares of bodies."""
     rng = np.random.default_rng(seed)
     margin = np.sort(rng.uniform(-0.9, 2.5, 40))[::-1].copy()
     odds = true.probability_slope * (margin - true.probability_even)
@@ -31,20 +31,22 @@ def picture(seed: int, true: PeopleKnobs) -> Scored:
     window = np.column_stack([rng.uniform(0, 300, (hits, 2)), rng.uniform([60, 120], [70, 140], (hits, 2))])
     columns = margin, right, window, body(window, true) + rng.normal(0, 1, (hits, 4))
     margin_, right_, window_, body_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
-    return Scored(margin_, right_, sure, window_, body_, int(right.sum()) + 1, PeopleKnobs())
+    return Scored(margin_, right_, sure, window_, body_, int(right.sum()) + 1, PeopleParameters())
 
 
 def test_knobs_that_drew_the_truth_are_found_again():
-    true = PeopleKnobs(height_share=0.8, width_share=0.42, feet_share=0.9, probability_slope=4.0, probability_even=0.5)
+    true = PeopleParameters(
+        height_share=0.8, width_share=0.42, feet_share=0.9, probability_slope=4.0, probability_even=0.5
+    )
     batch = [Example("drawn", seed, picture(seed, true)) for seed in range(20)]
-    knobs = Knobs(Settings(), NAMES)
+    parameters = Parameters(Settings(), NAMES)
     with torch.no_grad():
-        before = float(family().loss(knobs.values(), batch, 0.05).mean())
+        before = float(family().loss(parameters.values(), batch, 0.05).mean())
     found = descend(
-        family(), knobs, batch, Plan(steps=60, batch=10, rate=0.1, look_every=20, watched=0)
+        family(), parameters, batch, Plan(steps=60, batch=10, rate=0.1, look_every=20, watched=0)
     ).settings.people
     with torch.no_grad():
-        assert float(family().loss(knobs.values(), batch, 0.05).mean()) < before
+        assert float(family().loss(parameters.values(), batch, 0.05).mean()) < before
     for name, within in (("height_share", 0.02), ("width_share", 0.02), ("feet_share", 0.02)):
         assert getattr(found, name) == pytest.approx(getattr(true, name), abs=within)
     assert found.probability_even == pytest.approx(0.5, abs=0.15)
@@ -53,11 +55,11 @@ def test_knobs_that_drew_the_truth_are_found_again():
     assert 0.1 < found.threshold < 0.7
 
 
-def test_each_knob_moves_its_own_part_alone():
-    batch = [Example("drawn", 0, picture(0, PeopleKnobs()))]
-    knobs = Knobs(Settings(), ["people.threshold"])
-    family().loss(knobs.values(), batch, 0.2).sum().backward()
-    assert float(knobs.free[0].grad or 0) != 0
+def test_each_parameter_moves_its_own_part_alone():
+    batch = [Example("drawn", 0, picture(0, PeopleParameters()))]
+    parameters = Parameters(Settings(), ["people.threshold"])
+    family().loss(parameters.values(), batch, 0.2).sum().backward()
+    assert float(parameters.free[0].grad or 0) != 0
     alone = family().loss({}, batch, 0.0) - family().loss({"people.threshold": torch.tensor(0.5)}, batch, 0.0)
     content = batch[0].content
     right = content.right * (content.margin > 0)
@@ -93,12 +95,12 @@ def spotted() -> tuple[np.ndarray, np.ndarray]:
     image = np.zeros((160, 256), np.uint8)
     for u, level in ((40, 250), (136, 150), (216, 50)):
         image[80 - 3 : 80 + 4, u - 3 : u + 4] = level
-    return image, body(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleKnobs())
+    return image, body(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleParameters())
 
 
 def test_detections_below_the_threshold_are_kept_without_a_probability():
     image, true = spotted()
-    found = scored(image, true, PeopleKnobs(), Spots())
+    found = scored(image, true, PeopleParameters(), Spots())
     assert found.margin.tolist() == pytest.approx([1.5, 0.5, -0.5])
     assert found.right.tolist() == [1, 0, 0]
     assert (found.sure, found.people) == (2, 1)
@@ -108,7 +110,7 @@ def test_detections_below_the_threshold_are_kept_without_a_probability():
 
 def test_what_does_not_count_is_left_out():
     image, true = spotted()
-    found = scored(image, true, PeopleKnobs(), Spots(), lambda box_px: box_px[:, 0] < 100)
+    found = scored(image, true, PeopleParameters(), Spots(), lambda box_px: box_px[:, 0] < 100)
     assert found.margin.tolist() == pytest.approx([1.5])
 
 
@@ -119,7 +121,7 @@ def test_a_clip_gives_its_labelled_pictures(tmp_path: Path, monkeypatch: pytest.
         files.append(tmp_path / f"{number}.png")
         cv2.imwrite(str(files[-1]), image)
     truth = Truth("boxes", tmp_path, {}, {1: true, 3: np.zeros((0, 4))})
-    monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", lambda knobs: Spots())
+    monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", lambda parameters: Spots())
     clip = Clip("spots", tmp_path, tuple(files), truth=truth, shows=("people",))
     found = family().examples([clip], Settings())
     assert [(one.frame, one.content.people, one.content.right.sum()) for one in found] == [(1, 1, 1), (3, 0, 0)]
@@ -129,4 +131,4 @@ def test_a_clip_gives_its_labelled_pictures(tmp_path: Path, monkeypatch: pytest.
 
 def test_other_suppressions_than_nms_are_refused():
     with pytest.raises(InputError, match="set it to nms"):
-        family().examples([], with_knobs(Settings(), {"people.suppression": "opencv"}))
+        family().examples([], with_parameters(Settings(), {"people.suppression": "opencv"}))

@@ -1,4 +1,4 @@
-"""The knobs of registration: points of labelled frames, and a loss that is the hard registration's own error."""
+"""The parameters of registration: points of labelled frames, and a loss that is the hard registration's own error."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import folder
@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, Registering
 
 SETTINGS = Settings()
@@ -37,8 +37,8 @@ def examples(clip: Clip) -> list[Example]:
 
 
 def lost(examples: list[Example], tolerance_px: float, check_px: float, softness: float = 0.0) -> torch.Tensor:
-    knobs = {RANSAC: torch.tensor(tolerance_px).double(), CHECK: torch.tensor(check_px).double()}
-    return Registering().loss(knobs, examples, softness)
+    parameters = {RANSAC: torch.tensor(tolerance_px).double(), CHECK: torch.tensor(check_px).double()}
+    return Registering().loss(parameters, examples, softness)
 
 
 def test_every_labelled_frame_that_has_a_next_one_is_an_example(clip: Clip, examples: list[Example]) -> None:
@@ -52,14 +52,14 @@ def test_every_labelled_frame_that_has_a_next_one_is_an_example(clip: Clip, exam
 
 @pytest.mark.parametrize("tolerance_px", [0.7, 2.0, 6.0])
 def test_the_hard_loss_is_the_error_of_the_pipelines_registration(clip, examples, tolerance_px: float) -> None:
-    settings = with_knobs(SETTINGS, {RANSAC: tolerance_px})
-    vision = load_engine("onboard", settings)
-    views = [vision.prepare(frame.image) for frame in opened(clip)]
+    settings = with_parameters(SETTINGS, {RANSAC: tolerance_px})
+    engine = load_engine("onboard", settings)
+    views = [engine.prepare(frame.image) for frame in opened(clip)]
     wanted = []
     for pair, example in zip(pairwise(views), examples, strict=True):
         points = example.content.points
         start, end = (side[points.still].numpy() for side in (points.earlier_px, points.later_px))
-        found = vision.register([pair])[0].later_from_earlier
+        found = engine.register([pair])[0].later_from_earlier
         wanted.append(np.linalg.norm(transfer(found, start) - end, axis=1).mean())
     np.testing.assert_allclose(lost(examples, tolerance_px, 1.0).numpy(), wanted, atol=0.01)
 
@@ -71,16 +71,18 @@ def test_the_loss_tends_to_the_hard_one(examples: list[Example]) -> None:
 
 
 def test_knobs_of_the_family_have_finite_gradients(examples: list[Example]) -> None:
-    knobs = Knobs(SETTINGS, [name for name, knob in TUNABLE.items() if knob.family == "registration"])
-    Registering().loss(knobs.values(), examples, 0.2).sum().backward()
-    for name, free in zip(knobs.names, knobs.free, strict=True):
+    parameters = Parameters(
+        SETTINGS, [name for name, parameter in TUNABLE.items() if parameter.family == "registration"]
+    )
+    Registering().loss(parameters.values(), examples, 0.2).sum().backward()
+    for name, free in zip(parameters.names, parameters.free, strict=True):
         assert free.grad is not None and bool(free.grad.isfinite()) and float(free.grad) != 0, name
 
 
 def test_a_tolerance_that_is_too_wide_slopes_down_to_narrower_ones(examples: list[Example]) -> None:
-    knobs = Knobs(with_knobs(SETTINGS, {RANSAC: 6.0}), [RANSAC])
-    Registering().loss(knobs.values(), examples, 0.3).sum().backward()
-    assert float(knobs.free[0].grad) > 0
+    parameters = Parameters(with_parameters(SETTINGS, {RANSAC: 6.0}), [RANSAC])
+    Registering().loss(parameters.values(), examples, 0.3).sum().backward()
+    assert float(parameters.free[0].grad) > 0
     assert float(lost(examples, 6.0, 1.0).mean()) > float(lost(examples, 2.0, 1.0).mean())
 
 
@@ -101,8 +103,8 @@ def test_what_cannot_be_tuned_is_told_in_a_line(clip: Clip, examples: list[Examp
         Registering().examples([clip, bare], SETTINGS, lambda: told.append(1))
     assert not told, "a clip was computed before"
     with pytest.raises(InputError, match=r"registration\.halved"):
-        Registering().check([RANSAC], with_knobs(SETTINGS, {"registration.halved": True}))
-    unchecked = with_knobs(SETTINGS, {CHECK: 0.0})
+        Registering().check([RANSAC], with_parameters(SETTINGS, {"registration.halved": True}))
+    unchecked = with_parameters(SETTINGS, {CHECK: 0.0})
     free = Registering().examples([clip], unchecked)
     assert bool(torch.isfinite(Registering().loss({RANSAC: torch.tensor(2.0).double()}, free, 0.1)).all())
     with pytest.raises(InputError, match="forward_backward_px = 0 leaves the check out"):

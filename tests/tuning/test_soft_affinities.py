@@ -1,4 +1,4 @@
-"""The soft association of the source beside the hard one: the same links, and knobs that are found again."""
+"""The soft association of the source beside the hard one: the same links, and parameters that are found again."""
 
 from dataclasses import fields, replace
 from functools import partial
@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import PaperKnobs, Settings
+from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.tracking.assignment import pairs
 from torchvision_dddas.tracking.source_tracker import Look, associate
 from torchvision_dddas.tuning.affinities import together, window_of
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.soft_affinities import Windows, link_gains, location_weight, unlikeliness, wrong_links
 
 ALL = ("threshold", "lowest_dispersion", "location_cut", "appearance_cut")
@@ -38,12 +38,12 @@ def looks_of(
     return (now, before), (who_now, who_before)
 
 
-def windows(knobs: PaperKnobs, count: int = 6, many: int = 6, **kinds: Any) -> Windows:
-    return together([window_of(*looks_of(count, seed, **kinds), knobs) for seed in range(many)])
+def windows(parameters: PaperParameters, count: int = 6, many: int = 6, **kinds: Any) -> Windows:
+    return together([window_of(*looks_of(count, seed, **kinds), parameters) for seed in range(many)])
 
 
-def paper(**values: Any) -> PaperKnobs:
-    return PaperKnobs.model_construct(**(dict(PaperKnobs(window=2)) | values))
+def paper(**values: Any) -> PaperParameters:
+    return PaperParameters.model_construct(**(dict(PaperParameters(window=2)) | values))
 
 
 def linked(gain: Tensor) -> set[tuple[int, int]]:
@@ -53,27 +53,29 @@ def linked(gain: Tensor) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("values", [{}, {"rule": "fixed", "weight": 0.6}, {"threshold": 0.05}, {"location_cut": 0.1}])
 @pytest.mark.parametrize("pictured", [True, False])
 def test_without_softness_the_links_and_the_weight_are_those_of_the_source(values, pictured):
-    knobs = PaperKnobs.model_validate({"window": 2} | values)
+    parameters = PaperParameters.model_validate({"window": 2} | values)
     for seed in range(5):
         looks, identities = looks_of(7, seed, pictured, hues=3)
-        one = together([window_of(looks, identities, knobs)])
-        hard = associate(list(looks), knobs)
-        assert location_weight(knobs, one).item() == pytest.approx(hard.weight)
+        one = together([window_of(looks, identities, parameters)])
+        hard = associate(list(looks), parameters)
+        assert location_weight(parameters, one).item() == pytest.approx(hard.weight)
         wanted = {(i - 1, j - 1) for i, j in hard.rows.tolist() if i and j}
-        assert linked(link_gains(knobs, one)[0]) == wanted
+        assert linked(link_gains(parameters, one)[0]) == wanted
 
 
 def test_as_softness_vanishes_the_loss_is_the_number_of_wrong_links():
-    knobs = paper(threshold=0.04)
-    many = windows(knobs, count=8, pictured=False)
-    best = [linked(gain) for gain in link_gains(knobs, many)]
+    parameters = paper(threshold=0.04)
+    many = windows(parameters, count=8, pictured=False)
+    best = [linked(gain) for gain in link_gains(parameters, many)]
     wanted = []
     for chosen, true in zip(best, many.true, strict=True):
         right = {(int(i), int(j)) for i, j in true.nonzero()}
         known = {i for i, _ in right}
         wanted.append(len(right - chosen) + len({i for i, _ in chosen} - known))
     assert sum(wanted) > 0
-    off = [(wrong_links(knobs, many, soft) - torch.tensor(wanted)).abs().sum().item() for soft in (0.3, 0.1, 0.003)]
+    off = [
+        (wrong_links(parameters, many, soft) - torch.tensor(wanted)).abs().sum().item() for soft in (0.3, 0.1, 0.003)
+    ]
     assert off[0] > off[1] > off[2]
     assert off[2] < 0.1
 
@@ -82,8 +84,8 @@ def test_slopes_are_those_of_small_changes_and_none_is_missing():
     many = windows(paper(), count=5, many=3, hues=3)
 
     def lost(*values: Tensor) -> Tensor:
-        knobs = paper(**dict(zip(ALL, values, strict=True)))
-        return torch.cat([wrong_links(knobs, many, 0.1), unlikeliness(knobs, many, 0.1)])
+        parameters = paper(**dict(zip(ALL, values, strict=True)))
+        return torch.cat([wrong_links(parameters, many, 0.1), unlikeliness(parameters, many, 0.1)])
 
     start = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.1, 0.6, 0.3, 0.3)]
     # Ten rounds of messages are not their fixed point, at which alone the slope is exact.
@@ -98,14 +100,14 @@ def test_slopes_are_those_of_small_changes_and_none_is_missing():
 
 
 def test_nobody_and_targets_that_fill_up_change_nothing_and_all_is_finite():
-    knobs = paper(threshold=torch.tensor(0.1, dtype=torch.float64, requires_grad=True))
-    parts = [window_of(*looks_of(count, 3, leaving=leaving), knobs) for count, leaving in ((0, 0), (1, 1), (6, 2))]
-    both = wrong_links(knobs, together(parts), 0.05)
-    alone = torch.cat([wrong_links(knobs, together([part]), 0.05) for part in parts])
+    parameters = paper(threshold=torch.tensor(0.1, dtype=torch.float64, requires_grad=True))
+    parts = [window_of(*looks_of(count, 3, leaving=leaving), parameters) for count, leaving in ((0, 0), (1, 1), (6, 2))]
+    both = wrong_links(parameters, together(parts), 0.05)
+    alone = torch.cat([wrong_links(parameters, together([part]), 0.05) for part in parts])
     torch.testing.assert_close(both, alone, rtol=0, atol=1e-3)
     assert both[0] == 0
-    threshold: Any = knobs.threshold
-    (slope,) = torch.autograd.grad(both.sum() + unlikeliness(knobs, together(parts), 0.05).sum(), threshold)
+    threshold: Any = parameters.threshold
+    (slope,) = torch.autograd.grad(both.sum() + unlikeliness(parameters, together(parts), 0.05).sum(), threshold)
     assert torch.isfinite(slope)
 
 
@@ -125,7 +127,7 @@ def test_the_order_of_targets_does_not_matter():
         torch.testing.assert_close(loss(paper(), mixed, 0.05), loss(paper(), plain, 0.05))
 
 
-def test_a_link_that_no_knob_can_save_counts_no_more_than_once():
+def test_a_link_that_no_parameter_can_save_counts_no_more_than_once():
     many = windows(paper(), count=4, many=2, pictured=False)
     exchanged = replace(many, true=many.true.flip(2))
     wrong = wrong_links(paper(), exchanged, 0.001)
@@ -134,26 +136,26 @@ def test_a_link_that_no_knob_can_save_counts_no_more_than_once():
 
 
 @pytest.mark.parametrize(("start", "group"), [({"threshold": 0.8}, "threshold"), ({"weight": 0.95}, "weight")])
-def test_a_wrong_knob_is_brought_back_by_a_few_steps(start, group):
+def test_a_wrong_parameter_is_brought_back_by_a_few_steps(start, group):
     """Of people who come and go, a gate that is never shut links the wrong ones; of a crowd, places alone do."""
     fixed = {"rule": "fixed", "window": 2, "weight": 1.0 if group == "threshold" else 0.0} | start
-    settings = Settings().model_copy(update={"paper": PaperKnobs.model_validate(fixed)})
+    settings = Settings().model_copy(update={"paper": PaperParameters.model_validate(fixed)})
     if group == "threshold":
         many = windows(settings.paper, count=3, many=12, pictured=False, leaving=2)
     else:
         many = windows(settings.paper, count=20, many=4, leaving=0, walk=60.0)
-    knobs = Knobs(settings, [f"paper.{group}"])
-    adam = torch.optim.Adam(knobs.parameters(), lr=0.3)
+    parameters = Parameters(settings, [f"paper.{group}"])
+    adam = torch.optim.Adam(parameters.parameters(), lr=0.3)
 
     def wrong(softness: float, values: dict[str, Any]) -> Tensor:
         return wrong_links(paper(**(dict(settings.paper) | values)), many, softness).sum()
 
     before = wrong(0.001, {}).item()
     for softness in np.geomspace(0.1, 0.02, 30):
-        loss = wrong(float(softness), {name.split(".")[1]: value for name, value in knobs.values().items()})
+        loss = wrong(float(softness), {name.split(".")[1]: value for name, value in parameters.values().items()})
         adam.zero_grad()
         loss.backward()
         adam.step()
-    after = wrong(0.001, {group: getattr(knobs.settings().paper, group)}).item()
+    after = wrong(0.001, {group: getattr(parameters.settings().paper, group)}).item()
     assert before >= 4
     assert after < before / 2

@@ -1,4 +1,4 @@
-"""The loss on true links: the tracker's own scores, whose knobs it can find again."""
+"""The loss on true links: the tracker's own scores, whose parameters it can find again."""
 
 from dataclasses import fields, replace
 from typing import Any
@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import Settings, TrackKnobs
+from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.scores import Sight, link_scores
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.soft_scores import Looks, unlikeliness
 
 NAMES = [
@@ -61,29 +61,29 @@ def walkers(count: int = 6, looks: int = 10, scatter: float = 0.06, hide: bool =
     return Looks(**{name: torch.as_tensor(value) for name, value in parts.items()})
 
 
-def track(values: dict[str, Tensor]) -> TrackKnobs:
+def track(values: dict[str, Tensor]) -> TrackParameters:
     mine = {name.removeprefix("track."): value for name, value in values.items()}
-    return TrackKnobs.model_construct(**(dict(Settings().track) | mine))
+    return TrackParameters.model_construct(**(dict(Settings().track) | mine))
 
 
 def test_tensors_are_scored_as_arrays_are():
-    knobs, looks = Settings().track, walkers()
+    parameters, looks = Settings().track, walkers()
     box = looks.box_px[0].numpy()
-    state = kalman.started(box[0], 1, knobs.scatter, 0.07)
-    state = kalman.updated(kalman.predicted(state, 6, 0.009), box[1], 6, knobs.scatter)
+    state = kalman.started(box[0], 1, parameters.scatter, 0.07)
+    state = kalman.updated(kalman.predicted(state, 6, 0.009), box[1], 6, parameters.scatter)
     state[::2, kalman.SEEN] = 1
     left, sight = np.arange(6) % 3 == 0, Sight(11, 5, 0.07, 0.02, 0.1, (500.0, 500.0))
-    wanted = link_scores(state, left, box[2], sight, knobs)
+    wanted = link_scores(state, left, box[2], sight, parameters)
     there: Any = torch.as_tensor(state)
     at_border: Any = torch.as_tensor(left)
     last: Any = looks.box_px[0, 2]
     births: Any = torch.tensor(0.02, dtype=torch.float64)
-    found: Any = link_scores(there, at_border, last, replace(sight, births=births), knobs)
+    found: Any = link_scores(there, at_border, last, replace(sight, births=births), parameters)
     np.testing.assert_allclose(found.numpy(), wanted, rtol=0, atol=1e-9)
 
 
-def test_every_knob_has_a_slope_and_all_are_finite():
-    values = Knobs(Settings(), NAMES).values()
+def test_every_parameter_has_a_slope_and_all_are_finite():
+    values = Parameters(Settings(), NAMES).values()
     slopes = torch.autograd.grad(unlikeliness(track(values), walkers(), 1.0).sum(), list(values.values()))
     assert all(torch.isfinite(slope) for slope in slopes)
     assert [name for name, slope in zip(values, slopes, strict=True) if slope == 0] == []
@@ -95,15 +95,15 @@ def test_slopes_are_those_of_small_changes():
     def lost(*values: Tensor) -> Tensor:
         return unlikeliness(track(dict(zip(NAMES, values, strict=True))), looks, 1.0)
 
-    start = [value.detach() for value in Knobs(Settings(), NAMES).values().values()]
+    start = [value.detach() for value in Parameters(Settings(), NAMES).values().values()]
     for place in range(len(NAMES)):
         ends = []
         for sign in (1, -1):
             moved = [value.clone() for value in start]
             moved[place] *= 1 + sign * 1e-4
             ends.append(lost(*moved).detach().sum().item())
-        knob = start[place].clone().requires_grad_()
-        (slope,) = torch.autograd.grad(lost(*start[:place], knob, *start[place + 1 :]).sum(), knob)
+        parameter = start[place].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(lost(*start[:place], parameter, *start[place + 1 :]).sum(), parameter)
         assert slope.item() == pytest.approx((ends[0] - ends[1]) / (2e-4 * start[place].item()), rel=0.05, abs=2e-4)
 
 
@@ -179,21 +179,25 @@ def test_own_targets_are_scored_with_their_own_scatter():
 
 def test_a_wrong_scatter_is_brought_back_by_a_few_steps():
     looks = walkers(8, 12, scatter=0.02, hide=False)
-    knobs = Knobs(Settings().model_copy(update={"track": TrackKnobs(scatter=0.3, tail=30.0)}), ["track.scatter"])
-    adam = torch.optim.Adam(knobs.parameters(), lr=0.3)
+    parameters = Parameters(
+        Settings().model_copy(update={"track": TrackParameters(scatter=0.3, tail=30.0)}), ["track.scatter"]
+    )
+    adam = torch.optim.Adam(parameters.parameters(), lr=0.3)
     losses = []
     for _ in range(12):
-        loss = unlikeliness(TrackKnobs.model_construct(**(dict(knobs.base.track) | track_of(knobs))), looks, 1.0).mean()
+        loss = unlikeliness(
+            TrackParameters.model_construct(**(dict(parameters.base.track) | track_of(parameters))), looks, 1.0
+        ).mean()
         adam.zero_grad()
         loss.backward()
         adam.step()
         losses.append(loss.item())
     assert losses[-1] < losses[0]
-    assert knobs.settings().track.scatter < 0.15
+    assert parameters.settings().track.scatter < 0.15
 
 
-def track_of(knobs: Knobs) -> dict[str, Tensor]:
-    return {name.removeprefix("track."): value for name, value in knobs.values().items()}
+def track_of(parameters: Parameters) -> dict[str, Tensor]:
+    return {name.removeprefix("track."): value for name, value in parameters.values().items()}
 
 
 def test_all_the_links_weights_are_tunable():

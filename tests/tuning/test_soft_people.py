@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.evaluation.metrics.detection import areas, iou
 from torchvision_dddas.people.boxes import body, probability
 from torchvision_dddas.tuning.soft_people import bodies, doubt, soft_f
 
 KNOBS = {
-    f"people.{name}": torch.tensor(float(getattr(PeopleKnobs(), name)), dtype=torch.float64)
+    f"people.{name}": torch.tensor(float(getattr(PeopleParameters(), name)), dtype=torch.float64)
     for name in ("height_share", "width_share", "feet_share", "probability_slope", "probability_even")
 }
 
@@ -20,12 +20,12 @@ def drawn(seed: int = 0, count: int = 6) -> np.ndarray:
 
 def test_bodies_are_those_of_the_hard_recognizer():
     window = drawn()
-    np.testing.assert_allclose(bodies(torch.as_tensor(window), KNOBS).numpy(), body(window, PeopleKnobs()))
+    np.testing.assert_allclose(bodies(torch.as_tensor(window), KNOBS).numpy(), body(window, PeopleParameters()))
 
 
 def test_doubt_is_that_of_the_hard_probability():
     margin = np.linspace(-1, 3, 9)
-    told = probability(margin, PeopleKnobs())
+    told = probability(margin, PeopleParameters())
     for right, wanted in ((1.0, -np.log(told)), (0.0, -np.log(1 - told))):
         found = doubt(torch.as_tensor(margin), torch.full((9,), right, dtype=torch.float64), KNOBS)
         np.testing.assert_allclose(found.numpy(), wanted)
@@ -38,8 +38,8 @@ def test_doubt_is_least_where_probabilities_are_the_shares_that_are_right():
     columns = torch.as_tensor(margin), torch.as_tensor(right, dtype=torch.float64)
 
     def mean(slope: float, even: float) -> float:
-        knobs = {"people.probability_slope": slope, "people.probability_even": even}
-        return float(doubt(*columns, {name: torch.tensor(value) for name, value in knobs.items()}).mean())
+        parameters = {"people.probability_slope": slope, "people.probability_even": even}
+        return float(doubt(*columns, {name: torch.tensor(value) for name, value in parameters.items()}).mean())
 
     assert mean(3.0, 0.6) < min(mean(2.0, 0.6), mean(4.0, 0.6), mean(3.0, 0.4), mean(3.0, 0.8))
 
@@ -75,9 +75,11 @@ def test_gradients_of_all_are_right():
     right = torch.tensor([0.0, 0, 1, 0, 1, 1], dtype=torch.float64)
 
     def lost(*values: torch.Tensor) -> torch.Tensor:
-        knobs = dict(zip(KNOBS, values[:-1], strict=True))
-        common, union = areas(bodies(window, knobs), true)
-        return (common / union).sum() + doubt(margin, right, knobs).sum() + soft_f(margin, right, 4, values[-1], 0.3)
+        parameters = dict(zip(KNOBS, values[:-1], strict=True))
+        common, union = areas(bodies(window, parameters), true)
+        return (
+            (common / union).sum() + doubt(margin, right, parameters).sum() + soft_f(margin, right, 4, values[-1], 0.3)
+        )
 
     start = [value.clone().requires_grad_() for value in (*KNOBS.values(), torch.tensor(0.4, dtype=torch.float64))]
     assert torch.autograd.gradcheck(lost, start)

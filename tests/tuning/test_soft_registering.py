@@ -5,12 +5,12 @@ import torch
 
 from torchvision_dddas.functional.homography import fit
 from torchvision_dddas.geometry import transfer
-from torchvision_dddas.tuning.soft_registration import Followed, refitted
+from torchvision_dddas.tuning.soft_registration import TrackedFrame, refitted
 
 TRUE = torch.tensor([[1.01, 0.02, 3.0], [-0.01, 0.99, -2.0], [1e-5, -2e-5, 1.0]], dtype=torch.float64)
 
 
-def scene(seed: int = 0, slow_px: float = 3.0) -> Followed:
+def scene(seed: int = 0, slow_px: float = 3.0) -> TrackedFrame:
     """60 points on background, 12 on something slow, 8 that were lost and did not find back."""
     random = torch.Generator().manual_seed(seed)
     earlier = torch.rand(80, 2, generator=random, dtype=torch.float64) * 300
@@ -20,7 +20,7 @@ def scene(seed: int = 0, slow_px: float = 3.0) -> Followed:
     later[72:] += 0.7
     missed = 0.05 * torch.rand(80, generator=random, dtype=torch.float64)
     missed[72:] = 2.0
-    return Followed(earlier, later, missed, torch.arange(80) < 60)
+    return TrackedFrame(earlier, later, missed, torch.arange(80) < 60)
 
 
 def number(value: float) -> torch.Tensor:

@@ -5,43 +5,43 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs, chosen
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, chosen
 
 
 @pytest.mark.parametrize("name", TUNABLE)
 @pytest.mark.parametrize("free", [-1e6, -40.0, -1.0, 0.0, 2.0, 40.0, 1e6])
 def test_no_parameter_leads_out_of_a_knobs_range(name: str, free: float) -> None:
-    knob = TUNABLE[name]
-    value = float(knob.value(torch.tensor(free, dtype=torch.float64)))
-    assert knob.low - 1e-6 <= value <= knob.high * (1 + 1e-6)
-    with_knobs(Settings(), {name: knob.rounded(value)})
+    parameter = TUNABLE[name]
+    value = float(parameter.value(torch.tensor(free, dtype=torch.float64)))
+    assert parameter.low - 1e-6 <= value <= parameter.high * (1 + 1e-6)
+    with_parameters(Settings(), {name: parameter.rounded(value)})
 
 
 @given(st.sampled_from(sorted(TUNABLE)), st.floats(0.01, 0.99))
 def test_a_value_comes_back_from_its_parameter(name: str, share: float) -> None:
-    knob = TUNABLE[name]
-    value = knob.low + share * (knob.high - knob.low)
-    back = float(knob.value(torch.tensor(knob.free(value), dtype=torch.float64)))
+    parameter = TUNABLE[name]
+    value = parameter.low + share * (parameter.high - parameter.low)
+    back = float(parameter.value(torch.tensor(parameter.free(value), dtype=torch.float64)))
     assert math.isclose(back, value, rel_tol=1e-6) or not 1e-3 < _share(name, value) < 1 - 1e-3
 
 
 def _share(name: str, value: float) -> float:
-    knob = TUNABLE[name]
-    scale = (lambda v: math.log(v + knob.offset)) if knob.log else float
-    return (scale(value) - scale(knob.low)) / (scale(knob.high) - scale(knob.low))
+    parameter = TUNABLE[name]
+    scale = (lambda v: math.log(v + parameter.offset)) if parameter.log else float
+    return (scale(value) - scale(parameter.low)) / (scale(parameter.high) - scale(parameter.low))
 
 
 def test_knobs_that_have_not_moved_are_the_settings_they_came_from() -> None:
-    settings = with_knobs(Settings(), {"difference.threshold": 3.14159265, "landmarks.common_sigma_m": 0.0})
-    assert Knobs(settings, TUNABLE).settings() == settings
+    settings = with_parameters(Settings(), {"difference.threshold": 3.14159265, "landmarks.common_sigma_m": 0.0})
+    assert Parameters(settings, TUNABLE).settings() == settings
 
 
-def test_every_knob_has_a_slope_where_it_starts() -> None:
-    knobs = Knobs(Settings(), TUNABLE)
-    torch.stack(list(knobs.values().values())).sum().backward()
-    for name, free in zip(knobs.names, knobs.free, strict=True):
+def test_every_parameter_has_a_slope_where_it_starts() -> None:
+    parameters = Parameters(Settings(), TUNABLE)
+    torch.stack(list(parameters.values().values())).sum().backward()
+    for name, free in zip(parameters.names, parameters.free, strict=True):
         assert free.grad is not None and float(free.grad) > 0, name
 
 
@@ -58,35 +58,35 @@ def test_every_knob_has_a_slope_where_it_starts() -> None:
 )
 def test_a_tuned_value_is_rounded_to_what_its_setting_takes(name: str, value: float, wanted: float) -> None:
     assert TUNABLE[name].rounded(value) == wanted
-    with_knobs(Settings(), {name: TUNABLE[name].rounded(value)})
+    with_parameters(Settings(), {name: TUNABLE[name].rounded(value)})
 
 
 def test_a_parameter_that_moved_changes_its_setting_alone() -> None:
-    knobs = Knobs(Settings(), ["difference.threshold", "morphology.erode_px"])
+    parameters = Parameters(Settings(), ["difference.threshold", "morphology.erode_px"])
     with torch.no_grad():
-        knobs.free[0].add_(0.5)
-    tuned = knobs.settings()
+        parameters.free[0].add_(0.5)
+    tuned = parameters.settings()
     shipped = Settings()
     assert tuned.difference.threshold > shipped.difference.threshold
-    assert with_knobs(tuned, {"difference.threshold": shipped.difference.threshold}) == shipped
+    assert with_parameters(tuned, {"difference.threshold": shipped.difference.threshold}) == shipped
 
 
-def test_a_group_stands_for_its_tunable_knobs() -> None:
+def test_a_group_stands_for_its_tunable_parameters() -> None:
     assert chosen(["morphology.*", "morphology.erode_px"]) == ["morphology.erode_px", "morphology.close_px"]
 
 
 @pytest.mark.parametrize("name", ["difference.kind", "difference.treshold", "nonsense", "registration.levels"])
-def test_a_knob_that_cannot_be_tuned_is_told_with_those_that_can(name: str) -> None:
+def test_a_parameter_that_cannot_be_tuned_is_told_with_those_that_can(name: str) -> None:
     with pytest.raises(InputError, match=r"difference\.threshold \(0\.1 to 255\)") as caught:
-        Knobs(Settings(), [name])
+        Parameters(Settings(), [name])
     assert "\n" not in str(caught.value) and f"'{name}'" in str(caught.value)
 
 
 def test_whole_sizes_have_no_gradient_and_the_others_have() -> None:
-    knobs = Knobs(Settings(), ["morphology.erode_px", "difference.threshold"])
+    parameters = Parameters(Settings(), ["morphology.erode_px", "difference.threshold"])
     with torch.no_grad():
-        knobs.free[0] += 0.15
-    values = knobs.values(whole=True)
-    assert float(knobs.values()["morphology.erode_px"].detach()) != 3 and float(values["morphology.erode_px"]) == 3
+        parameters.free[0] += 0.15
+    values = parameters.values(whole=True)
+    assert float(parameters.values()["morphology.erode_px"].detach()) != 3 and float(values["morphology.erode_px"]) == 3
     assert not values["morphology.erode_px"].requires_grad and values["difference.threshold"].requires_grad
-    assert Knobs(Settings(), ["morphology.erode_px"]).values(whole=True)["morphology.erode_px"].requires_grad
+    assert Parameters(Settings(), ["morphology.erode_px"]).values(whole=True)["morphology.erode_px"].requires_grad

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.evaluation.studies.world import filmed, study
-from torchvision_dddas.config import load_config, with_knobs
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.evaluation.metrics import paired
 from torchvision_dddas.evaluation.studies.goals import goal_of, value_of
 from torchvision_dddas.evaluation.studies.running import run_study
@@ -70,7 +70,7 @@ def test_the_goal_is_judged_by_itself_and_less_may_be_better() -> None:
 
 def test_knobs_that_did_not_move_change_nothing(clips) -> None:
     same = {"difference.threshold": load_config("fast").difference.threshold}
-    assert with_knobs(load_config("fast"), same) == load_config("fast")
+    assert with_parameters(load_config("fast"), same) == load_config("fast")
     spec = read_spec(clips)
     told = judge(spec, clips.parent, GOAL, same, ("held",), (), 0, clips.parent / "cache")
     assert told.tuned.says == "the same" and told.held is None

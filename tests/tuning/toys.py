@@ -1,4 +1,4 @@
-"""Families of knobs that are known through and through: where their loss is least, where it is no number."""
+"""Families of parameters that are known through and through: where their loss is least, where it is no number."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,15 +32,15 @@ class Bowl:
         """Two of each clip."""
         return [Example(clip.name, frame, torch.tensor(0.0)) for clip in clips for frame in (1, 2)]
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """A bowl, a little deeper for what is soft."""
         self.calls.append(softness)
-        threshold = knobs["difference.threshold"]
+        threshold = parameters["difference.threshold"]
         found = []
         for example in batch:
             loss = (threshold.log() - self.place - example.content) ** 2 - 0.01 * softness
-            if "difference.noise_levels" in knobs:
-                loss = loss + knobs["difference.noise_levels"].log() ** 2
+            if "difference.noise_levels" in parameters:
+                loss = loss + parameters["difference.noise_levels"].log() ** 2
             if (example.clip, example.frame) == self.wrong and float(threshold.detach()) > self.wrong_above:
                 loss = loss * float("nan")
             if (example.clip, example.frame) == self.steep:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate, check_rate
+from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate, check_rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
@@ -52,7 +52,7 @@ def aerial(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-positions"),
     config: Config = None,
     set_: Overrides = None,
-    backend: Engine = Backend.auto,
+    backend: EngineOption = Backend.auto,
     save: Annotated[
         str | None, typer.Option(metavar="NAMES", help="cot,map,report, all or none; tables are always written.")
     ] = None,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.io.output.confirmation_output import ConfirmJournal
     from torchvision_dddas.people.confirmation import Vehicle
-    from torchvision_dddas.types import Confirmed
+    from torchvision_dddas.types import Confirmation
 
 
 @explained
@@ -128,7 +128,7 @@ def confirm_into(
 
 
 _KIND = {True: "positions (east_m, north_m)", False: "boxes"}
-_Found = tuple[list[str], list[list[str]], "Iterator[Confirmed]"]
+_Found = tuple[list[str], list[list[str]], "Iterator[Confirmation]"]
 
 
 def _on_the_ground(

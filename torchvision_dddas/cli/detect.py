@@ -8,7 +8,7 @@ import typer
 
 from torchvision_dddas.cli.clips import clip_facts, folders_for, last_lines
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def detect(
     ),
     config: Config = None,
     set_: Overrides = None,
-    backend: Engine = Backend.auto,
+    backend: EngineOption = Backend.auto,
     save: Annotated[
         str, typer.Option(metavar="NAMES", help="masks,overlay, all or none; the tables are always written.")
     ] = "all",
@@ -78,19 +78,19 @@ def detect_clip(
 
         source = open_source(clip, rate_hz=rate_hz)
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip) if telemetry else None
-        vision = load_engine(backend, settings)
+        engine = load_engine(backend, settings)
         facts = {
             "input": clip,
             "telemetry": telemetry,
             "clip": clip_facts(source),
-            "backend": vision.name,
+            "backend": engine.name,
             "settings": settings.model_dump(),
         }
         journal = output.begin(facts, source.rate_hz)
         journal.notes += flight.notes if flight is not None else ()
         try:
             with progress(source.name, source.count, quiet) as tick:
-                for scene in run(source, vision, settings, flight):
+                for scene in run(source, engine, settings, flight):
                     output.write(scene)
                     tick()
         finally:

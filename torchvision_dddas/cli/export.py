@@ -24,7 +24,7 @@ def export(
         typer.Option("--size", metavar="WxH", help="Size of the pictures, for graphs of one size; may be repeated."),
     ] = None,
     config: Annotated[
-        str, typer.Option(metavar="FILE|NAME", help="Whose knobs the graphs hold: a TOML file or a name.")
+        str, typer.Option(metavar="FILE|NAME", help="Whose parameters the graphs hold: a TOML file or a name.")
     ] = "fast",
     set_: Overrides = None,
     list_: Annotated[bool, typer.Option("--list", help="Say which graphs there are, and make none.")] = False,
@@ -32,8 +32,8 @@ def export(
 ) -> None:
     """Make the ONNX graphs of our functions, for the onboard back end and for accelerators.
 
-    Writes the graphs and manifest.json (inputs, outputs, knobs, SHA-256, versions) under --out, once all agree with
-    torch. `step` takes half a minute, the others seconds.
+    Writes the graphs and manifest.json (inputs, outputs, parameters, SHA-256, versions) under --out, once all agree
+    with torch. `step` takes half a minute, the others seconds.
     """
     from torchvision_dddas import export as exporting
     from torchvision_dddas.config import load_config

@@ -15,7 +15,7 @@ from torchvision_dddas.cli.mistakes import INTERRUPTED
 from torchvision_dddas.cli.prepared import Prepared, prepared
 
 if TYPE_CHECKING:
-    from torchvision_dddas.config import LiveKnobs, Settings
+    from torchvision_dddas.config import LiveParameters, Settings
     from torchvision_dddas.io.streams import About, Stream
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
@@ -122,7 +122,7 @@ def _about(ready: Prepared) -> "About":
 
 
 def _opened(
-    opened: ExitStack, texts: Sequence[str], said: "About", health: "Health", live: "LiveKnobs", option: str
+    opened: ExitStack, texts: Sequence[str], said: "About", health: "Health", live: "LiveParameters", option: str
 ) -> "list[Stream]":
     """Streams that are closed when `opened` is. Raises InputError."""
     from torchvision_dddas.io.streams import open_streams
@@ -177,7 +177,7 @@ def _facts(
         "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
         "interval_frames": interval,
         "people": people,
-        "backend": ready.vision.name,
+        "backend": ready.engine.name,
         "notes": ready.notes,
         **located,
         "settings": ready.settings.model_dump(),

@@ -16,7 +16,7 @@ def path(
     ready: Prepared, source: "LiveSource", people: bool, interval: int, backend: str, health: "Health"
 ) -> "Callable[[Feed], Iterator[Result]]":
     """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
-    from torchvision_dddas.config import with_knobs
+    from torchvision_dddas.config import with_parameters
     from torchvision_dddas.detection.engine import load_engine
     from torchvision_dddas.live.load_shedding import Shedding
     from torchvision_dddas.pipeline import survey
@@ -28,15 +28,15 @@ def path(
 
         # A look at the whole picture takes as long as many pictures do to come.
         share = min(settings.people.look_share, 0.1)
-        settings = with_knobs(settings, {"people.search": "regions", "people.look_share": share})
+        settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
         recognizer = recognizer_of(settings.people, backend)
         Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
     shedding = Shedding(source, settings, health, people)
-    visions = iter([ready.vision])
+    visions = iter([ready.engine])
 
     def begin(feed: "Feed") -> "Iterator[Result]":
         # After an error nothing that remembers a frame is trusted.
-        vision = next(visions, None) or load_engine(backend, shedding.settings)
+        engine = next(visions, None) or load_engine(backend, shedding.settings)
         spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
         watch = None if ready.watch is None else ready.watch.anew()
 
@@ -48,7 +48,7 @@ def path(
 
         seen = None if spotter is None else spotter.see
         for surveyed in survey(
-            feed, vision, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
+            feed, engine, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
         ):
             yield surveyed, None if spotter is None else spotter.of(surveyed.followed.number, feed.ended)
 

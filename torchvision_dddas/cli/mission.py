@@ -95,14 +95,14 @@ def fly_into(
             simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = Begun(simulated)
         mission = mission_of(source, settings, backend, chosen.clip.located_by == "landmarks")
-        vision = load_engine(backend, mission.settings)
-        journal = _begin(output, mission, simulated, vision.name)
+        engine = load_engine(backend, mission.settings)
+        journal = _begin(output, mission, simulated, engine.name)
         output.knows(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
         scorer = CrowdScorer(partial(geometry.east_north, origin_deg=simulated.origin_deg))
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
                 done = 0
-                for surveyed in survey(source, vision, mission.settings, None, mission.watch, 1, mission):
+                for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):
                     for truth in simulated.truths():
                         scorer.feed(truth)
                         output.true(truth)

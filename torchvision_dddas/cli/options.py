@@ -19,9 +19,9 @@ class Backend(StrEnum):
 
 Config = Annotated[str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a knob; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a parameter; may be repeated.")
 ]
-Engine = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
+EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")]
 Clips = Annotated[str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")]
 Jobs = Annotated[int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one a core]")]

@@ -9,14 +9,14 @@ import typer
 
 from torchvision_dddas.cli.clips import clip_facts, folders_for, last_lines
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.io.output.people_output import PeopleJournal
-    from torchvision_dddas.people.scorer import Recognizer
+    from torchvision_dddas.people.scorer import WindowScorer
 
 
 @explained
@@ -39,7 +39,7 @@ def people(
     ),
     config: Config = None,
     set_: Overrides = None,
-    backend: Engine = Backend.auto,
+    backend: EngineOption = Backend.auto,
     save: Annotated[
         str, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
     ] = "all",
@@ -69,7 +69,7 @@ def people(
 def people_into(
     folder: Path,
     clip: str,
-    recognizer: Callable[[], "Recognizer"],
+    recognizer: Callable[[], "WindowScorer"],
     settings: "Settings",
     save: Sequence[str] = (),
     around: Path | None = None,

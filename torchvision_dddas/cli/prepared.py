@@ -8,7 +8,7 @@ from torchvision_dddas.cli.aerial import AerialInput, locator_for
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.detection.engine import Vision
+    from torchvision_dddas.detection.engine import Engine
     from torchvision_dddas.geo import Locator, Watch
     from torchvision_dddas.io.sources import Source
     from torchvision_dddas.types import Telemetry
@@ -22,7 +22,7 @@ class Prepared:
     """
 
     settings: "Settings"
-    vision: "Vision"
+    engine: "Engine"
     watch: "Watch | None"
     flight: "Telemetry | None"
     notes: list[str]
@@ -70,10 +70,10 @@ def _watch(given: AerialInput, settings: "Settings", source: "Source", backend: 
 
 def _sized(settings: "Settings", locator: "Locator") -> "tuple[Settings, list[str]]":
     """With the camera's own focal length where targets' sizes are told from the altitude, unless another is set."""
-    from torchvision_dddas.config import Settings, with_knobs
+    from torchvision_dddas.config import Settings, with_parameters
 
     focal = locator.camera.focal_px[0]
     if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
         return settings, []
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
-    return with_knobs(settings, {"gates.focal_px": focal}), [note]
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]

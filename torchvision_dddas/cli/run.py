@@ -19,7 +19,7 @@ from torchvision_dddas.cli.aerial import (
 from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mission import SIMULATED, fly
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
 from torchvision_dddas.cli.prepared import prepared
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
@@ -51,7 +51,7 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-run"),
     config: Config = None,
     set_: Overrides = None,
-    backend: Engine = Backend.auto,
+    backend: EngineOption = Backend.auto,
     save: Annotated[
         str | None,
         typer.Option(
@@ -61,7 +61,8 @@ def run(
     ] = None,
     rate: Rate = None,
     scene: Annotated[
-        list[str] | None, typer.Option("--scene", metavar="KNOB=VALUE", help="Change a knob of a scenario (sim:NAME).")
+        list[str] | None,
+        typer.Option("--scene", metavar="KNOB=VALUE", help="Change a parameter of a scenario (sim:NAME)."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the scenario's chances, in place of its own.")] = None,
     live: Annotated[
@@ -163,13 +164,13 @@ def run_into(
 
         source = open_source(clip, rate_hz=rate_hz)
         ready = prepared(given, telemetry, settings, source, backend, clip)
-        settings, vision, watch, notes = ready.settings, ready.vision, ready.watch, ready.notes
+        settings, engine, watch, notes = ready.settings, ready.engine, ready.watch, ready.notes
         facts: dict[str, Any] = {
             "input": clip,
             "telemetry": telemetry,
             "clip": clip_facts(source),
             "interval_frames": interval,
-            "backend": vision.name,
+            "backend": engine.name,
         }
         journal: Record
         rate = source.rate_hz / interval
@@ -189,7 +190,7 @@ def run_into(
         try:
             count = None if source.count is None else -(-source.count // interval)
             with progress(source.name, count, quiet) as tick:
-                for surveyed in survey(source, vision, settings, ready.flight, watch, interval):
+                for surveyed in survey(source, engine, settings, ready.flight, watch, interval):
                     write(surveyed)
                     tick()
         finally:

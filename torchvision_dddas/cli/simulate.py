@@ -112,12 +112,12 @@ def simulate_into(
 
 def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
     """The frames of a run that nobody steers. ground: whether ground vehicles take pictures, all at once."""
-    from torchvision_dddas.config import Settings, with_knobs
+    from torchvision_dddas.config import Settings, with_parameters
     from torchvision_dddas.simulation.recording import Filmed
     from torchvision_dddas.simulation.scenario import settings_of
 
     scenario = simulator.scenario
-    apart_s = with_knobs(Settings(), settings_of(scenario)).steering.picture_s
+    apart_s = with_parameters(Settings(), settings_of(scenario)).steering.picture_s
     apart = max(1, round(apart_s * scenario.clip.rate_hz))
     while True:
         begun = time.perf_counter()

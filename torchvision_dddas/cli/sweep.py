@@ -1,4 +1,4 @@
-"""`dddas sweep`: a study with other knobs, again and again, and which of them measure best."""
+"""`dddas sweep`: a study with other parameters, again and again, and which of them measure best."""
 
 import sys
 import time
@@ -30,7 +30,7 @@ def sweep(
     ],
     grid: Annotated[
         list[str] | None,
-        typer.Option("--grid", metavar="KNOB=A,B,C", help="Values of a knob; may be repeated: all combinations."),
+        typer.Option("--grid", metavar="KNOB=A,B,C", help="Values of a parameter; may be repeated: all combinations."),
     ] = None,
     optuna: Annotated[
         int | None, typer.Option(metavar="N", help="So many points within --range, as Optuna proposes them.")
@@ -59,7 +59,7 @@ def sweep(
     out: Annotated[Path, typer.Option(help="Folder for sweep.json and best.toml.")] = Path("dddas-sweep"),
     quiet: Quiet = False,
 ) -> None:
-    """Try knobs on whole data sets, all points of a grid or as Optuna proposes; writes sweep.json and best.toml.
+    """Try parameters on whole data sets, all points of a grid or as Optuna proposes; writes sweep.json and best.toml.
 
     Results are kept as those of dddas evaluate --dataset: a sweep that is asked for again goes on where it was.
     """
@@ -84,7 +84,7 @@ def sweep(
     tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache, _pace(quiet))
     search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
     swept = Swept(out, settings, goal, search, tuned, held)
-    on_tuned = lambda knobs: tried.measured(knobs, tuned)  # noqa: E731
+    on_tuned = lambda parameters: tried.measured(parameters, tuned)  # noqa: E731
     trials = (
         sweeping.on_grid(choices, settings, on_tuned, lambda points: tried.ahead(points, tuned))
         if optuna is None
@@ -97,8 +97,8 @@ def sweep(
     if (found := sweeping.best(swept.trials, goal.least)) is None:
         raise InputError(f"no setting has a {goal.name}: {swept.trials[0].cause}")
     if held:
-        tried.ahead([{}, found.knobs], held)
-    swept.choose(found, (tried.measured({}, held), tried.measured(found.knobs, held)) if held else None)
+        tried.ahead([{}, found.parameters], held)
+    swept.choose(found, (tried.measured({}, held), tried.measured(found.parameters, held)) if held else None)
     if not quiet:
         show(swept)
 
@@ -118,13 +118,13 @@ def _pace(quiet: bool) -> Callable[[int, int], None]:
 
 def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] | None) -> None:
     if optuna is None and ranges:
-        raise InputError("--range is for Optuna; give --optuna N too, or --grid knob=value,value")
+        raise InputError("--range is for Optuna; give --optuna N too, or --grid parameter=value,value")
     if optuna is not None and grid:
-        raise InputError("--grid and --optuna were both given; wanted one (--range takes values too: knob=a,b,c)")
+        raise InputError("--grid and --optuna were both given; wanted one (--range takes values too: parameter=a,b,c)")
     if optuna is None and not grid:
-        raise InputError("nothing to try; give --grid knob=value,value or --optuna N --range knob=low:high")
+        raise InputError("nothing to try; give --grid parameter=value,value or --optuna N --range parameter=low:high")
     if optuna is not None and not ranges:
-        raise InputError("--optuna has nothing to draw; give --range knob=low:high")
+        raise InputError("--optuna has nothing to draw; give --range parameter=low:high")
     if optuna is not None and not 1 <= optuna <= MOST_PROPOSED:
         raise InputError(f"--optuna is {optuna}; wanted 1 to {MOST_PROPOSED} points")
 
@@ -138,16 +138,16 @@ def show(swept: "Swept") -> None:
     from torchvision_dddas.evaluation.studies.swept import number
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
-    knobs = list(dict.fromkeys(knob for trial in swept.trials for knob in trial.knobs))
+    parameters = list(dict.fromkeys(parameter for trial in swept.trials for parameter in trial.parameters))
     table = Table(title=f"{swept.heading}, {'least' if swept.goal.least else 'most'} first")
-    for column in ("trial", *knobs, swept.goal.measure):
-        table.add_column(column, justify="left" if column in knobs else "right")
+    for column in ("trial", *parameters, swept.goal.measure):
+        table.add_column(column, justify="left" if column in parameters else "right")
     ordered = ranked(swept.trials, swept.goal.least)
     shown = ordered[:MOST_SHOWN]
     if swept.trials[0] not in shown:
         shown.append(swept.trials[0])
     for trial in shown:
-        cells = [_value(trial.knobs[k]) if k in trial.knobs else "as it was" for k in knobs]
+        cells = [_value(trial.parameters[k]) if k in trial.parameters else "as it was" for k in parameters]
         table.add_row(str(trial.number), *cells, number(trial.value))
     console.print(table)
     if len(ordered) > len(shown):
@@ -165,8 +165,10 @@ def show(swept: "Swept") -> None:
 def _said(trial: "Trial") -> str:
     from torchvision_dddas.evaluation.studies.swept import number
 
-    knobs = ", ".join(f"{knob}={_value(value)}" for knob, value in trial.knobs.items()) or "as it was"
-    return f"{knobs}: {trial.cause or number(trial.value)}"
+    parameters = (
+        ", ".join(f"{parameter}={_value(value)}" for parameter, value in trial.parameters.items()) or "as it was"
+    )
+    return f"{parameters}: {trial.cause or number(trial.value)}"
 
 
 def _value(value: object) -> str:

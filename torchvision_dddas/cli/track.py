@@ -8,17 +8,17 @@ import typer
 
 from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Engine, Overrides, Quiet, Rate
+from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.detection.engine import Vision
+    from torchvision_dddas.detection.engine import Engine
     from torchvision_dddas.io.detection_tables import DetectionTable
     from torchvision_dddas.io.output.track_output import TrackJournal
     from torchvision_dddas.io.sources import Source
-    from torchvision_dddas.types import Followed
+    from torchvision_dddas.types import TrackedFrame
 
 
 @explained
@@ -35,7 +35,7 @@ def track(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-tracks"),
     config: Config = None,
     set_: Overrides = None,
-    backend: Engine = Backend.auto,
+    backend: EngineOption = Backend.auto,
     save: Annotated[
         str | None, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
     ] = None,
@@ -97,7 +97,7 @@ def track_into(
         notes = agreed(table, interval, source) if table is not None else []
         if table is not None and settings.track.mode == "default":
             notes += beginning(table, settings.track.birth_score)
-        vision = load_engine(backend, settings) if source is not None else None
+        engine = load_engine(backend, settings) if source is not None else None
         facts = {
             "input": clip,
             "detections": detections,
@@ -106,7 +106,7 @@ def track_into(
             if table is None
             else {"given": len(table), "used": int(looked_at(table.frame, interval).sum())},
             "interval_frames": interval,
-            "backend": vision and vision.name,
+            "backend": engine and engine.name,
             "settings": settings.model_dump(),
         }
         journal = output.begin(
@@ -116,7 +116,7 @@ def track_into(
         try:
             name = source.name if source is not None else str(detections)
             with progress(name, looks(table, source, interval), quiet) as tick:
-                for followed in _followed(table, source, vision, settings, interval):
+                for followed in _followed(table, source, engine, settings, interval):
                     output.write(followed)
                     tick()
             if source is not None and table is not None and table.last > source.last:
@@ -129,20 +129,20 @@ def track_into(
 def _followed(
     table: "DetectionTable | None",
     source: "Source | None",
-    vision: "Vision | None",
+    engine: "Engine | None",
     settings: "Settings",
     interval: int,
-) -> "Iterator[Followed]":
+) -> "Iterator[TrackedFrame]":
     from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 
-    if source is None or vision is None:
+    if source is None or engine is None:
         assert table is not None
         return follow_table(table, settings, interval)
     if table is not None:
-        return follow_clip(source, table, vision, settings, interval)
+        return follow_clip(source, table, engine, settings, interval)
     from torchvision_dddas.detection.detector import run
 
-    return follow_scenes(run(source, vision, settings), settings, interval, source.size)
+    return follow_scenes(run(source, engine, settings), settings, interval, source.size)
 
 
 def looks(table: "DetectionTable | None", source: "Source | None", interval: int) -> int | None:

@@ -1,4 +1,4 @@
-"""`dddas tune`: knobs fitted by gradient on the clips of a study, and what that was worth on clips held out."""
+"""`dddas tune`: parameters fitted by gradient on the clips of a study, and what that was worth on clips held out."""
 
 import json
 import sys
@@ -33,8 +33,14 @@ FILES = (CHECKPOINT, OLD, COST, OLD_COST, TUNED, REPORT, RUN)
 @explained
 def tune(
     study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as of dddas evaluate.")],
-    knobs: Annotated[
-        str, typer.Option(metavar="KNOB,...", help="What to tune, such as difference.threshold or 'difference.*'.")
+    parameters: Annotated[
+        str,
+        typer.Option(
+            "--parameters",
+            "--knobs",
+            metavar="NAME,...",
+            help="What to tune, such as difference.threshold or 'difference.*'.",
+        ),
     ],
     steps: Annotated[int, typer.Option(metavar="N", help="Steps at most.")] = 100,
     holdout: Annotated[
@@ -55,10 +61,12 @@ def tune(
         ),
     ] = False,
     batch: Annotated[int, typer.Option(metavar="N", help="Examples of a step.")] = 8,
-    rate: Annotated[float, typer.Option(help="Of a step: 0.05 is about 5 % of a knob.")] = 0.05,
+    rate: Annotated[float, typer.Option(help="Of a step: 0.05 is about 5 % of a parameter.")] = 0.05,
     pull: Annotated[
         float,
-        typer.Option(help="To where the knobs began, 0.1 or so where examples are few: a factor e costs half of it."),
+        typer.Option(
+            help="To where the parameters began, 0.1 or so where examples are few: a factor e costs half of it."
+        ),
     ] = 0.0,
     watched: Annotated[
         float,
@@ -86,7 +94,7 @@ def tune(
     out: Annotated[Path, typer.Option(help="Folder for tuned.toml, report.html and run.json.")] = Path("dddas-tune"),
     quiet: Quiet = False,
 ) -> None:
-    """Tune knobs by gradient on the clips of a study, and measure before and after, held-out clips apart.
+    """Tune parameters by gradient on the clips of a study, and measure before and after, held-out clips apart.
 
     Writes tuned.toml, which every command takes as --config, report.html and run.json.
     """
@@ -113,7 +121,7 @@ def tune(
             _prepared,
             spec,
             study.parent,
-            patterns(knobs, "--knobs", "knob"),
+            patterns(parameters, "--knobs", "knob"),
             patterns(holdout, "--holdout"),
             patterns(clips, "--clips"),
             measure,
@@ -163,7 +171,7 @@ class _Tuning:
         if resume and not place.is_file():
             self._say(f"there is no checkpoint at {place}: it begins anew")
         tell = partial(self._tell, {"state": "running", "study": ready.spec.name}, resume, cost)
-        found = descend(ready.family, ready.knobs, ready.examples, self._plan, cost, tell, place, resume)
+        found = descend(ready.family, ready.parameters, ready.examples, self._plan, cost, tell, place, resume)
         self._clock("descent", began)
         self._toml(ready, found, None)
         verdict = self._judged(ready)
@@ -195,7 +203,7 @@ class _Tuning:
             return replace(costing.read(place), weight=weight)
         began = time.perf_counter()
         clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
-        names, settings = ready.knobs.names, ready.knobs.base
+        names, settings = ready.parameters.names, ready.parameters.base
         count = costing.REPEATS * len(costing.points(settings, names))
         with progress("what time costs", count, self._quiet) as tick:
             cost = costing.measured(clip, ready.goal.task, settings, names, weight, backend, tick=tick)
@@ -249,7 +257,7 @@ class _Tuning:
     def _toml(self, ready: "Prepared", found: "Descended", verdict: "Verdict | None") -> None:
         from torchvision_dddas.evaluation.studies.sweep import as_toml
 
-        about = [f"dddas tune: {', '.join(ready.knobs.names)} on {', '.join(ready.tuned)}, step {found.best}."]
+        about = [f"dddas tune: {', '.join(ready.parameters.names)} on {', '.join(ready.tuned)}, step {found.best}."]
         if verdict is not None:
             about += [f"{line}." for line in _told(verdict)]
         self._write(TUNED, as_toml(found.settings, about))
@@ -263,17 +271,17 @@ class _Tuning:
         verdict: "Verdict",
     ) -> dict[str, Any]:
         """What run.json holds, and the page shows."""
-        from torchvision_dddas.config import all_knobs
+        from torchvision_dddas.config import all_parameters
         from torchvision_dddas.io.output.run_record import versions
         from torchvision_dddas.tuning.family import loss_of
         from torchvision_dddas.tuning.parameters import TUNABLE
 
         spec, after = ready.spec, _values(ready)
-        meaning = {knob.name: knob.meaning for knob in all_knobs()}
+        meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
         charged = None
         if cost is not None:
-            expected = float(cost.expected({name: value.detach() for name, value in ready.knobs.values().items()}))
-            charged = {**asdict(cost), "expected": expected}
+            expected = float(cost.expected({name: value.detach() for name, value in ready.parameters.values().items()}))
+            charged = {**cost.as_json(), "expected": expected}
         return {
             "state": "failed" if found.failed else "complete",
             "versions": versions(),
@@ -291,7 +299,7 @@ class _Tuning:
                     "meaning": meaning[name],
                     "idle": name in found.idle,
                 }
-                for name in ready.knobs.names
+                for name in ready.parameters.names
             },
             "best": found.best,
             "taken": found.taken,
@@ -327,7 +335,7 @@ class _Tuning:
 
 
 def show(verdict: "Verdict", folder: Path, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Print the knobs, what they were worth, and where the rest is."""
+    """Print the parameters, what they were worth, and where the rest is."""
     from rich.console import Console
     from rich.table import Table
 
@@ -377,14 +385,14 @@ def _prepared(
 
     with progress("examples", None, quiet) as tick:
         ready = prepare(spec, base, names, holdout, clips, measure, loss, tick)
-    ready.knobs.to(device)
+    ready.parameters.to(device)
     return ready
 
 
 def _values(ready: "Prepared") -> dict[str, Any]:
-    """The knobs as settings have them."""
-    dumped = ready.knobs.settings().model_dump()
-    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.knobs.names}
+    """The parameters as settings have them."""
+    dumped = ready.parameters.settings().model_dump()
+    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.parameters.names}
 
 
 def _device(name: str) -> Any:

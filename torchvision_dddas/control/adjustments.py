@@ -15,16 +15,16 @@ class Record:
         """All that is set from here on happened at this frame."""
         self.frame, self._made = frame, []
 
-    def set(self, knob: str, new: float, cause: str, old: float = 0.0, least: float = 0.0) -> None:
+    def set(self, parameter: str, new: float, cause: str, old: float = 0.0, least: float = 0.0) -> None:
         """Write a value down where it differs by more than `least` from the one in force; old: the one at first."""
-        now = self._values.setdefault(knob, old)
+        now = self._values.setdefault(parameter, old)
         if abs(new - now) > least:
-            self._values[knob] = new
-            self._made.append(Adjustment(self.frame, knob, float(now), float(new), cause))
+            self._values[parameter] = new
+            self._made.append(Adjustment(self.frame, parameter, float(now), float(new), cause))
 
-    def know(self, knob: str, value: float) -> None:
+    def know(self, parameter: str, value: float) -> None:
         """A value that another line tells."""
-        self._values[knob] = value
+        self._values[parameter] = value
 
     def add(self, adjustments: tuple[Adjustment, ...]) -> None:
         """Take over what another rule wrote."""

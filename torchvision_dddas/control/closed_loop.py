@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.control.ground_confirmation import CloserLook
 from torchvision_dddas.control.sensor_monitor import Notice, Vigilance
 from torchvision_dddas.control.steering_api import Steering
@@ -15,7 +15,7 @@ from torchvision_dddas.geo import Locator, Site, Watch, local, site_of
 from torchvision_dddas.geo.elevation import about
 from torchvision_dddas.geo.solvers import load_colours, load_solver
 from torchvision_dddas.people.detector import recognizer_of
-from torchvision_dddas.types import Command, Elevation, Landmarks, Order, Registration, Scene, Surveyed, Telemetry
+from torchvision_dddas.types import Command, Elevation, FrameResult, Landmarks, Order, Registration, Scene, Telemetry
 
 MEMORY_S = 15.0
 """Reports this old no longer tell where anything is: the rest of a long run would only cost time."""
@@ -48,7 +48,7 @@ def fitted(settings: Settings, source: Instrument) -> Settings:
         own["gates.focal_px"] = float(source.camera.focal_px[0])
     if settings.landmarks.height_m == Settings().landmarks.height_m:
         own["landmarks.height_m"] = source.plate_m
-    return with_knobs(settings, own)
+    return with_parameters(settings, own)
 
 
 class Mission:
@@ -84,7 +84,7 @@ class Mission:
         """What was seen to go wrong, or to be well again, since this was last asked."""
         return self._vigilance.notices()
 
-    def after(self, surveyed: Surveyed, step: Registration | None) -> Surveyed:
+    def after(self, surveyed: FrameResult, step: Registration | None) -> FrameResult:
         """Judge the targets of a frame by what the ground vehicles saw, and say where all go next.
 
         step: how the background moved up to the frame.
@@ -129,7 +129,7 @@ class Mission:
         down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
         return float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
 
-    def _extent_m(self, surveyed: Surveyed) -> np.ndarray:
+    def _extent_m(self, surveyed: FrameResult) -> np.ndarray:
         """(P,) radius of each located target on the ground; 0 where unknown."""
         grounded = surveyed.grounded
         assert grounded is not None

@@ -19,7 +19,16 @@ from torchvision_dddas.control.rules import (
 from torchvision_dddas.control.uav_commands import Follow
 from torchvision_dddas.control.ugv_commands import Team
 from torchvision_dddas.detection.gates import pixels_per_metre
-from torchvision_dddas.types import Adjustment, Camera, Command, Confirmed, Flight, Grounded, Marks, Registration
+from torchvision_dddas.types import (
+    Adjustment,
+    AerialLocations,
+    Camera,
+    Command,
+    Confirmation,
+    Flight,
+    LandmarkObservations,
+    Registration,
+)
 
 # Vehicles are given new goals so often at most: what is found is a second old, and they do not turn faster.
 _PERIOD_S = 0.2
@@ -48,18 +57,18 @@ class Steering:
 
     def begin(self, flight: Flight | None) -> Command:
         """Before anything is found: as many frames as a walker needs to show at this altitude."""
-        knobs = self.settings.steering
-        if knobs.on and knobs.sampling and flight is not None and flight.altitude_m > 0:
-            self._every = int(np.clip(round(self._least(flight)), 1, knobs.maximum_every))
+        parameters = self.settings.steering
+        if parameters.on and parameters.sampling and flight is not None and flight.altitude_m > 0:
+            self._every = int(np.clip(round(self._least(flight)), 1, parameters.maximum_every))
         self._command = Command(self._every)
         return self._command
 
     def step(
         self,
-        grounded: Grounded,
-        confirmed: Confirmed | None,
+        grounded: AerialLocations,
+        confirmed: Confirmation | None,
         now_s: float,
-        marks: Marks,
+        marks: LandmarkObservations,
         flight: Flight | None,
         step: Registration | None = None,
     ) -> tuple[Command, tuple[Adjustment, ...]]:
@@ -69,14 +78,14 @@ class Steering:
         flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
         while silent. step: how the background moved up to the located frame. Places in the command are local metres.
         """
-        knobs = self.settings.steering
-        if not knobs.on:
+        parameters = self.settings.steering
+        if not parameters.on:
             return Command(), ()
         self._record.begin(grounded.frame)
         now_s = max(now_s, grounded.time_s)
         outlook = self._memory.step(grounded, confirmed, now_s)
         self._stand = stand_of(flight, grounded.fix, self._stand, self.camera)
-        if knobs.sampling:
+        if parameters.sampling:
             self._sample(grounded, outlook, now_s, flight, step)
         if now_s - self._steered_s < _PERIOD_S - 1e-6:
             orders = tuple(replace(order, picture=False) for order in self._command.orders)
@@ -84,11 +93,11 @@ class Steering:
             return self._command, self._record.made()
         self._steered_s = now_s
         team_m = self._team.hear(marks, now_s, self._record)
-        if knobs.follow:
+        if parameters.follow:
             at = looked_at(flight, grounded.fix, self._stand) if self._stand is not None else None
             self._follow.step(outlook, team_m, self._stand, at, now_s, self._record)
         orders = ()
-        if knobs.look:
+        if parameters.look:
             orders = self._team.orders(outlook, self._follow.rows(outlook), self._aloft(), now_s, self._record)
         look_at = self._follow.look_at
         self._command = Command(self._every, self._fly_to(look_at), look_at, self._follow.altitude_m, orders)
@@ -111,10 +120,15 @@ class Steering:
         return None if look_at is None or stand is None else stand.pose(look_at, stand.altitude_m).place_m[:2]
 
     def _sample(
-        self, grounded: Grounded, outlook: Outlook, now_s: float, flight: Flight | None, step: Registration | None
+        self,
+        grounded: AerialLocations,
+        outlook: Outlook,
+        now_s: float,
+        flight: Flight | None,
+        step: Registration | None,
     ) -> None:
         """Of how many frames one is wanted."""
-        frame, knobs, interval = grounded.frame, self.settings.steering, self.settings.interval
+        frame, parameters, interval = grounded.frame, self.settings.steering, self.settings.interval
         between, self._before = max(frame - self._before, 1), frame
         lost = np.flatnonzero(outlook.wanted & (outlook.missed == _MISSED))
         if grounded.fix.pose is not None and len(lost):  # what has left the picture is not lost
@@ -137,12 +151,12 @@ class Steering:
             # One that is missed for a moment goes on.
             seen = outlook.missed <= _MISSED
             wanted, limit = every_wanted(
-                wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], knobs
+                wanted, self.rate_hz, outlook.speed_m_s[seen], 2 * outlook.radius_m[seen], parameters
             )
             why += limit
         if flight is not None and flight.altitude_m > 0:
             wanted = max(wanted, self._least(flight))
-        every, made = sampled(frame, self._every, wanted, why, knobs)
+        every, made = sampled(frame, self._every, wanted, why, parameters)
         if every > self._every and now_s - self._sampled_s < _CALM_S:
             return
         if made:

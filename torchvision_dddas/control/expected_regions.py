@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.types import Camera
 
 # People are as tall as within so many standard deviations, and the camera looks where it says within as many.
@@ -25,7 +25,7 @@ def expected_regions(
     camera: Camera,
     camera_m: np.ndarray,
     heading_rad: float,
-    knobs: GroundKnobs,
+    parameters: GroundParameters,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(R, 4) boxes in the picture within which bodies of the targets in view lie, and (R, 2) heights of these, in px.
 
@@ -36,7 +36,7 @@ def expected_regions(
     heights: list[tuple[float, float]] = []
     width, (focal_u, focal_v), (middle_u, middle_v) = camera.size_px[0], camera.focal_px, camera.centre_px
     unsure = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2)[:, -1], 0) + camera.position_sigma_m**2)
-    tall = knobs.body_height_m + _SIGMAS * knobs.body_height_sigma_m * np.array([-1.0, 1.0])
+    tall = parameters.body_height_m + _SIGMAS * parameters.body_height_sigma_m * np.array([-1.0, 1.0])
     eye = camera.height_m if math.isfinite(camera.height_m) else float(tall[1])
     nearest_m = focal_v * tall[0] / camera.size_px[1]  # nobody is whole in the picture from nearer
     for apart, reach in zip(place_m - camera_m, radius_m + unsure + _MARGIN_M, strict=True):

@@ -12,8 +12,8 @@ from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.people.collaboration import Beliefs, Look, look, view_of
 from torchvision_dddas.people.confirmation import confirmed_by
 from torchvision_dddas.people.detector import people_in
-from torchvision_dddas.people.scorer import Recognizer
-from torchvision_dddas.types import Confirmed, Grounded, GroundPicture, Poses
+from torchvision_dddas.people.scorer import WindowScorer
+from torchvision_dddas.types import AerialLocations, Confirmation, GroundPicture, Poses
 
 # People do not run faster.
 _RUNNING_M_S = 4.0
@@ -28,7 +28,7 @@ def slow_enough(seen: Look, velocity_m_s: np.ndarray) -> Look:
 class CloserLook:
     """What is believed of each target, as pictures from the ground come in."""
 
-    def __init__(self, settings: Settings, recognizer: Recognizer) -> None:
+    def __init__(self, settings: Settings, recognizer: WindowScorer) -> None:
         self._settings, self._recognizer = settings, recognizer
         self._beliefs = Beliefs(settings.confirm)
         self._waiting: list[GroundPicture] = []
@@ -39,7 +39,7 @@ class CloserLook:
         """Pictures of the frames to come, as targets are located some frames later."""
         self._waiting += pictures
 
-    def confirm(self, grounded: Grounded, extent_m: np.ndarray) -> Confirmed:
+    def confirm(self, grounded: AerialLocations, extent_m: np.ndarray) -> Confirmation:
         """What is known of the targets of a frame, by the pictures taken at it and all before.
 
         extent_m: (P,) radius of each located target: its people stand about its middle.
@@ -55,7 +55,7 @@ class CloserLook:
         self.spent_s = time.perf_counter() - start
         return confirmed_by(grounded.frame, slice(0, len(targets)), targets, self._beliefs, looks)
 
-    def _look(self, picture: GroundPicture, grounded: Grounded, extent_m: np.ndarray) -> Look:
+    def _look(self, picture: GroundPicture, grounded: AerialLocations, extent_m: np.ndarray) -> Look:
         settings, camera, positions = self._settings, picture.camera, grounded.positions
         place = np.array([camera.place], float)
         if positions.origin_deg is not None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.types import Camera, Confirmed, Grounded
+from torchvision_dddas.types import AerialLocations, Camera, Confirmation
 
 # A target steers nothing before it was located so often and for so long: most false alarms are gone by then.
 _SIGHTINGS, _LASTING_S = 3, 0.8
@@ -102,7 +102,7 @@ class Memory:
         self.camera = camera
         self._known: dict[int, _Remembered] = {}
 
-    def step(self, grounded: Grounded, confirmed: Confirmed | None, now_s: float) -> Outlook:
+    def step(self, grounded: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Outlook:
         """The targets as expected at now_s, after a frame was located; confirmed: row = that of its positions."""
         radii = radii_m(grounded, self.camera)
         targets = grounded.positions.target.tolist()
@@ -160,7 +160,7 @@ def _judge(known: _Remembered, kind: str, probability: float) -> None:
         known.human = True
 
 
-def radii_m(grounded: Grounded, camera: Camera) -> np.ndarray:
+def radii_m(grounded: AerialLocations, camera: Camera) -> np.ndarray:
     """(P,) half the mean side of each located target's box, over the ground."""
     boxes = grounded.box_px[grounded.row] if len(grounded.box_px) else np.zeros((len(grounded.positions), 4))
     if grounded.fix.pose is None:

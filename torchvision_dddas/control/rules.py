@@ -1,4 +1,4 @@
-"""The feedback rules: how what was found steers the knobs."""
+"""The feedback rules: how what was found steers the parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,12 +6,19 @@ from itertools import combinations
 
 import numpy as np
 
-from torchvision_dddas.config import IntervalKnobs, LandmarkKnobs, LiveKnobs, Settings, SteeringKnobs, with_knobs
+from torchvision_dddas.config import (
+    IntervalParameters,
+    LandmarkParameters,
+    LiveParameters,
+    Settings,
+    SteeringParameters,
+    with_parameters,
+)
 from torchvision_dddas.detection.gates import Gates, gates_at, pixels_per_metre
-from torchvision_dddas.types import Adjustment, Marks
+from torchvision_dddas.types import Adjustment, LandmarkObservations
 
 SAMPLING = "sampling.every"
-"""Of so many frames one is looked at: no knob, but named like one in the record."""
+"""Of so many frames one is looked at: no parameter, but named like one in the record."""
 
 # A change of altitude by this share moves the gates: less is not worth a line in the record.
 _ALTITUDE_STEP = 0.2
@@ -41,44 +48,48 @@ _LEAST_SHARE = 0.002
 _MOST_PATIENCE = 16.0
 
 
-def interval_from_telemetry(altitude_m: float, speed_m_s: float, rate_hz: float, knobs: IntervalKnobs) -> float:
+def interval_from_telemetry(
+    altitude_m: float, speed_m_s: float, rate_hz: float, parameters: IntervalParameters
+) -> float:
     """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
 
     Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz; the floor of the speed, which keeps
     hovering finite, is ours.
     """
-    speed = max(speed_m_s, knobs.lowest_speed_m_s)
-    by_height = altitude_m / knobs.reference_altitude_m * knobs.reference_speed_m_s / speed
-    return by_height * rate_hz / knobs.reference_rate_hz * knobs.cost
+    speed = max(speed_m_s, parameters.lowest_speed_m_s)
+    by_height = altitude_m / parameters.reference_altitude_m * parameters.reference_speed_m_s / speed
+    return by_height * rate_hz / parameters.reference_rate_hz * parameters.cost
 
 
-def interval_from_flow(flows_px: Sequence[float], width: int, knobs: IntervalKnobs) -> float:
+def interval_from_flow(flows_px: Sequence[float], width: int, parameters: IntervalParameters) -> float:
     """The same without telemetry: the background's flow is proportional to S / (A R), so its inverse takes their place.
 
     flows_px: median background flow of the latest steps, pixels a frame. width: of the picture, pixels.
     """
     flow = float(np.median(flows_px)) / width
-    return knobs.reference_flow / max(flow, 1e-4) * knobs.cost
+    return parameters.reference_flow / max(flow, 1e-4) * parameters.cost
 
 
-def bounded(interval: float, knobs: IntervalKnobs) -> int:
+def bounded(interval: float, parameters: IntervalParameters) -> int:
     """Rounded and within the interval's bounds."""
-    return int(np.clip(round(min(interval, 1e6)), knobs.minimum_frames, knobs.maximum_frames))
+    return int(np.clip(round(min(interval, 1e6)), parameters.minimum_frames, parameters.maximum_frames))
 
 
-def adjusted(frame: int, now: int, wanted: float, why: str, knobs: IntervalKnobs) -> tuple[int, tuple[Adjustment, ...]]:
+def adjusted(
+    frame: int, now: int, wanted: float, why: str, parameters: IntervalParameters
+) -> tuple[int, tuple[Adjustment, ...]]:
     """The interval from here on, and the record of its change, if any.
 
     A change by one frame waits until the rule is past the middle by a quarter, so that noise does not make it flutter.
     """
-    new = bounded(wanted, knobs)
-    if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75 and knobs.minimum_frames <= now):
+    new = bounded(wanted, parameters)
+    if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75 and parameters.minimum_frames <= now):
         return now, ()
     return new, (Adjustment(frame, "interval.frames", now, new, why),)
 
 
 def every_wanted(
-    interval: float, rate_hz: float, speed_m_s: np.ndarray, size_m: np.ndarray, knobs: SteeringKnobs
+    interval: float, rate_hz: float, speed_m_s: np.ndarray, size_m: np.ndarray, parameters: SteeringParameters
 ) -> tuple[float, str]:
     """Of how many frames one is worth a look, before rounding and bounds; in words what limits it beside the rule.
 
@@ -87,28 +98,30 @@ def every_wanted(
     half of it, and are nearer to each other than to any other target, since two that part are a size apart. Where none
     is known, so that a walker who comes into the picture is found.
     """
-    wanted = knobs.sampling_share * interval
+    wanted = parameters.sampling_share * interval
     known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
     if not known.any():
         most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / _WALKER_M_S)), 1.0)
-        return (most, "; nothing is found yet") if most < min(wanted, knobs.maximum_every) else (wanted, "")
+        return (most, "; nothing is found yet") if most < min(wanted, parameters.maximum_every) else (wanted, "")
     frames = _MOVED_SHARE * size_m[known] * rate_hz / np.maximum(speed_m_s[known], 1e-3)
     tightest = int(frames.argmin())
-    if frames[tightest] >= min(wanted, knobs.maximum_every):
+    if frames[tightest] >= min(wanted, parameters.maximum_every):
         return wanted, ""
     speed, size = speed_m_s[known][tightest], size_m[known][tightest]
     # Whole frames, so that it holds.
     return max(float(np.floor(frames[tightest])), 1.0), f"; a target of {size:.1f} m goes at {speed:.1f} m/s"
 
 
-def every_least(pixels_per_metre: float, rate_hz: float, knobs: SteeringKnobs) -> float:
+def every_least(pixels_per_metre: float, rate_hz: float, parameters: SteeringParameters) -> float:
     """Of how many frames one is worth a look at the least: between two looks a walker must move far enough to show."""
-    return knobs.least_move_px * rate_hz / (_WALKER_M_S * pixels_per_metre)
+    return parameters.least_move_px * rate_hz / (_WALKER_M_S * pixels_per_metre)
 
 
-def sampled(frame: int, now: int, wanted: float, why: str, knobs: SteeringKnobs) -> tuple[int, tuple[Adjustment, ...]]:
+def sampled(
+    frame: int, now: int, wanted: float, why: str, parameters: SteeringParameters
+) -> tuple[int, tuple[Adjustment, ...]]:
     """Of how many frames one is looked at from here on, and the record of its change, if any; steady as `adjusted`."""
-    new = int(np.clip(round(min(wanted, 1e6)), 1, knobs.maximum_every))
+    new = int(np.clip(round(min(wanted, 1e6)), 1, parameters.maximum_every))
     if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75):
         return now, ()
     return new, (Adjustment(frame, SAMPLING, now, new, why),)
@@ -152,7 +165,7 @@ def regime_at(altitude_m: float, rate_hz: float, base: Settings) -> Regime:
     close = base.morphology.close_px
     if base.morphology.close_m:
         close = int(np.clip(round(base.morphology.close_m * pixels_per_metre(altitude_m, gates.focal_px)), 1, close))
-    settings = with_knobs(base, {"gates.min_area_px": area, "small.on": on, "morphology.close_px": close})
+    settings = with_parameters(base, {"gates.min_area_px": area, "small.on": on, "morphology.close_px": close})
     return Regime(settings, altitude_m, gates_at(altitude_m, rate_hz, gates))
 
 
@@ -187,7 +200,7 @@ class LandmarkUse:
 
 
 def chosen(
-    frame: int, now: LandmarkUse, marks: Marks, speed_m_s: np.ndarray, knobs: LandmarkKnobs
+    frame: int, now: LandmarkUse, marks: LandmarkObservations, speed_m_s: np.ndarray, parameters: LandmarkParameters
 ) -> tuple[np.ndarray, LandmarkUse, tuple[Adjustment, ...]]:
     """The rows of `marks` to use, of those in view; what is in use from here on; and the record of a change of number.
 
@@ -197,24 +210,24 @@ def chosen(
     poor_speed_m_s, so that they are detected poorly (appendix A, section V); else those `least` that are best spread.
     """
     view = np.flatnonzero(np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1))
-    if knobs.rule == "all":
+    if parameters.rule == "all":
         return view, LandmarkUse(tuple(marks.landmark[view].tolist())), ()
     known = np.asarray(speed_m_s, float)[view]
     speed = float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else None
     poor, cause = now.poor, ""
-    if speed is not None and poor and speed < _CALM * knobs.poor_speed_m_s:
-        poor, cause = False, f"below {_CALM * knobs.poor_speed_m_s:.2g}: they are detected well"
-    elif speed is not None and not poor and speed > knobs.poor_speed_m_s and len(view) > knobs.least:
-        poor, cause = True, f"above {knobs.poor_speed_m_s:g}: they are detected poorly"
-    rows = view if poor or len(view) <= knobs.least else view[_best_spread(marks, view, now, knobs.least)]
+    if speed is not None and poor and speed < _CALM * parameters.poor_speed_m_s:
+        poor, cause = False, f"below {_CALM * parameters.poor_speed_m_s:.2g}: they are detected well"
+    elif speed is not None and not poor and speed > parameters.poor_speed_m_s and len(view) > parameters.least:
+        poor, cause = True, f"above {parameters.poor_speed_m_s:g}: they are detected poorly"
+    rows = view if poor or len(view) <= parameters.least else view[_best_spread(marks, view, now, parameters.least)]
     use = LandmarkUse(tuple(marks.landmark[rows].tolist()), poor)
     if not cause or len(rows) == len(now.landmark):
         return rows, use, ()
     why = f"{len(view)} landmarks in view go at {speed:.1f} m/s on average, {cause}"
-    return rows, use, (Adjustment(frame, "landmarks.used", len(now.landmark) or knobs.least, len(rows), why),)
+    return rows, use, (Adjustment(frame, "landmarks.used", len(now.landmark) or parameters.least, len(rows), why),)
 
 
-def _best_spread(marks: Marks, view: np.ndarray, now: LandmarkUse, count: int) -> np.ndarray:
+def _best_spread(marks: LandmarkObservations, view: np.ndarray, now: LandmarkUse, count: int) -> np.ndarray:
     """Of the rows in view, those `count` that are used already, unless others are spread clearly better."""
     places = marks.east_north_m[view]
     best = best_spread(places, count)
@@ -308,42 +321,44 @@ def shed(
     all that makes a look cheaper, and as many pictures as it takes, when it is more than twice as much. More: when it
     is expected to fit for calm_s on end; for twice as long each time that it did not last.
     """
-    knobs, ladder = base.live, rungs(base, people)
+    parameters, ladder = base.live, rungs(base, people)
     at = min(now.rung, len(ladder) - 1)
-    if not knobs.shed or apart_s <= 0:
+    if not parameters.shed or apart_s <= 0:
         return now, ()
     shares = [cost_s / (rung[SAMPLING] * apart_s) for rung in ladder]
     cheapest = next((i for i, rung in enumerate(ladder) if rung[SAMPLING] > 1), len(ladder)) - 1
-    slow = cost_s * 1000 > knobs.deadline_ms and at < cheapest
-    if shares[at] > knobs.load or slow:
-        far = shares[at] > _FAR_OVER * knobs.load
+    slow = cost_s * 1000 > parameters.deadline_ms and at < cheapest
+    if shares[at] > parameters.load or slow:
+        far = shares[at] > _FAR_OVER * parameters.load
         to = max(at, cheapest) if far else min(at + 1, len(ladder) - 1)
         # How many pictures can be had is known, what a cheaper look costs is not.
-        while (far or at >= cheapest) and shares[to] > knobs.load and to < len(ladder) - 1:
+        while (far or at >= cheapest) and shares[to] > parameters.load and to < len(ladder) - 1:
             to += 1
-        undone = now_s - now.eased_s < 2 * now.patience * knobs.calm_s
+        undone = now_s - now.eased_s < 2 * now.patience * parameters.calm_s
         patience = min(2 * now.patience, _MOST_PATIENCE) if undone else 1.0
         new = replace(now, rung=to, spare_s=None, patience=patience if to != at else now.patience)
         limit = (
-            f"{knobs.load:.0%} is allowed" if shares[at] > knobs.load else f"its deadline is {knobs.deadline_ms:g} ms"
+            f"{parameters.load:.0%} is allowed"
+            if shares[at] > parameters.load
+            else f"its deadline is {parameters.deadline_ms:g} ms"
         )
         return new, _moved(frame, ladder[at], ladder[to], _took(cost_s, shares[at], limit))
-    to = _eased(at, shares, cost_s, cheapest, knobs)
+    to = _eased(at, shares, cost_s, cheapest, parameters)
     if to == at:
         return replace(now, spare_s=None), ()
     if now.spare_s is None:
         return replace(now, spare_s=now_s), ()
-    if now_s - now.spare_s < now.patience * knobs.calm_s:
+    if now_s - now.spare_s < now.patience * parameters.calm_s:
         return now, ()
     why = _took(cost_s, shares[at], f"for {now_s - now.spare_s:.1f} s there was time to spare")
     return replace(now, rung=to, spare_s=None, eased_s=now_s), _moved(frame, ladder[at], ladder[to], why)
 
 
-def _eased(at: int, shares: Sequence[float], cost_s: float, cheapest: int, knobs: LiveKnobs) -> int:
+def _eased(at: int, shares: Sequence[float], cost_s: float, cheapest: int, parameters: LiveParameters) -> int:
     """The rung that is expected to fit with time to spare, if lower than `at`."""
     if at > cheapest:  # how much more often it may be is known
-        return next(i for i in range(cheapest, at + 1) if i == at or shares[i] <= _SPARE * knobs.load)
-    dearer = _DEARER * cost_s * 1000 <= knobs.deadline_ms and _DEARER * shares[at] <= _SPARE * knobs.load
+        return next(i for i in range(cheapest, at + 1) if i == at or shares[i] <= _SPARE * parameters.load)
+    dearer = _DEARER * cost_s * 1000 <= parameters.deadline_ms and _DEARER * shares[at] <= _SPARE * parameters.load
     return at - 1 if at and dearer else at
 
 

@@ -10,7 +10,7 @@ from torchvision_dddas.control import ugv_placement as stations
 from torchvision_dddas.control.adjustments import Record, counted
 from torchvision_dddas.control.footprint import Stand
 from torchvision_dddas.control.prediction import Outlook
-from torchvision_dddas.types import Marks, Order
+from torchvision_dddas.types import LandmarkObservations, Order
 
 # A vehicle that reports no place is counted on for so long: planned waypoints bridge dropouts.
 _SILENT_S = 10.0
@@ -48,14 +48,14 @@ class Team:
     """The ground vehicles, by name."""
 
     def __init__(self, settings: Settings, vehicles: Sequence[str]) -> None:
-        self.knobs, self.names = settings.steering, tuple(vehicles)
+        self.parameters, self.names = settings.steering, tuple(vehicles)
         self._known: dict[int, _Vehicle] = {}
         self._ring: stations.Ring | None = None
         self._on_ring: tuple[int, ...] = ()
         self._place_of: np.ndarray | None = None
         self._let_be: dict[int, float] = {}
 
-    def hear(self, marks: Marks, now_s: float, record: Record) -> np.ndarray:
+    def hear(self, marks: LandmarkObservations, now_s: float, record: Record) -> np.ndarray:
         """Take on the places that the team reports; the places (V, 2) of those that are counted on."""
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
@@ -110,9 +110,9 @@ class Team:
         record: Record,
     ) -> np.ndarray:
         """(V, 2) the goals of those on the ring and of those sent to look."""
-        present, knobs = self.present, self.knobs
+        present, parameters = self.present, self.parameters
         reach = np.linalg.norm(outlook.east_north_m[rows] - middle, axis=1) + outlook.radius_m[rows]
-        radius = float(np.clip(reach.max() + stations.KEEP_OFF_M, knobs.station_m, _WIDEST * knobs.station_m))
+        radius = float(np.clip(reach.max() + stations.KEEP_OFF_M, parameters.station_m, _WIDEST * parameters.station_m))
         on = [k for k, v in enumerate(present) if self._known[v].sent_to < 0]
         names = tuple(present[k] for k in on)
         goals = team_m.copy()
@@ -137,12 +137,12 @@ class Team:
         """A place from which a vehicle sees a target well, on its own side of it."""
         place = outlook.east_north_m[row] + _LEAD_S * outlook.velocity_m_s[row]
         apart = from_m - place
-        away = outlook.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.knobs.look_m)
+        away = outlook.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.parameters.look_m)
         return place + apart / max(float(np.linalg.norm(apart)), 1e-6) * away
 
     def _send(self, outlook: Outlook, now_s: float, record: Record) -> None:
         """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
-        knobs, wanted = self.knobs, dict(zip(outlook.target.tolist(), range(len(outlook)), strict=True))
+        parameters, wanted = self.parameters, dict(zip(outlook.target.tolist(), range(len(outlook)), strict=True))
         needs = stations.need(outlook)
         for v, vehicle in self._known.items():
             if vehicle.sent_to < 0:
@@ -169,13 +169,13 @@ class Team:
             let_be = now_s - self._let_be.get(target, -np.inf) < _LET_BE_S
             if free <= 0 or needs[row] < 1 - _UNSURE:
                 break
-            seen_from_ring = afar[row] < knobs.look_m
-            too_fast = outlook.speed_m_s[row] > knobs.fast_m_s or not outlook.steady[row]
+            seen_from_ring = afar[row] < parameters.look_m
+            too_fast = outlook.speed_m_s[row] > parameters.fast_m_s or not outlook.steady[row]
             if target in gone_to or let_be or too_fast or seen_from_ring or outlook.lost_s[row] > 1:
                 continue
             idle = [v for v, vehicle in self._known.items() if vehicle.sent_to < 0]
             away = [float(np.linalg.norm(self._known[v].place_m - outlook.east_north_m[row])) for v in idle]
-            if min(away) - outlook.radius_m[row] < 0.8 * knobs.look_m:
+            if min(away) - outlook.radius_m[row] < 0.8 * parameters.look_m:
                 continue  # somebody sees it already
             v = idle[int(np.argmin(away))]
             self._known[v].sent_to, self._known[v].sent_s = target, now_s
@@ -193,26 +193,26 @@ class Team:
         now_s: float,
         record: Record,
     ) -> Order:
-        vehicle, knobs, name = self._known[v], self.knobs, self.names[v]
+        vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
         away = float(np.linalg.norm(station - vehicle.place_m))
-        vehicle.near = away < knobs.near_m * (_FAR if vehicle.near else 1.0)
+        vehicle.near = away < parameters.near_m * (_FAR if vehicle.near else 1.0)
         # It must not fall behind a crowd that walks faster than it should go near it.
-        slow = round(min(max(knobs.slow_m_s, 1.1 * drift_m_s), max(knobs.fast_m_s, knobs.slow_m_s)), 1)
+        slow = round(min(max(parameters.slow_m_s, 1.1 * drift_m_s), max(parameters.fast_m_s, parameters.slow_m_s)), 1)
         record.set(
             f"{name}.speed_m_s",
-            slow if vehicle.near else knobs.fast_m_s,
+            slow if vehicle.near else parameters.fast_m_s,
             f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s",
             least=1.0,
         )
         row = self._watched(v, outlook, now_s, record)
-        speed = slow if vehicle.near else knobs.fast_m_s
+        speed = slow if vehicle.near else parameters.fast_m_s
         picture = self._pictured(v, outlook, row, now_s, record)
         return Order(name, goal, speed, outlook.east_north_m[row], picture)
 
     def _watched(self, v: int, outlook: Outlook, now_s: float, record: Record) -> int:
         """The row of the target that a vehicle looks at."""
-        vehicle, knobs, name = self._known[v], self.knobs, self.names[v]
-        row = stations.most_needed(outlook, vehicle.place_m, knobs.look_m, vehicle.watches)
+        vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
+        row = stations.most_needed(outlook, vehicle.place_m, parameters.look_m, vehicle.watches)
         here = np.flatnonzero(outlook.target == vehicle.watches)
         if len(here) and now_s - vehicle.watched_s < _LOOK_S:
             row = int(here[0])
@@ -235,7 +235,7 @@ class Team:
         return not bool(outlook.unseen[row]) and surely > (_UNSURE if now else _SURE)
 
     def _period_s(self, vehicle: _Vehicle) -> float:
-        return self.knobs.picture_s * (_SELDOM if vehicle.sure else 1)
+        return self.parameters.picture_s * (_SELDOM if vehicle.sure else 1)
 
     def _pictured(self, v: int, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
         """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
@@ -243,12 +243,12 @@ class Team:
         vehicle.sure = self._sure(outlook, row, vehicle.sure)
         period = self._period_s(vehicle)
         why = f"target {outlook.target[row]}: {_known(outlook, row)}"
-        record.set(f"{name}.picture_s", period, why, old=self.knobs.picture_s)
+        record.set(f"{name}.picture_s", period, why, old=self.parameters.picture_s)
         apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
         # One vehicle after the other, each in its part of the period.
         shift_s = 1e-6 - v * period / len(self.names)
         turn, last = (int((when_s + shift_s) // period) for when_s in (now_s, vehicle.pictured_s))
-        if apart > self.knobs.look_m or turn == last:
+        if apart > self.parameters.look_m or turn == last:
             return False
         vehicle.pictured_s = now_s
         return True

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import MorphologyKnobs
+from torchvision_dddas.config import MorphologyParameters
 from torchvision_dddas.detection.mask_cleaning import closed, ellipse
 from torchvision_dddas.geometry import occupied
 
@@ -75,15 +75,20 @@ def find_blobs(
 
 
 def weak_blobs(
-    wide: np.ndarray, found: list[Blob], threshold: float, knobs: MorphologyKnobs, min_area_px: int, peak: float
+    wide: np.ndarray,
+    found: list[Blob],
+    threshold: float,
+    parameters: MorphologyParameters,
+    min_area_px: int,
+    peak: float,
 ) -> list[Blob]:
     """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour."""
     core = cv2.threshold(wide, int(threshold), 255, cv2.THRESH_BINARY)[1]
-    core = closed(cv2.erode(core, ellipse(knobs.erode_px)), knobs.close_px)
+    core = closed(cv2.erode(core, ellipse(parameters.erode_px)), parameters.close_px)
     taken = np.zeros(wide.shape, bool)
     for blob in found:
         taken[blob.window] |= blob.mask
-    others = find_blobs(core, wide, threshold, min_area_px, peak, knobs.hull)
+    others = find_blobs(core, wide, threshold, min_area_px, peak, parameters.hull)
     return [replace(blob, weak=True) for blob in others if not taken[blob.window][blob.mask].any()]
 
 

@@ -13,7 +13,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.control import rules as control
 from torchvision_dddas.detection import windows
 from torchvision_dddas.detection.blob_motion import DenseFlow
-from torchvision_dddas.detection.engine import Foreground, View, Vision, Window
+from torchvision_dddas.detection.engine import Engine, Foreground, View, Window
 from torchvision_dddas.detection.motion_history import MotionHistory
 from torchvision_dddas.detection.observation import Found, Observation, admitted, cores, draw_targets, observe, table
 from torchvision_dddas.detection.small_targets import SmallTracks, candidates
@@ -73,13 +73,15 @@ def check_length(frames: int) -> None:
 
 def _memory(settings: Settings) -> int:
     """How many frames before the one observed may be looked at again."""
-    knobs, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
+    parameters, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
     judged = 5  # persistence looks two frames before a frame that is drawn two frames late
-    if knobs.kind == "between_later":
+    if parameters.kind == "between_later":
         return max(longest, judged)
     # Where a window can look one way only, it looks twice as far.
-    widest = 2 * max(knobs.wide_frames, *knobs.near_frames, settings.small.gap_frames if settings.small.on else 0)
-    return max(min(widest, longest), knobs.wide_frames, 2 * max(knobs.near_frames), judged)
+    widest = 2 * max(
+        parameters.wide_frames, *parameters.near_frames, settings.small.gap_frames if settings.small.on else 0
+    )
+    return max(min(widest, longest), parameters.wide_frames, 2 * max(parameters.near_frames), judged)
 
 
 @dataclass
@@ -104,7 +106,7 @@ class _Slot:
 
 def run(
     source: Clip,
-    vision: Vision,
+    engine: Engine,
     settings: Settings,
     telemetry: Telemetry | None = None,
     batch: int | None = None,
@@ -118,10 +120,10 @@ def run(
     A source that can be steered has a method `telemetry` that tells what was reported so far, in place of a whole log.
     Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
     """
-    return answered(running(source, vision, settings, telemetry, batch, retune), vision)
+    return answered(running(source, engine, settings, telemetry, batch, retune), engine)
 
 
-def answered(steps: Steps, vision: Vision) -> Iterator[Scene]:
+def answered(steps: Steps, engine: Engine) -> Iterator[Scene]:
     """The scenes of a loop whose back end answers it alone."""
     answer: list[Any] | None = None
     while True:
@@ -134,13 +136,13 @@ def answered(steps: Steps, vision: Vision) -> Iterator[Scene]:
             yield said
         else:
             start = time.perf_counter()
-            answer = getattr(vision, said.what)(said.items)
+            answer = getattr(engine, said.what)(said.items)
             said.seconds = time.perf_counter() - start
 
 
 def running(
     source: Clip,
-    vision: Vision,
+    engine: Engine,
     settings: Settings,
     telemetry: Telemetry | None = None,
     batch: int | None = None,
@@ -150,7 +152,7 @@ def running(
     count = getattr(source, "count", None)
     if telemetry is not None and count:
         check_overlap(telemetry, (count - 1) / source.rate_hz)
-    loop = Loop(vision, settings, source.rate_hz, telemetry, batch or (8 if vision.name == "torch" else 1))
+    loop = Loop(engine, settings, source.rate_hz, telemetry, batch or (8 if engine.name == "torch" else 1))
     last_s = 0.0
     live = getattr(source, "telemetry", None)
     for frame in source:
@@ -171,9 +173,9 @@ class Loop:
     """The state of a run: the frames in flight, the interval, the small tracks. Feed it frames in order."""
 
     def __init__(
-        self, vision: Vision, settings: Settings, rate_hz: float, telemetry: Telemetry | None = None, batch: int = 1
+        self, engine: Engine, settings: Settings, rate_hz: float, telemetry: Telemetry | None = None, batch: int = 1
     ) -> None:
-        self.vision, self.settings, self.batch = vision, settings, batch
+        self.engine, self.settings, self.batch = engine, settings, batch
         self.rate_hz, self.telemetry = rate_hz, telemetry
         self.slots: deque[_Slot] = deque()
         self.memory = _memory(settings)
@@ -199,7 +201,7 @@ class Loop:
         """Go on with other settings. How small targets and the motion's history are kept stays as it was."""
         if settings is self.settings:
             return
-        self.settings = self.vision.knobs = settings
+        self.settings = self.engine.parameters = settings
         # Frames that windows may look at are kept for the longer of the two.
         self.memory = max(self.memory, _memory(settings))
         altitude_m = self.regime.altitude_m
@@ -209,17 +211,17 @@ class Loop:
 
     def feed(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """Take one frame; yields the scenes that are settled by it. adjustments: made before it, for its scene."""
-        return answered(self.feeding(frame, adjustments), self.vision)
+        return answered(self.feeding(frame, adjustments), self.engine)
 
     def end(self, last: int = 0) -> Iterator[Scene]:
         """The clip is over: settle everything that is left. last: number of the clip's last frame, read or not."""
-        return answered(self.ending(last), self.vision)
+        return answered(self.ending(last), self.engine)
 
     def feeding(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Steps:
         """As `feed`, with the back end's answers sent from outside."""
         start = time.perf_counter()
         self.skipped += frame.skipped
-        view = self.vision.prepare(frame.image)
+        view = self.engine.prepare(frame.image)
         slot = _Slot(frame, view, frame.number - self.skipped, adjustments=adjustments)
         slot.seconds["prepare"] = time.perf_counter() - start
         self.shape = frame.image.shape
@@ -300,7 +302,7 @@ class Loop:
 
     def _steer(self, index: int, slot: _Slot) -> None:
         """The feedback rule for the detection interval."""
-        knobs = self.settings.interval
+        parameters = self.settings.interval
         flight = self._flight(slot)
         # A log may tell one of them and not the other, or fall silent for a while.
         altitude = flight.altitude_m if flight is not None and np.isfinite(flight.altitude_m) else None
@@ -312,16 +314,16 @@ class Loop:
         if slot.step is not None and slot.step.reliable:
             after = self._at(index + 1).frame.skipped + 1
             self.flows.append(slot.step.flow_px / after)
-        if knobs.rule:
+        if parameters.rule:
             wanted, why = None, ""
             if flight is not None and altitude is not None and np.isfinite(flight.speed_m_s):
-                wanted = control.interval_from_telemetry(altitude, flight.speed_m_s, self.rate_hz, knobs)
+                wanted = control.interval_from_telemetry(altitude, flight.speed_m_s, self.rate_hz, parameters)
                 why = f"altitude {altitude:.1f} m, speed {flight.speed_m_s:.1f} m/s"
             if wanted is None and self.flows:
-                wanted = control.interval_from_flow(self.flows, slot.view.size[0], knobs)
+                wanted = control.interval_from_flow(self.flows, slot.view.size[0], parameters)
                 why = f"background flow {np.median(self.flows):.2f} px a frame"
             if wanted is not None:
-                self.interval, moved = control.adjusted(number, self.interval, wanted / apart, why, knobs)
+                self.interval, moved = control.adjusted(number, self.interval, wanted / apart, why, parameters)
                 slot.adjustments += moved
         slot.interval = self.interval
 
@@ -501,14 +503,14 @@ class Loop:
         )
 
     def _small_targets(self, index: int, found: list[Found]) -> list[Found]:
-        """Confirmed small tracks seen in this frame, where no other target covers them."""
+        """Confirmation small tracks seen in this frame, where no other target covers them."""
         if not self.settings.small.on:
             return []
         near = range(max(index - 2, self.first), min(index + 3, self.observed))
         blobs = [len(o.blobs) for i in near if (o := self._at(i).observation) is not None]
         misses = [step.error_px for i in near if (step := self._at(i).step) is not None]
-        knobs = self.settings.small
-        if np.median(blobs) > knobs.max_blobs and misses and np.median(misses) > knobs.parallax_px:
+        parameters = self.settings.small
+        if np.median(blobs) > parameters.max_blobs and misses and np.median(misses) > parameters.parallax_px:
             return []
         extra = []
         for track in self.tracks.confirmed():
@@ -525,9 +527,9 @@ class Loop:
         return extra
 
 
-def scenes(frames: Iterable[Frame], vision: Vision, settings: Settings, rate_hz: float = 10.0) -> Iterator[Scene]:
+def scenes(frames: Iterable[Frame], engine: Engine, settings: Settings, rate_hz: float = 10.0) -> Iterator[Scene]:
     """`run` on frames at hand."""
-    loop = Loop(vision, settings, rate_hz)
+    loop = Loop(engine, settings, rate_hz)
     for frame in frames:
         yield from loop.feed(frame)
     yield from loop.end()

@@ -19,7 +19,7 @@ WHITE = 248
 
 @dataclass
 class View:
-    """One frame as the back end holds it. Made by `Vision.prepare`.
+    """One frame as the back end holds it. Made by `Engine.prepare`.
 
     image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W).
     kept: what the engine computed for this frame and will want again (pyramid, tensor, keypoints); its own affair.
@@ -78,11 +78,11 @@ class Foreground:
     scale: int = 1
 
 
-class Vision(Protocol):
-    """A back end. knobs: the settings in force; others may be put in their place between two frames."""
+class Engine(Protocol):
+    """A back end. parameters: the settings in force; others may be put in their place between two frames."""
 
     name: str
-    knobs: Settings
+    parameters: Settings
 
     def prepare(self, image: np.ndarray) -> View:
         """Whatever is computed once per frame."""
@@ -97,15 +97,15 @@ class Vision(Protocol):
         ...
 
 
-def load_engine(backend: str, settings: Settings) -> Vision:
+def load_engine(backend: str, settings: Settings) -> Engine:
     """The back end `torch` or `onboard`; `auto` takes onboard, the quicker one for a single stream on a CPU.
 
     Raises InputError for another name, and for `torch` where the extra is not installed.
     """
     if not wants_torch(backend):
-        from torchvision_dddas.detection.opencv_engine import OnboardVision
+        from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 
-        return OnboardVision(settings)
-    from torchvision_dddas.detection.torch_engine import TorchVision
+        return OpenCVEngine(settings)
+    from torchvision_dddas.detection.torch_engine import TorchEngine
 
-    return TorchVision(settings)
+    return TorchEngine(settings)

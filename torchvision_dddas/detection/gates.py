@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import GateKnobs
+from torchvision_dddas.config import GateParameters
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,9 @@ def pixels_per_metre(altitude_m: float, focal_px: float) -> float:
     return focal_px / max(altitude_m, 1.0)
 
 
-def gates_at(altitude_m: float, rate_hz: float, knobs: GateKnobs) -> Gates:
+def gates_at(altitude_m: float, rate_hz: float, parameters: GateParameters) -> Gates:
     """The gates at an altitude above ground; rate_hz: frames a second."""
-    scale = pixels_per_metre(altitude_m, knobs.focal_px)
-    return Gates(knobs.min_size_m * scale, knobs.max_size_m * scale, knobs.max_speed_m_s * scale / rate_hz)
+    scale = pixels_per_metre(altitude_m, parameters.focal_px)
+    return Gates(
+        parameters.min_size_m * scale, parameters.max_size_m * scale, parameters.max_speed_m_s * scale / rate_hz
+    )

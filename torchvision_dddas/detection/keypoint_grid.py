@@ -2,9 +2,9 @@
 
 import math
 
-from torchvision_dddas.config import RegistrationKnobs
+from torchvision_dddas.config import RegistrationParameters
 
 
-def cell_side(width: int, height: int, knobs: RegistrationKnobs) -> int:
+def cell_side(width: int, height: int, parameters: RegistrationParameters) -> int:
     """Side of the grid cells, in pixels, that keeps the number of keypoints within the budget."""
-    return max(knobs.cell_px, math.ceil(math.sqrt(width * height / knobs.keypoints)))
+    return max(parameters.cell_px, math.ceil(math.sqrt(width * height / parameters.keypoints)))

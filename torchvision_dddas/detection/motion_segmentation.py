@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import HistoryKnobs
+from torchvision_dddas.config import HistoryParameters
 from torchvision_dddas.detection.blobs import Blob
 from torchvision_dddas.detection.flow_split import cut
 from torchvision_dddas.detection.motion_history import NEWEST, MotionHistory, gradient, region_orientation
@@ -54,7 +54,9 @@ def regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float) -> l
     return found
 
 
-def moving_parts(blob: Blob, history: MotionHistory, size: tuple[int, int], knobs: HistoryKnobs) -> list[Part]:
+def moving_parts(
+    blob: Blob, history: MotionHistory, size: tuple[int, int], parameters: HistoryParameters
+) -> list[Part]:
     """The blob with its velocity, or its parts with theirs where its trail shows two motions.
 
     The history has the current frame's silhouette. size: (width, height) of the picture. Slower than the trail is
@@ -67,15 +69,15 @@ def moving_parts(blob: Blob, history: MotionHistory, size: tuple[int, int], knob
     body = np.zeros(stamps.shape, bool)
     body[y - top : y - top + height, x - left : x - left + width] = blob.mask
     body &= stamps == NEWEST
-    angle, valid = gradient(stamps, knobs.delta_min_frames, knobs.delta_max_frames)
+    angle, valid = gradient(stamps, parameters.delta_min_frames, parameters.delta_max_frames)
     old = np.where(stamps == NEWEST, np.uint8(0), stamps)
-    trails = regions(old, _grown(body), knobs.segmentation_threshold_frames)
+    trails = regions(old, _grown(body), parameters.segmentation_threshold_frames)
     total = sum(int(trail.sum()) for trail in trails)
     trails = [trail for trail in trails if trail.sum() >= _LEAST_SHARE * total]
     if not trails:
         return [Part(blob, np.full(2, np.nan))]
     pointing, agreement = zip(
-        *(region_orientation(angle, valid, stamps, _grown(t), knobs.duration_frames) for t in trails), strict=True
+        *(region_orientation(angle, valid, stamps, _grown(t), parameters.duration_frames) for t in trails), strict=True
     )
     pair = _apart([p if a >= _AGREEMENT else np.nan for p, a in zip(pointing, agreement, strict=True)])
     if pair is not None:
@@ -89,7 +91,7 @@ def moving_parts(blob: Blob, history: MotionHistory, size: tuple[int, int], knob
             if all(np.hypot(*part.velocity_px) >= _LEAST_SPEED_PX for part in parts):
                 return parts
     trail = np.logical_or.reduce(trails)
-    heading, _ = region_orientation(angle, valid, stamps, _grown(trail), knobs.duration_frames)
+    heading, _ = region_orientation(angle, valid, stamps, _grown(trail), parameters.duration_frames)
     return [Part(blob, _velocity(stamps, body, trail, heading))]
 
 

@@ -52,20 +52,20 @@ def observe(
 
     history: moved on to this frame; it tells the motions where the settings ask for no dense flow.
     """
-    knobs, view = settings.difference, window.reference
-    scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
+    parameters, view = settings.difference, window.reference
+    scale = EVIDENCE_SCALE if parameters.kind == "normalized" else 1.0
     blobs = find_blobs(
         foreground.core,
         foreground.evidence,
-        knobs.threshold * scale,
+        parameters.threshold * scale,
         settings.gates.min_area_px,
-        knobs.peak * scale,
+        parameters.peak * scale,
         settings.morphology.hull,
         foreground.scale,
     )
     if settings.persistence.on and _looks_both_ways(window):
-        knobs_of = settings.morphology, settings.gates.min_area_px, knobs.peak * scale
-        blobs += weak_blobs(foreground.wide, blobs, knobs.threshold * scale, *knobs_of)
+        knobs_of = settings.morphology, settings.gates.min_area_px, parameters.peak * scale
+        blobs += weak_blobs(foreground.wide, blobs, parameters.threshold * scale, *knobs_of)
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)

@@ -6,14 +6,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import DifferenceKnobs, Settings
+from torchvision_dddas.config import DifferenceParameters, Settings
 from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, Foreground, View, Window
 from torchvision_dddas.detection.exposure import to_light_of
 from torchvision_dddas.detection.mask_cleaning import closed, ellipse
 from torchvision_dddas.detection.opencv_foreground import exposed, inside, lit, median_above, texture_of, warp
 from torchvision_dddas.detection.opencv_half import (
-    half_knobs,
     half_of,
+    half_parameters,
     half_settings,
     half_window,
     whole_maps,
@@ -23,13 +23,13 @@ from torchvision_dddas.detection.opencv_registration import register
 from torchvision_dddas.types import Registration
 
 
-class OnboardVision:
-    """Implements `Vision` one pair and one window at a time."""
+class OpenCVEngine:
+    """Implements `Engine` one pair and one window at a time."""
 
     name = "onboard"
 
     def __init__(self, settings: Settings) -> None:
-        self.knobs = settings
+        self.parameters = settings
 
     def prepare(self, image: np.ndarray) -> View:
         """The frame and its grey picture."""
@@ -37,50 +37,52 @@ class OnboardVision:
 
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
         """Keypoints, pyramidal Lucas-Kanade, RANSAC, refits on the inliers."""
-        knobs = self.knobs.registration
-        if knobs.halved:
-            small = half_knobs(knobs)
+        parameters = self.parameters.registration
+        if parameters.halved:
+            small = half_parameters(parameters)
             return [whole_step(register(half_of(a), half_of(b), small)) for a, b in pairs]
-        return [register(earlier, later, knobs) for earlier, later in pairs]
+        return [register(earlier, later, parameters) for earlier, later in pairs]
 
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """Differences to the warped neighbours, threshold, morphology."""
-        if not self.knobs.difference.halved:
-            return [_foreground(window, self.knobs) for window in windows]
-        found = [_foreground(half_window(window), half_settings(self.knobs)) for window in windows]
-        flow = self.knobs.persistence.on or self.knobs.refine.on
-        if not (flow or self.knobs.history.on or self.knobs.small.on):  # blobs are found as well on the half maps
+        if not self.parameters.difference.halved:
+            return [_foreground(window, self.parameters) for window in windows]
+        found = [_foreground(half_window(window), half_settings(self.parameters)) for window in windows]
+        flow = self.parameters.persistence.on or self.parameters.refine.on
+        if not (
+            flow or self.parameters.history.on or self.parameters.small.on
+        ):  # blobs are found as well on the half maps
             return [replace(half, scale=2) for half in found]
         return [whole_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
 
 
 def _foreground(window: Window, settings: Settings) -> Foreground:
-    knobs, grey = settings.difference, window.reference.grey
+    parameters, grey = settings.difference, window.reference.grey
     if min(grey.shape) < 2:  # OpenCV takes a single column for a number
         return _nothing(grey)
-    normalized = knobs.kind == "normalized"
+    normalized = parameters.kind == "normalized"
     if normalized or settings.refine.on:
         texture = texture_of(grey)
     else:  # nobody asks
         texture = np.broadcast_to(np.uint8(0), grey.shape)
     if normalized:
         scale = EVIDENCE_SCALE
-        noise = np.sqrt((np.arange(256) * knobs.gradient_share / 4) ** 2 + knobs.noise_levels**2)
+        noise = np.sqrt((np.arange(256) * parameters.gradient_share / 4) ** 2 + parameters.noise_levels**2)
         weight = cv2.LUT(texture, (EVIDENCE_SCALE / noise).astype(np.float32))
         textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
     else:
         scale = 1.0
-    neighbours = _Neighbours(window, knobs)
+    neighbours = _Neighbours(window, parameters)
 
     def evidence(pair: tuple[int, int]) -> np.ndarray:
         both = neighbours.both(pair)
-        z = neighbours.apart(pair) if knobs.kind == "between_later" else neighbours.least(pair)
+        z = neighbours.apart(pair) if parameters.kind == "between_later" else neighbours.least(pair)
         if not normalized:
-            z = cv2.GaussianBlur(z, (knobs.blur_px,) * 2, 0)
+            z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
             return cv2.bitwise_and(z, both, dst=z)
         z = cv2.multiply(cv2.bitwise_and(z, both), weight, dtype=cv2.CV_8U)
         z = cv2.threshold(z, EVIDENCE_CAP, EVIDENCE_CAP, cv2.THRESH_TRUNC)[1]
-        z = cv2.GaussianBlur(z, (knobs.blur_px,) * 2, 0)
+        z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
         unit = median_above(z, cv2.bitwise_and(both, textured, dst=both), EVIDENCE_SCALE) / EVIDENCE_SCALE
         return z if unit == 1.0 else cv2.convertScaleAbs(z, alpha=1 / unit)
 
@@ -92,7 +94,7 @@ def _foreground(window: Window, settings: Settings) -> Foreground:
     neighbours.keep_for(window.wide, window.small)
     wide = near if window.wide is None else evidence(window.wide)
     neighbours.keep_for(window.small)
-    core = cv2.threshold(near, int(knobs.threshold * scale), 255, cv2.THRESH_BINARY)[1]
+    core = cv2.threshold(near, int(parameters.threshold * scale), 255, cv2.THRESH_BINARY)[1]
     close_px = window.close_px or settings.morphology.close_px
     core = closed(cv2.erode(core, ellipse(settings.morphology.erode_px)), close_px)
     small = None
@@ -115,8 +117,8 @@ class _Neighbours:
     All of a window's at once, with where each is seen, would hold 15 MB at 1280x720.
     """
 
-    def __init__(self, window: Window, knobs: DifferenceKnobs) -> None:
-        self.window, self.knobs = window, knobs
+    def __init__(self, window: Window, parameters: DifferenceParameters) -> None:
+        self.window, self.parameters = window, parameters
         self.made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.known: dict[tuple[int, int], np.ndarray] = {}
 
@@ -126,10 +128,10 @@ class _Neighbours:
             reference, neighbour_from_reference = self.window.reference, self.window.neighbour_from_reference[index]
             neighbour = self.window.neighbours[index]
             warped = warp(neighbour.grey, neighbour_from_reference)
-            seen = inside(neighbour_from_reference, reference.size, self.knobs.border_px)
-            if self.knobs.kind == "normalized":
+            seen = inside(neighbour_from_reference, reference.size, self.parameters.border_px)
+            if self.parameters.kind == "normalized":
                 warped = exposed(reference.grey, warped, seen)
-            elif self.knobs.kind == "to_reference":
+            elif self.parameters.kind == "to_reference":
                 warped = lit(reference.grey, warped, *to_light_of(reference, neighbour))
             self.made[index] = warped, seen
         return self.made[index]

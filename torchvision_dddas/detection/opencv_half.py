@@ -1,4 +1,4 @@
-"""Half the resolution, for a quarter of the cost: pictures, homographies, knobs and maps from one to the other.
+"""Half the resolution, for a quarter of the cost: pictures, homographies, parameters and maps from one to the other.
 
 A pixel of the half picture is the mean of 2 x 2 pixels, so that place p there is place 2 p + 1/2 in the whole picture.
 """
@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import RegistrationKnobs, Settings
+from torchvision_dddas.config import RegistrationParameters, Settings
 from torchvision_dddas.detection.engine import Foreground, View, Window
 from torchvision_dddas.types import Registration
 
@@ -37,11 +37,11 @@ def half_window(window: Window) -> Window:
     )
 
 
-def half_knobs(knobs: RegistrationKnobs) -> RegistrationKnobs:
-    """The registration's knobs with the lengths of half pictures; search windows stay, and so see twice as far."""
-    return knobs.model_copy(
-        update={"cell_px": max(knobs.cell_px // 2, 4), "ransac_px": knobs.ransac_px / 2}
-        | {"forward_backward_px": knobs.forward_backward_px / 2}
+def half_parameters(parameters: RegistrationParameters) -> RegistrationParameters:
+    """The registration's parameters with the lengths of half pictures; search windows stay, and so see twice as far."""
+    return parameters.model_copy(
+        update={"cell_px": max(parameters.cell_px // 2, 4), "ransac_px": parameters.ransac_px / 2}
+        | {"forward_backward_px": parameters.forward_backward_px / 2}
     )
 
 

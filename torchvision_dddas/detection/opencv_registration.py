@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import RegistrationKnobs
+from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.detection.engine import View
 from torchvision_dddas.detection.exposure import in_one_light
 from torchvision_dddas.detection.keypoint_grid import cell_side
@@ -47,47 +47,47 @@ class _Carried:
     cover: int
 
 
-def register(earlier: View, later: View, knobs: RegistrationKnobs) -> Registration:
+def register(earlier: View, later: View, parameters: RegistrationParameters) -> Registration:
     """The background's motion from `earlier` to `later`; what the next step needs is left in `later.kept`."""
-    carrying = knobs.redetect_frames > 1
+    carrying = parameters.redetect_frames > 1
     carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
-    if carried is not None and _worn(carried, earlier.size, knobs):
-        points = keypoints(earlier.grey, knobs, halved=not knobs.halved)
+    if carried is not None and _worn(carried, earlier.size, parameters):
+        points = keypoints(earlier.grey, parameters, halved=not parameters.halved)
         carried = _Carried(points, carried.step, 0, len(points), _cover(points, earlier.size))
     if carried is not None:
-        found, inliers = _step(earlier, later, carried.points, knobs, carried.step)
+        found, inliers = _step(earlier, later, carried.points, parameters, carried.step)
         if found.inliers < _LEAST_SHARE * len(carried.points) or not found.reliable:
             carried = None
     if carried is None:
-        points = keypoints(earlier.grey, knobs, halved=carrying and not knobs.halved)
+        points = keypoints(earlier.grey, parameters, halved=carrying and not parameters.halved)
         carried = _Carried(points, np.eye(3), 0, len(points), _cover(points, earlier.size))
-        found, inliers = _step(earlier, later, points, knobs, None)
+        found, inliers = _step(earlier, later, points, parameters, None)
     if carrying and found.reliable:
         step = found.later_from_earlier
         later.kept["carried"] = _Carried(inliers, step, carried.age + 1, carried.count, carried.cover)
     return found
 
 
-def keypoints(grey: np.ndarray, knobs: RegistrationKnobs, halved: bool = False) -> np.ndarray:
+def keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
     """(N, 2) float32: the best pixel of every grid cell, by the smaller eigenvalue of the structure tensor.
 
     halved: look at half the resolution, at a quarter of the cost; the points then lie on even pixels.
     """
     height, width = grey.shape
-    cell = cell_side(width, height, knobs)
+    cell = cell_side(width, height, parameters)
     if halved and min(width, height) > 1:
         # Half a pixel to the left and top of where the corner stands: a search window does not mind.
         grey = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-        points = _best_of_cells(grey, max(cell // 2, 1), knobs)
+        points = _best_of_cells(grey, max(cell // 2, 1), parameters)
         return 2 * points
-    return _best_of_cells(grey, cell, knobs)
+    return _best_of_cells(grey, cell, parameters)
 
 
-def _best_of_cells(grey: np.ndarray, cell: int, knobs: RegistrationKnobs) -> np.ndarray:
+def _best_of_cells(grey: np.ndarray, cell: int, parameters: RegistrationParameters) -> np.ndarray:
     rows, columns = grey.shape[0] // cell, grey.shape[1] // cell
     if not rows or not columns:
         return np.zeros((0, 2), np.float32)
-    corner = _corners(grey, knobs.block_px)
+    corner = _corners(grey, parameters.block_px)
     cells = corner[: rows * cell, : columns * cell].reshape(rows, cell, columns * cell)
     # Down the columns first: that runs along whole rows of memory.
     best = cells.max(axis=1).reshape(rows, columns, cell)
@@ -95,7 +95,7 @@ def _best_of_cells(grey: np.ndarray, cell: int, knobs: RegistrationKnobs) -> np.
     value = best.max(axis=2)
     at_best = cells[np.arange(rows)[:, None], :, column] == value[..., None]
     row = at_best.argmax(axis=2) + cell * np.arange(rows)[:, None]
-    good = value > max(knobs.quality * float(corner.max()), 1e-7)
+    good = value > max(parameters.quality * float(corner.max()), 1e-7)
     return np.stack([column[good], row[good]], axis=1).astype(np.float32)
 
 
@@ -110,10 +110,10 @@ def _corners(grey: np.ndarray, block: int) -> np.ndarray:
     return corner
 
 
-def _worn(carried: _Carried, size: tuple[int, int], knobs: RegistrationKnobs) -> bool:
+def _worn(carried: _Carried, size: tuple[int, int], parameters: RegistrationParameters) -> bool:
     """Whether the points carried on are too old, too few or too much in one place."""
     return (
-        carried.age >= knobs.redetect_frames
+        carried.age >= parameters.redetect_frames
         or len(carried.points) < _LEAST_LEFT * carried.count
         or _cover(carried.points, size) < _LEAST_COVER * carried.cover
     )
@@ -126,53 +126,57 @@ def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
 
 
 def _step(
-    earlier: View, later: View, start: np.ndarray, knobs: RegistrationKnobs, predicted: np.ndarray | None
+    earlier: View, later: View, start: np.ndarray, parameters: RegistrationParameters, predicted: np.ndarray | None
 ) -> tuple[Registration, np.ndarray]:
     """The registration and its inliers' places in the later frame."""
     size, end, tracked = earlier.size, start, np.zeros(len(start), bool)
     if len(start) >= 4:
-        end, tracked = _track(*in_one_light(earlier, later), start, knobs, predicted)
+        end, tracked = _track(*in_one_light(earlier, later), start, parameters, predicted)
     start, end = start[tracked], end[tracked]
     if len(start) < 4:
-        return judged(np.eye(3), len(start), 0, np.inf, size, knobs), end
-    later_from_earlier = fit(start, end, knobs)
+        return judged(np.eye(3), len(start), 0, np.inf, size, parameters), end
+    later_from_earlier = fit(start, end, parameters)
     miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
-    inliers = miss < knobs.ransac_px
+    inliers = miss < parameters.ransac_px
     error = float(np.median(miss[inliers])) if inliers.any() else np.inf
-    return judged(later_from_earlier, len(start), int(inliers.sum()), error, size, knobs), end[inliers]
+    return judged(later_from_earlier, len(start), int(inliers.sum()), error, size, parameters), end[inliers]
 
 
 def _track(
-    earlier: np.ndarray, later: np.ndarray, start: np.ndarray, knobs: RegistrationKnobs, predicted: np.ndarray | None
+    earlier: np.ndarray,
+    later: np.ndarray,
+    start: np.ndarray,
+    parameters: RegistrationParameters,
+    predicted: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the points went, (N, 2) float32, and which of them were followed, (N,) bool."""
-    end, found, missed_px = there_and_back(earlier, later, start, knobs, predicted)
-    return end, found & (missed_px <= knobs.forward_backward_px)
+    end, found, missed_px = there_and_back(earlier, later, start, parameters, predicted)
+    return end, found & (missed_px <= parameters.forward_backward_px)
 
 
 def there_and_back(
     earlier: np.ndarray,
     later: np.ndarray,
     start: np.ndarray,
-    knobs: RegistrationKnobs,
+    parameters: RegistrationParameters,
     predicted: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the points went, (N, 2) float32, which were found there and on the way back, and by how much that missed.
 
     missed_px: (N,) of the start; 0 where the way back is left out. predicted: (3, 3), where to look first.
     """
-    levels, steps, side, flags = knobs.levels, knobs.iterations, knobs.window_px, 0
+    levels, steps, side, flags = parameters.levels, parameters.iterations, parameters.window_px, 0
     guess: Any = None  # OpenCV's stubs know no None here
     if predicted is not None:
         levels, steps, flags = min(levels, _SHORT_LEVELS), min(steps, _SHORT_STEPS), cv2.OPTFLOW_USE_INITIAL_FLOW
         guess = transfer(predicted, start).astype(np.float32)
-    elif knobs.redetect_frames > 1:
+    elif parameters.redetect_frames > 1:
         side = max(side, _DEEP_WINDOW_PX)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, knobs.epsilon_px)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, parameters.epsilon_px)
     search: dict[str, Any] = {"winSize": (side, side), "maxLevel": levels, "criteria": criteria, "flags": flags}
     end, found, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess, **search)
     tracked, missed_px = found.ravel() == 1, np.zeros(len(start))
-    if knobs.forward_backward_px > 0:
+    if parameters.forward_backward_px > 0:
         # The way back is searched from where it should end, at full resolution: a true match stays there. From nothing
         # it costs three times as much and moves the homography by 0.03 px at most.
         search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
@@ -183,19 +187,21 @@ def there_and_back(
     return end, tracked & ((end >= 0) & (end <= (width - 1, height - 1))).all(axis=1), missed_px
 
 
-def fit(start: np.ndarray, end: np.ndarray, knobs: RegistrationKnobs) -> np.ndarray:
+def fit(start: np.ndarray, end: np.ndarray, parameters: RegistrationParameters) -> np.ndarray:
     """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy."""
-    affine, model, refit = knobs.model == "affine", None, None
+    affine, model, refit = parameters.model == "affine", None, None
     if affine:
-        found: np.ndarray | None = cv2.estimateAffine2D(start, end, None, cv2.RANSAC, knobs.ransac_px)[0]
+        found: np.ndarray | None = cv2.estimateAffine2D(start, end, None, cv2.RANSAC, parameters.ransac_px)[0]
         model = None if found is None else np.vstack([found, [0, 0, 1]])
     else:
-        model = cv2.findHomography(start, end, cv2.USAC_MAGSAC, knobs.ransac_px, maxIters=2000, confidence=0.999)[0]
+        model = cv2.findHomography(start, end, cv2.USAC_MAGSAC, parameters.ransac_px, maxIters=2000, confidence=0.999)[
+            0
+        ]
     if model is None:
         return np.eye(3)
     fitted = np.zeros(0, bool)
-    for share in _TOLERANCES_HALVED if knobs.halved else _TOLERANCES:
-        tolerance = share * knobs.ransac_px
+    for share in _TOLERANCES_HALVED if parameters.halved else _TOLERANCES:
+        tolerance = share * parameters.ransac_px
         near = np.linalg.norm(transfer(model, start) - end, axis=1) < tolerance
         if near.sum() < 12:
             break

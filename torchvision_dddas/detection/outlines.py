@@ -36,9 +36,9 @@ def refine(
     """
     x, y, width, height = blob.box
     box = blob.window
-    knobs = settings.difference
+    parameters = settings.difference
     slope = texture[box].astype(np.float32) / 4
-    noise = np.sqrt(knobs.noise_levels**2 + (knobs.gradient_share * slope) ** 2)
+    noise = np.sqrt(parameters.noise_levels**2 + (parameters.gradient_share * slope) ** 2)
     own = grey[box]
     still = cv2.blur(np.minimum(*(_misfit(own, w[box], noise) for w in warped)), (3, 3))
     moved = [_moved(w, fit, motion.frame, blob.box) for w, fit in zip(warped, motion.affine, strict=True)]

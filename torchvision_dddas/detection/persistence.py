@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from torchvision_dddas.config import PersistenceKnobs
+from torchvision_dddas.config import PersistenceParameters
 from torchvision_dddas.detection.blob_motion import Motion
 from torchvision_dddas.detection.blobs import Blob
 from torchvision_dddas.geometry import transfer
@@ -46,7 +46,9 @@ class Sighting:
         return np.nan_to_num([motion.velocity_px for motion in self.motions])
 
 
-def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int], knobs: PersistenceKnobs) -> list[bool]:
+def persistent(
+    sightings: Sequence[Sighting], index: int, size: tuple[int, int], parameters: PersistenceParameters
+) -> list[bool]:
     """Which blobs of `sightings[index]` are targets, judged by up to two frames before and after it.
 
     A blob that is linked over enough frames and moves steadily in enough of them is a target. Where blobs are few, or
@@ -55,20 +57,20 @@ def persistent(sightings: Sequence[Sighting], index: int, size: tuple[int, int],
     size: (width, height) of the picture. Source: appendix B, S5, asks for independently moving targets; the test
     per blob, not per pixel, is what keeps targets whole.
     """
-    crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > knobs.trusted_blobs
+    crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > parameters.trusted_blobs
     possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
     verdicts = []
     for blob, motion in zip(sightings[index].blobs, sightings[index].motions, strict=True):
-        links, passes = _seen((blob, motion), sightings, index, knobs.flow_share)
+        links, passes = _seen((blob, motion), sightings, index, parameters.flow_share)
         if blob.weak:
-            verdicts.append(links >= knobs.weak_links and passes >= knobs.weak_passes)
+            verdicts.append(links >= parameters.weak_links and passes >= parameters.weak_passes)
             continue
-        steady = links >= min(knobs.links, possible) and passes >= min(knobs.passes, possible)
+        steady = links >= min(parameters.links, possible) and passes >= min(parameters.passes, possible)
         share = blob.area_px / (size[0] * size[1])
-        large = share >= knobs.large_share
+        large = share >= parameters.large_share
         linked = links >= 2 or possible < 2
-        trusted = (linked and large) if crowded else (linked or share >= knobs.large_share / 5)
-        sure = motion.steady > knobs.sure_share and share >= knobs.large_share / 10
+        trusted = (linked and large) if crowded else (linked or share >= parameters.large_share / 5)
+        sure = motion.steady > parameters.sure_share and share >= parameters.large_share / 10
         verdicts.append(steady or trusted or sure)
     return verdicts
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchvision_dddas.config import RegistrationKnobs
+from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.geometry import background_flow, transfer
 from torchvision_dddas.types import Registration
 
@@ -15,7 +15,7 @@ def judged(
     inliers: int,
     error_px: float,
     size: tuple[int, int],
-    knobs: RegistrationKnobs,
+    parameters: RegistrationParameters,
 ) -> Registration:
     """The record of a registration, flagged with a cause in words when nothing may be concluded from it.
 
@@ -23,9 +23,9 @@ def judged(
     between successive frames.
     """
     cause = ""
-    if tracked < knobs.min_inliers:
-        cause = f"only {tracked} keypoints could be followed, {knobs.min_inliers} wanted"
-    elif inliers < knobs.min_inliers or inliers < knobs.min_inlier_share * tracked:
+    if tracked < parameters.min_inliers:
+        cause = f"only {tracked} keypoints could be followed, {parameters.min_inliers} wanted"
+    elif inliers < parameters.min_inliers or inliers < parameters.min_inlier_share * tracked:
         cause = f"only {inliers} of {tracked} keypoints agree on one background motion"
     elif not plausible(later_from_earlier, size):
         cause = "the background motion found is not one of a camera"

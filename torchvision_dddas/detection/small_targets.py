@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import SmallKnobs
+from torchvision_dddas.config import SmallParameters
 from torchvision_dddas.geometry import occupied, transfer
 
 # A track is straight when its points lie this close to a constant velocity, px (root mean square).
@@ -34,7 +34,7 @@ class Track:
     confirmed: bool = False
 
 
-def candidates(small: np.ndarray, knobs: SmallKnobs) -> list[tuple[int, int, int, int]]:
+def candidates(small: np.ndarray, parameters: SmallParameters) -> list[tuple[int, int, int, int]]:
     """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to be told apart."""
     boxes: list[tuple[int, int, int, int]] = []
     for left, top, wide, high in occupied(small, 2):
@@ -43,16 +43,16 @@ def candidates(small: np.ndarray, knobs: SmallKnobs) -> list[tuple[int, int, int
         boxes += [
             (left + x, top + y, w, h)
             for x, y, w, h, area in stats[1:count].tolist()
-            if area >= knobs.min_area_px and w * h <= knobs.max_box_px
+            if area >= parameters.min_area_px and w * h <= parameters.max_box_px
         ]
-    return sorted(boxes, key=lambda box: (box[1], box[0])) if len(boxes) <= knobs.max_candidates else []
+    return sorted(boxes, key=lambda box: (box[1], box[0])) if len(boxes) <= parameters.max_candidates else []
 
 
 class SmallTracks:
     """Remembers the candidates of past frames. Feed it every frame in order."""
 
-    def __init__(self, knobs: SmallKnobs) -> None:
-        self.knobs = knobs
+    def __init__(self, parameters: SmallParameters) -> None:
+        self.parameters = parameters
         self.tracks: list[Track] = []
         self.counts: deque[int] = deque(maxlen=20)
 
@@ -70,14 +70,14 @@ class SmallTracks:
         taken = self._continue(frame, centres, boxes)
         for i in set(range(len(boxes))) - taken:
             self.tracks.append(Track([frame], centres[i : i + 1], [boxes[i]]))
-        self.tracks = [t for t in self.tracks if frame - t.frames[-1] <= self.knobs.misses]
+        self.tracks = [t for t in self.tracks if frame - t.frames[-1] <= self.parameters.misses]
 
     def _continue(self, frame: int, centres: np.ndarray, boxes: Sequence[tuple[int, int, int, int]]) -> set[int]:
         if not self.tracks or not len(centres):
             return set()
         ahead = np.array([t.points_px[-1] + t.velocity_px * (frame - t.frames[-1]) for t in self.tracks])
         distance = np.linalg.norm(ahead[:, None] - centres[None], axis=2)
-        near = np.argwhere(distance <= self.knobs.gate_px)
+        near = np.argwhere(distance <= self.parameters.gate_px)
         near = near[np.argsort(distance[near[:, 0], near[:, 1]], kind="stable")]
         rows: set[int] = set()
         taken: set[int] = set()
@@ -108,15 +108,15 @@ class SmallTracks:
         rms = float(np.sqrt((miss**2).sum(axis=1).mean()))
         if len(time) >= 3:
             track.velocity_px = velocity
-        if len(time) < self.knobs.hits:
+        if len(time) < self.parameters.hits:
             return
         speed = float(np.hypot(*velocity))
         sigma = max(rms, 0.3) / np.sqrt(spread)
         length = float(np.median([max(w, h) for _, _, w, h in track.boxes]))
         travel = speed * (time[-1] - time[0])
         lengths = _LENGTHS + _LENGTHS_EACH * float(np.median(self.counts))
-        far = travel >= max(self.knobs.min_travel_px, lengths * length)
-        track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.knobs.sureness)
+        far = travel >= max(self.parameters.min_travel_px, lengths * length)
+        track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.parameters.sureness)
 
     def confirmed(self) -> list[Track]:
         """The tracks believed so far."""

@@ -39,14 +39,14 @@ class Registered(NamedTuple):
     texture: Tensor
 
 
-class TorchVision:
-    """Implements `Vision` on all pairs and windows of equal structure at once."""
+class TorchEngine:
+    """Implements `Engine` on all pairs and windows of equal structure at once."""
 
     name = "torch"
 
     def __init__(self, settings: Settings, device: str | torch.device | None = None) -> None:
         """device: by default the GPU where there is one."""
-        self.knobs = settings
+        self.parameters = settings
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
     def prepare(self, image: np.ndarray) -> View:
@@ -59,7 +59,7 @@ class TorchVision:
         return _in_groups(
             pairs,
             lambda pair: (pair[0].size, pair[1].size),
-            lambda group: register(group, self.knobs.registration, self.device),
+            lambda group: register(group, self.parameters.registration, self.device),
         )
 
     @torch.inference_mode()
@@ -84,7 +84,7 @@ class TorchVision:
 
     def registered(self, windows: list[Window]) -> Registered:
         """Windows of equal structure with their neighbours warped to the references, in the references' light."""
-        knobs, one = self.knobs.difference, windows[0]
+        parameters, one = self.parameters.difference, windows[0]
         (width, height), count = one.reference.size, len(one.neighbours)
         grey = torch.cat([torch.from_numpy(window.reference.grey)[None, None] for window in windows]).to(self.device)
         levels = joined([levels_of(window.reference, self.device) for window in windows])
@@ -95,28 +95,28 @@ class TorchVision:
             neighbours = joined([levels_of(window.neighbours[k], self.device) for window in windows])
             frame_size = neighbours.shape[-2], neighbours.shape[-1]
             sampled = warp.sample(neighbours, matrices[:, k], (height, width)).add_(0.5).floor_()
-            run = warp.seen_columns(matrices[:, k], (height, width), frame_size, knobs.border_px)
-            if knobs.kind == "normalized":
+            run = warp.seen_columns(matrices[:, k], (height, width), frame_size, parameters.border_px)
+            if parameters.kind == "normalized":
                 sampled = exposed(levels, sampled, run)
-            elif knobs.kind == "to_reference":
+            elif parameters.kind == "to_reference":
                 light = np.array([to_light_of(window.reference, window.neighbours[k]) for window in windows])
                 if (light != (1.0, 0.0)).any():
                     sampled = lit(levels, sampled, *torch.from_numpy(light.T).to(levels))
             warped.append(sampled.to(torch.uint8))
             seen.append(run)
         # Without either nobody asks for the texture.
-        wanted = knobs.kind == "normalized" or self.knobs.refine.on
+        wanted = parameters.kind == "normalized" or self.parameters.refine.on
         texture = difference.gradient(levels) if wanted else torch.zeros_like(levels)
         return Registered(grey, warped, seen, texture)
 
     def _foreground_at_once(self, windows: list[Window]) -> list[Foreground]:
-        knobs, morph, one = self.knobs.difference, self.knobs.morphology, windows[0]
+        parameters, morph, one = self.parameters.difference, self.parameters.morphology, windows[0]
         grey, warped, seen, texture = self.registered(windows)
-        near, wide = evidence(one, grey, warped, seen, texture, knobs)
-        scale = EVIDENCE_SCALE if knobs.kind == "normalized" else 1.0
-        core = (near > int(knobs.threshold * scale)).to(torch.uint8) * 255
+        near, wide = evidence(one, grey, warped, seen, texture, parameters)
+        scale = EVIDENCE_SCALE if parameters.kind == "normalized" else 1.0
+        core = (near > int(parameters.threshold * scale)).to(torch.uint8) * 255
         core = closed(morphology.erode(core, morph.erode_px, "ellipse"), one.close_px or morph.close_px)
-        small = small_movers(one, grey, warped, seen, self.knobs.small)
+        small = small_movers(one, grey, warped, seen, self.parameters.small)
         a, b = one.near[-1]
         maps = core, near, wide, texture.to(torch.uint8), warped[a], warped[b]
         rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import DifferenceKnobs, SmallKnobs
+from torchvision_dddas.config import DifferenceParameters, SmallParameters
 from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, View, Window
 from torchvision_dddas.functional import blur, difference, morphology, warp
 
@@ -33,22 +33,24 @@ def evidence(
     warped: list[Tensor],
     seen: list[tuple[Tensor, Tensor]],
     texture: Tensor,
-    knobs: DifferenceKnobs,
+    parameters: DifferenceParameters,
 ) -> tuple[Tensor, Tensor]:
     """The largest evidence over the near pairs, and that of the wide pair, uint8."""
     width = grey.shape[-1]
-    if knobs.kind == "normalized":
-        weight = difference.noise_weight(texture, knobs.noise_levels, knobs.gradient_share).mul_(EVIDENCE_SCALE)
+    if parameters.kind == "normalized":
+        weight = difference.noise_weight(texture, parameters.noise_levels, parameters.gradient_share).mul_(
+            EVIDENCE_SCALE
+        )
         textured = texture > TEXTURED
-    distance = distances(window, grey, warped, knobs)
+    distance = distances(window, grey, warped, parameters)
 
     def of(pair: tuple[int, int]) -> Tensor:
         both = seen_by_both(seen[pair[0]], seen[pair[1]], width)
         least = least_of(pair, distance, warped)
-        if knobs.kind != "normalized":
-            return blur.gaussian_levels(least, knobs.blur_px) * both
+        if parameters.kind != "normalized":
+            return blur.gaussian_levels(least, parameters.blur_px) * both
         z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
-        z = blur.gaussian_levels(z, knobs.blur_px)
+        z = blur.gaussian_levels(z, parameters.blur_px)
         return _in_units(z, textured & both)
 
     near = of(window.near[0])
@@ -58,7 +60,7 @@ def evidence(
 
 
 def small_movers(
-    window: Window, grey: Tensor, warped: list[Tensor], seen: list[tuple[Tensor, Tensor]], knobs: SmallKnobs
+    window: Window, grey: Tensor, warped: list[Tensor], seen: list[tuple[Tensor, Tensor]], parameters: SmallParameters
 ) -> Tensor | None:
     """255 where something small may move, uint8; None where nobody looks for it."""
     if window.small is None:
@@ -67,8 +69,8 @@ def small_movers(
     least = torch.minimum(apart(grey, warped[a]), apart(grey, warped[b]))
     least = blur.gaussian_levels(least, 5) * seen_by_both(seen[a], seen[b], grey.shape[-1])
     mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
-    level = (knobs.noise_ratio * mean).clamp(min=knobs.threshold).floor()
-    return closed((least > level).to(torch.uint8) * 255, knobs.close_px)
+    level = (parameters.noise_ratio * mean).clamp(min=parameters.threshold).floor()
+    return closed((least > level).to(torch.uint8) * 255, parameters.close_px)
 
 
 def closed(mask: Tensor, side: int) -> Tensor:
@@ -91,9 +93,11 @@ def _used(window: Window) -> set[int]:
     return {k for pair in (*window.near, *([window.wide] if window.wide else [])) for k in pair}
 
 
-def distances(window: Window, grey: Tensor, warped: list[Tensor], knobs: DifferenceKnobs) -> dict[int, Tensor]:
+def distances(
+    window: Window, grey: Tensor, warped: list[Tensor], parameters: DifferenceParameters
+) -> dict[int, Tensor]:
     """How far each neighbour that counts is from the reference; none where neighbours are compared to each other."""
-    return {k: apart(grey, warped[k]) for k in _used(window)} if knobs.kind != "between_later" else {}
+    return {k: apart(grey, warped[k]) for k in _used(window)} if parameters.kind != "between_later" else {}
 
 
 def least_of(pair: tuple[int, int], distance: dict[int, Tensor], warped: list[Tensor]) -> Tensor:

@@ -43,12 +43,12 @@ def pairs(
 
     A window looks both ways where it can; at the ends of a stretch it looks one way only.
     """
-    knobs = settings.difference
-    if knobs.kind == "between_later":
+    parameters = settings.difference
+    if parameters.kind == "between_later":
         return [p for p in [_forward(at, interval, first, last)] if p], None, None
     # No further than the reach, whatever is known already: the result must not depend on how frames are batched.
     ahead = min(last, at + reach(interval, settings))
-    near = [p for gap in knobs.near_frames if (p := _symmetric(at, gap, first, ahead))]
+    near = [p for gap in parameters.near_frames if (p := _symmetric(at, gap, first, ahead))]
     if not near and (p := _symmetric(at, 1, first, ahead)):
         near = [p]
     near = list(dict.fromkeys(near))
@@ -56,13 +56,13 @@ def pairs(
     # and only where no pair looks both ways.
     near = [p for p in near if p[0] < at < p[1]] or near[:1]
     wide = None
-    if knobs.wide_frames and near:
-        forward = min(knobs.wide_frames, max(2 * interval - 2, 0), ahead - at)
-        back = min(knobs.wide_frames, at - first)
+    if parameters.wide_frames and near:
+        forward = min(parameters.wide_frames, max(2 * interval - 2, 0), ahead - at)
+        back = min(parameters.wide_frames, at - first)
         if back >= 3 and forward >= 2:
             wide = (at - back, at + forward)
         else:
-            gaps = range(knobs.wide_frames, 2, -1)
+            gaps = range(parameters.wide_frames, 2, -1)
             wide = next((p for gap in gaps if (p := _symmetric(at, gap, first, ahead))), None)
     small = None
     if small_looked_for(interval, settings):

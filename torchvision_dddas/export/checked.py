@@ -22,12 +22,12 @@ class Check:
 
 @dataclass(frozen=True)
 class Made:
-    """One file: its content, what it is for, which of our functions it was compared with, the knobs baked in."""
+    """One file: its content, what it is for, which of our functions it was compared with, the parameters baked in."""
 
     content: bytes
     about: str
     source: str
-    knobs: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
     checks: tuple[Check, ...] = ()
 
 

@@ -60,7 +60,7 @@ def entry(made: Made) -> dict[str, Any]:
         "opset": opset,
         "inputs": {value.name: described(value) for value in model.graph.input},
         "outputs": {value.name: described(value) for value in model.graph.output},
-        "knobs": made.knobs,
+        "knobs": made.parameters,
         "checked_against": made.source,
         "checks": [{"unit": c.unit, "off": float(f"{c.off:.1e}"), "limit": c.limit} for c in made.checks],
         "versions": {

@@ -21,7 +21,7 @@ import onnxruntime
 import torch
 from onnx import TensorProto
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.export.checked import Check, Made
 from torchvision_dddas.export.graph_builder import FAR, Graph
 from torchvision_dddas.functional import hog
@@ -37,9 +37,9 @@ ABOUT = {
 }
 
 
-def made(knobs: PeopleKnobs) -> dict[str, Made]:
+def made(parameters: PeopleParameters) -> dict[str, Made]:
     """The files by their names, compared with torch."""
-    wanted = layout(knobs)
+    wanted = layout(parameters)
     files = graphs(wanted)
     check = Check("score", largest_difference(files, wanted), TOLERANCE)
     return {name: Made(content, ABOUT[name], "ops.hog", baked(wanted), (check,)) for name, content in files.items()}
@@ -180,7 +180,7 @@ def graphs(layout: hog.Layout) -> dict[str, bytes]:
 
 
 def baked(layout: hog.Layout) -> dict[str, int]:
-    """The knobs that a graph is made for."""
+    """The parameters that a graph is made for."""
     values = layout.cell, layout.block, layout.stride, layout.bins, int(layout.signed), int(layout.gamma)
     return dict(zip(BAKED, values, strict=True))
 

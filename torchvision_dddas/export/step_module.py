@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchvision_dddas.config import DifferenceKnobs, MorphologyKnobs, RegistrationKnobs
+from torchvision_dddas.config import DifferenceParameters, MorphologyParameters, RegistrationParameters
 from torchvision_dddas.detection.keypoint_grid import cell_side
 from torchvision_dddas.detection.torch_foreground import LEVEL, apart, seen_by_both
 from torchvision_dddas.functional import affine, blur, consensus, flow, homography, keypoints, morphology, warp
@@ -25,7 +25,7 @@ REFITS = 1.0, 0.5  # of the tolerance of RANSAC
 class WarpDifference(nn.Module):
     """Where three pictures differ after two of them were brought onto the first."""
 
-    def __init__(self, difference: DifferenceKnobs, morphology: MorphologyKnobs) -> None:
+    def __init__(self, difference: DifferenceParameters, morphology: MorphologyParameters) -> None:
         super().__init__()
         self.difference, self.morphology = difference, morphology
 
@@ -54,15 +54,15 @@ class WarpDifference(nn.Module):
 class Register(nn.Module):
     """The background's motion from a picture to each of its neighbours."""
 
-    def __init__(self, size: tuple[int, int], knobs: RegistrationKnobs) -> None:
+    def __init__(self, size: tuple[int, int], parameters: RegistrationParameters) -> None:
         """size: (width, height) in px."""
         super().__init__()
-        self.knobs, self.cell = knobs, cell_side(*size, knobs)
+        self.settings, self.cell = parameters, cell_side(*size, parameters)
         self.count = (size[0] // self.cell) * (size[1] // self.cell)
         self.levels = 1
-        while self.levels <= knobs.levels and min(size) / 2**self.levels > knobs.window_px:
+        while self.levels <= parameters.levels and min(size) / 2**self.levels > parameters.window_px:
             self.levels += 1
-        self.model = affine if knobs.model == "affine" else homography
+        self.model = affine if parameters.model == "affine" else homography
 
     def forward(
         self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor
@@ -72,10 +72,10 @@ class Register(nn.Module):
         samples: int64 (S, 4), numbers of keypoints from which the hypotheses are drawn. tolerance_px: float64 ().
         Where nothing agrees: the identity, with 0 inliers.
         """
-        knobs, pairs = self.knobs, len(neighbours)
+        parameters, pairs = self.settings, len(neighbours)
         levels = reference[None, None].float()
         points, _, valid = keypoints.grid_features(
-            levels, self.cell, knobs.quality, knobs.block_px, least=1e-7 * LEVEL**2
+            levels, self.cell, parameters.quality, parameters.block_px, least=1e-7 * LEVEL**2
         )
         points, valid = points.expand(pairs, -1, -1), valid.expand(pairs, -1)
         earlier = [level.expand(pairs, -1, -1, -1) for level in flow.pyramid(levels, self.levels)]
@@ -98,12 +98,12 @@ class Register(nn.Module):
     def _track(
         self, points: Tensor, earlier: list[Tensor], later: list[Tensor], guess: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        knobs = self.knobs
+        parameters = self.settings
         reach = {} if guess is None else {"reach_px": REACH_PX}
         settings = {
-            "window_px": knobs.window_px,
-            "iterations": min(knobs.iterations, STEPS),
-            "epsilon_px": knobs.epsilon_px,
+            "window_px": parameters.window_px,
+            "iterations": min(parameters.iterations, STEPS),
+            "epsilon_px": parameters.epsilon_px,
             "min_eigen": 1e-4 * LEVEL**2,
             **reach,
         }
@@ -132,9 +132,9 @@ class Step(nn.Module):
     def __init__(
         self,
         size: tuple[int, int],
-        registration: RegistrationKnobs,
-        difference: DifferenceKnobs,
-        morph: MorphologyKnobs,
+        registration: RegistrationParameters,
+        difference: DifferenceParameters,
+        morph: MorphologyParameters,
     ) -> None:
         super().__init__()
         self.register, self.compare = Register(size, registration), WarpDifference(difference, morph)

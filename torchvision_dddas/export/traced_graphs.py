@@ -66,7 +66,7 @@ def module(name: str, settings: Settings, size: tuple[int, int]) -> nn.Module:
 
 
 def baked(name: str, settings: Settings) -> dict[str, Any]:
-    """The knobs that the graph holds."""
+    """The parameters that the graph holds."""
     difference, morphology = settings.difference, settings.morphology
     held: dict[str, Any] = {
         "difference.blur_px": difference.blur_px,
@@ -76,7 +76,7 @@ def baked(name: str, settings: Settings) -> dict[str, Any]:
     }
     if name == "step":
         names = "model", "keypoints", "cell_px", "quality", "block_px", "window_px", "levels", "epsilon_px"
-        held |= {f"registration.{knob}": getattr(settings.registration, knob) for knob in names}
+        held |= {f"registration.{parameter}": getattr(settings.registration, parameter) for parameter in names}
     return held
 
 

@@ -73,7 +73,7 @@ def noise_weight(
 
     texture: 4 x grey levels a pixel, as `gradient` gives it.
     """
-    # In place where that keeps the gradient of the knobs.
+    # In place where that keeps the gradient of the parameters.
     return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()
 
 

@@ -1,4 +1,4 @@
-"""The threshold that can be softened, so that gradients pass while knobs are tuned (appendix B, step S4)."""
+"""The threshold that can be softened, so that gradients pass while parameters are tuned (appendix B, step S4)."""
 
 import torch
 from jaxtyping import Float

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import AerialKnobs, Settings
+from torchvision_dddas.config import AerialParameters, Settings
 from torchvision_dddas.control.rules import LandmarkUse, chosen
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.elevation import surface, up
@@ -20,7 +20,7 @@ from torchvision_dddas.geo.solvers import PlaneSolver
 from torchvision_dddas.geo.speeds import Movers
 from torchvision_dddas.geo.sun import feet_below, shadow_m, sun_at
 from torchvision_dddas.io.telemetry import at
-from torchvision_dddas.types import Adjustment, Camera, Fix, Flight, Grounded, Marks, Positions
+from torchvision_dddas.types import Adjustment, AerialLocations, Camera, Fix, Flight, LandmarkObservations, Positions
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Look:
     """How the picture of one frame lies on the ground, by which landmarks; adjustments and seconds as in Scene."""
 
     fix: Fix
-    marks: Marks
+    marks: LandmarkObservations
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -108,11 +108,11 @@ class Locator:
         """Of a frame, since the clip's first."""
         return (frame - 1) / self.rate_hz
 
-    def marks(self, frame: int) -> Marks:
+    def marks(self, frame: int) -> LandmarkObservations:
         """The landmarks of a frame, on the ground: those whose place and height are known."""
         return self._standing(self.courses.at(frame))
 
-    def look(self, frame: int, marks: Marks) -> Look:
+    def look(self, frame: int, marks: LandmarkObservations) -> Look:
         """How the picture of a frame lies on the ground; marks: those of `marks`, with their places in the picture."""
         start = time.perf_counter()
         speeds = self.courses.speed_m_s(frame)[marks.landmark]
@@ -147,7 +147,7 @@ class Locator:
         targets: Targets,
         adjustments: Sequence[Adjustment] = (),
         seconds: Mapping[str, float] | None = None,
-    ) -> Grounded:
+    ) -> AerialLocations:
         """Where the targets of a frame stand by its fix; none that the fix cannot place. Feed it frames in order.
 
         adjustments, seconds: what happened to the frame before, for the record.
@@ -171,7 +171,7 @@ class Locator:
         )
         spent = {**(seconds or {}), **look.seconds, "ground": time.perf_counter() - start}
         moved = (*adjustments, *look.adjustments)
-        return Grounded(
+        return AerialLocations(
             fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, look.marks, moved, spent
         )
 
@@ -185,26 +185,26 @@ class Locator:
 
     def _laid(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
-        knobs = self.settings.aerial
+        parameters = self.settings.aerial
         pixels, lift = self.points(fix, targets)
         place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
         _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
-        variance = sigma_of(targets, knobs) ** 2
+        variance = sigma_of(targets, parameters) ** 2
         own = (by_pixel - shared) * variance[:, None, None]
         return place, shared + own, own
 
     def _sun(self, time_s: float) -> tuple[float, float] | None:
         """Where the sun stands, azimuth and height, rad; None where nothing tells, and at night."""
-        knobs, site = self.settings.aerial, self.site
-        if knobs.sun_height_deg > 0:
-            return math.radians(knobs.sun_azimuth_deg), math.radians(knobs.sun_height_deg)
+        parameters, site = self.settings.aerial, self.site
+        if parameters.sun_height_deg > 0:
+            return math.radians(parameters.sun_azimuth_deg), math.radians(parameters.sun_height_deg)
         sun = site.sun_rad
         if sun is None and site.origin_deg is not None and site.telemetry is not None:
             start = site.telemetry.start_utc_s
             sun = sun_at(*site.origin_deg, start + time_s) if math.isfinite(start) else None
         return sun if sun is not None and sun[1] > 0 else None
 
-    def _standing(self, marks: Marks) -> Marks:
+    def _standing(self, marks: LandmarkObservations) -> LandmarkObservations:
         if self._ground is None or not len(marks):
             return marks
         marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
@@ -212,9 +212,9 @@ class Locator:
         return chosen_rows(marks, np.isfinite(marks.up_m))
 
 
-def chosen_rows(marks: Marks, rows: np.ndarray) -> Marks:
+def chosen_rows(marks: LandmarkObservations, rows: np.ndarray) -> LandmarkObservations:
     """Some of the landmarks."""
-    return Marks(
+    return LandmarkObservations(
         marks.landmark[rows],
         marks.image_px[rows],
         marks.east_north_m[rows],
@@ -224,13 +224,13 @@ def chosen_rows(marks: Marks, rows: np.ndarray) -> Marks:
     )
 
 
-def sigma_of(targets: Targets, knobs: AerialKnobs) -> np.ndarray:
+def sigma_of(targets: Targets, parameters: AerialParameters) -> np.ndarray:
     """(N,) standard deviation in pixels, of u and of v each, of the points that stand for the targets."""
     side = np.sqrt(np.maximum(targets.box_px[:, 2] * targets.box_px[:, 3], 0))
-    return np.hypot(knobs.target_sigma_px, side * (knobs.own_sigma if targets.bodies else 0.0))
+    return np.hypot(parameters.target_sigma_px, side * (parameters.own_sigma if targets.bodies else 0.0))
 
 
-def points_of(targets: Targets, knobs: AerialKnobs, posed: bool) -> tuple[np.ndarray, np.ndarray]:
+def points_of(targets: Targets, parameters: AerialParameters, posed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) that stand for the targets, and how high above the ground those are (N,) m.
 
     A body's foot is where its middle, half its height up, has its place: that takes a pose of the camera (posed).
@@ -239,9 +239,9 @@ def points_of(targets: Targets, knobs: AerialKnobs, posed: bool) -> tuple[np.nda
     if targets.middle_px is not None:
         centre = np.where(np.isfinite(targets.middle_px).all(axis=1)[:, None], targets.middle_px, centre)
     lift = np.zeros(len(centre))
-    if knobs.point == "auto" and targets.feet_px is not None:
+    if parameters.point == "auto" and targets.feet_px is not None:
         named = np.isfinite(targets.feet_px).all(axis=1)
         return np.where(named[:, None], targets.feet_px, centre), lift
-    if posed and (knobs.point == "foot" or (knobs.point == "auto" and targets.bodies)):
-        lift += knobs.target_height_m / 2
+    if posed and (parameters.point == "foot" or (parameters.point == "auto" and targets.bodies)):
+        lift += parameters.target_height_m / 2
     return centre, lift

@@ -12,7 +12,7 @@ import numpy as np
 
 from torchvision_dddas.geo.linearization import Glimpse
 from torchvision_dddas.geo.pose_estimation import EXACT_M, Expected, Prior, Solution
-from torchvision_dddas.types import Marks
+from torchvision_dddas.types import LandmarkObservations
 
 FORGOTTEN = 4.0
 """A landmark not seen for so many time constants is forgotten."""
@@ -56,7 +56,7 @@ class Memory:
         """Whether any frame has told anything."""
         return bool(self.mean.any())
 
-    def at(self, time_s: float, prior: Prior, marks: Marks, correlation_s: float) -> "Memory":
+    def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "Memory":
         """The same at a later time, with the landmarks that are new."""
         correlation_s /= self.lasting.pace
         gap_s = time_s - self.time_s
@@ -78,7 +78,7 @@ class Memory:
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
         return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
 
-    def _of(self, time_s: float, marks: Marks, forgotten_s: float) -> "Memory":
+    def _of(self, time_s: float, marks: LandmarkObservations, forgotten_s: float) -> "Memory":
         """The same with the landmarks that are new, and without those not seen for too long."""
         seen, old = marks.landmark.tolist(), self.ids.tolist()
         staying = [
@@ -97,7 +97,7 @@ class Memory:
         seen_s = np.concatenate([self.seen_s[staying], np.full(len(new), time_s)])
         return replace(self, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
 
-    def expected(self, prior: Prior, marks: Marks) -> Expected:
+    def expected(self, prior: Prior, marks: LandmarkObservations) -> Expected:
         """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
         known, n = np.flatnonzero(prior.known), len(marks)
         ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
@@ -108,7 +108,7 @@ class Memory:
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
-    def foretold(self, marks: Marks, glimpse: Glimpse) -> tuple[float, "Memory"]:
+    def foretold(self, marks: LandmarkObservations, glimpse: Glimpse) -> tuple[float, "Memory"]:
         """How well it foretold a picture, the log of the density of where the landmarks were, and itself after it.
 
         The telemetry must tell all seven.
@@ -124,7 +124,7 @@ class Memory:
         mean = self.mean + white[:, 1:].T @ white[:, 0]
         return density, self._with(mean, covariance, marks.landmark[glimpse.used])
 
-    def after(self, prior: Prior, marks: Marks, used: np.ndarray, solution: Solution) -> "Memory":
+    def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "Memory":
         """With what a frame told: of errors that were not looked at too, as far as they go with those that were."""
         known, n = np.flatnonzero(prior.known), len(marks)
         ours = np.concatenate([known, places_of(self.ids, marks.landmark)])

@@ -6,10 +6,10 @@ import numpy as np
 
 from torchvision_dddas.geo.aerial_locator import Locator
 from torchvision_dddas.tracking.crowd_identity import RollCall
-from torchvision_dddas.types import Fix, Followed
+from torchvision_dddas.types import Fix, TrackedFrame
 
 
-def named(followed: Followed, fix: Fix, locator: Locator, roll: RollCall) -> Followed:
+def named(followed: TrackedFrame, fix: Fix, locator: Locator, roll: RollCall) -> TrackedFrame:
     """The frame with its targets under the names that roll gives them, without those that it gives none.
 
     Boxes that bridge a gap keep the name that they had.

@@ -13,7 +13,7 @@ from torchvision_dddas.geo.linearization import glimpse_of
 from torchvision_dddas.geo.plane import LEAST, Solver, homography_fix, on_one_line, too_few
 from torchvision_dddas.geo.pose_estimation import Prior, Solution, bare_prior, expected_of, prior_of
 from torchvision_dddas.geo.projection import unbent
-from torchvision_dddas.types import Camera, Fix, Flight, Marks
+from torchvision_dddas.types import Camera, Fix, Flight, LandmarkObservations
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
 """Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
@@ -70,30 +70,35 @@ class Registrar:
         self.habit = _Habit({}, frozenset())
 
     def step(
-        self, frame: int, time_s: float, flight: Flight | None, marks: Marks, degrees: Degrees | None = None
+        self,
+        frame: int,
+        time_s: float,
+        flight: Flight | None,
+        marks: LandmarkObservations,
+        degrees: Degrees | None = None,
     ) -> Fix:
         """How one frame lies on the ground; by = "" and a cause where nothing tells it.
 
         flight: what telemetry says then, its place in local metres; None without telemetry. marks: the landmarks,
         places in local metres; rows without pixel or place do not count. degrees, for aerial.mode = paper.
         """
-        knobs = self.settings.aerial
+        parameters = self.settings.aerial
         usable, changes = self._usable(marks)
         if degrees is not None:
             degrees = (np.asarray(degrees[0], float)[usable], degrees[1])
         seen = rows(marks, usable)
-        prior = prior_of(flight, self.camera, knobs, self.ground_up_m, self.focal_known)
-        if knobs.mode == "pose":
+        prior = prior_of(flight, self.camera, parameters, self.ground_up_m, self.focal_known)
+        if parameters.mode == "pose":
             fix = self._by_pose(frame, time_s, prior, seen)
         else:
             fix = self._by_homography(frame, prior, seen, degrees)
         return _with_unusable(fix, marks, usable, changes)
 
-    def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: Marks) -> Fix:
-        knobs, n = self.settings.aerial, len(marks)
-        cause = _refused(frame, prior, marks, knobs.least_spread)
-        bare = bare_prior(self.camera, knobs, self.focal_known)
-        self.memories = [memory.at(time_s, prior or bare, marks, knobs.correlation_s) for memory in self.memories]
+    def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: LandmarkObservations) -> Fix:
+        parameters, n = self.settings.aerial, len(marks)
+        cause = _refused(frame, prior, marks, parameters.least_spread)
+        bare = bare_prior(self.camera, parameters, self.focal_known)
+        self.memories = [memory.at(time_s, prior or bare, marks, parameters.correlation_s) for memory in self.memories]
         believed = int(self.credit.argmax())
         before = self.memories[believed]
         if cause:
@@ -127,7 +132,7 @@ class Registrar:
             cause=cause,
         )
 
-    def _learn(self, prior: Prior, marks: Marks, used: np.ndarray, solution: Solution) -> None:
+    def _learn(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> None:
         """Hold what each belief foretold against what the picture shows, and let it learn from it."""
         if len(self.memories) == 1 or not (prior.known.all() and used.any()):
             return
@@ -137,7 +142,9 @@ class Registrar:
         self.credit = REMEMBERS * self.credit + np.maximum(density - density.max(), -MOST_SURPRISED)
         self.memories = [memory for _, memory in told]
 
-    def _judged(self, before: Memory, prior: Prior, marks: Marks, bare: Prior | None) -> tuple[Verdict, Memory]:
+    def _judged(
+        self, before: Memory, prior: Prior, marks: LandmarkObservations, bare: Prior | None
+    ) -> tuple[Verdict, Memory]:
         """The landmarks tested against what is remembered, and what is to be remembered of the past then."""
         gate, n = self.settings.aerial.gate_probability, len(marks)
         everyone, itself = np.ones(n, bool), np.arange(n)
@@ -168,7 +175,7 @@ class Registrar:
         )
         return verdict, memory
 
-    def _less_and_less(self, before: Memory, prior: Prior, marks: Marks) -> Iterator[Memory]:
+    def _less_and_less(self, before: Memory, prior: Prior, marks: LandmarkObservations) -> Iterator[Memory]:
         """What else to remember where all of it does not fit: a report may jump within its errors."""
         if not before.told:
             return
@@ -177,19 +184,21 @@ class Registrar:
             yield before.anew(places_of(before.ids, np.array([identity])))
         yield before.anew(np.arange(len(before.mean)))
 
-    def _by_homography(self, frame: int, prior: Prior | None, marks: Marks, degrees: Degrees | None) -> Fix:
+    def _by_homography(
+        self, frame: int, prior: Prior | None, marks: LandmarkObservations, degrees: Degrees | None
+    ) -> Fix:
         """By landmarks alone; telemetry, where there is any, only tells whether they are what they are said to be."""
-        knobs, n = self.settings.aerial, len(marks)
-        paper = knobs.mode == "paper"
+        parameters, n = self.settings.aerial, len(marks)
+        paper = parameters.mode == "paper"
         if paper or prior is None or not prior.known.all() or n == 0:
             seen = marks if paper else self._unbent(marks)
-            return homography_fix(frame, seen, self.solver, knobs.least_spread, degrees, paper)
+            return homography_fix(frame, seen, self.solver, parameters.least_spread, degrees, paper)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         expected = expected_of(prior, marks.sigma_m)
-        verdict = judge(marks, self.camera, expected, knobs.gate_probability, names)
+        verdict = judge(marks, self.camera, expected, parameters.gate_probability, names)
         # Where nothing explains the disagreement the telemetry may be wrong: the landmarks are taken at their word.
         kept = rows(reordered(marks, verdict.order), verdict.used) if verdict.passed else marks
-        fix = homography_fix(frame, self._unbent(kept), self.solver, knobs.least_spread)
+        fix = homography_fix(frame, self._unbent(kept), self.solver, parameters.least_spread)
         solution = verdict.solution
         return replace(
             fix,
@@ -201,11 +210,11 @@ class Registrar:
             cause=fix.cause or verdict.cause,
         )
 
-    def _unbent(self, marks: Marks) -> Marks:
+    def _unbent(self, marks: LandmarkObservations) -> LandmarkObservations:
         """As a lens without distortion would show them: a bent picture of a plane is no homography's."""
         return replace(marks, image_px=unbent(marks.image_px, self.camera))
 
-    def _usable(self, marks: Marks) -> tuple[np.ndarray, tuple[str, ...]]:
+    def _usable(self, marks: LandmarkObservations) -> tuple[np.ndarray, tuple[str, ...]]:
         """Which rows count: those with pixel and place, each landmark once; and of those that do not, why."""
         in_picture = np.isfinite(marks.image_px).all(axis=1)
         placed = np.isfinite(marks.east_north_m).all(axis=1) & np.isfinite(marks.sigma_m)
@@ -220,7 +229,7 @@ class Registrar:
             first.add(identity)
         return usable, tuple(changes)
 
-    def _as_before(self, marks: Marks) -> tuple[np.ndarray, np.ndarray] | None:
+    def _as_before(self, marks: LandmarkObservations) -> tuple[np.ndarray, np.ndarray] | None:
         """The repair of the frame before, for this frame's rows; None where there was none or it does not apply."""
         row = {identity: k for k, identity in enumerate(marks.landmark.tolist())}
         if not (self.habit.pixels_of or self.habit.without):
@@ -234,7 +243,7 @@ class Registrar:
         return self.names[identity] if 0 <= identity < len(self.names) else f"landmark {identity}"
 
 
-def _refused(frame: int, prior: Prior | None, marks: Marks, least_spread: float) -> str:
+def _refused(frame: int, prior: Prior | None, marks: LandmarkObservations, least_spread: float) -> str:
     """Why nothing can tell where the camera is; empty where something can."""
     n = len(marks)
     if prior is None:
@@ -248,11 +257,11 @@ def _refused(frame: int, prior: Prior | None, marks: Marks, least_spread: float)
     return ""
 
 
-def _nothing(frame: int, marks: Marks, cause: str) -> Fix:
+def _nothing(frame: int, marks: LandmarkObservations, cause: str) -> Fix:
     return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * len(marks), cause=cause)
 
 
-def _with_unusable(fix: Fix, marks: Marks, usable: np.ndarray, changes: tuple[str, ...]) -> Fix:
+def _with_unusable(fix: Fix, marks: LandmarkObservations, usable: np.ndarray, changes: tuple[str, ...]) -> Fix:
     """With the landmarks that are in the picture but could not be used."""
     seen = np.flatnonzero(usable | np.isfinite(marks.image_px).all(axis=1))
     told = dict(zip(np.flatnonzero(usable).tolist(), fix.state, strict=True))

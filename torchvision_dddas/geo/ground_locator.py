@@ -12,7 +12,7 @@ from torchvision_dddas.geo.fusion import fuse
 from torchvision_dddas.geo.ranging import sight, touches_border
 from torchvision_dddas.io.camera_files import PoseTable, poses_at
 from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.types import Camera, Located, Poses, Positions, Sightings
+from torchvision_dddas.types import Camera, GroundLocations, Poses, Positions, Sightings
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def looks(views: Sequence[View], within_frames: int = 0) -> Iterator[tuple[int, 
         yield first, rows
 
 
-def locate(found: Survey, settings: Settings) -> Iterator[Located]:
+def locate(found: Survey, settings: Settings) -> Iterator[GroundLocations]:
     """Where people stand, frame by frame: of several cameras the fused places."""
     names = _Names()
     for frame, here in looks(found.views, settings.ground.within_frames):
@@ -118,7 +118,7 @@ def locate(found: Survey, settings: Settings) -> Iterator[Located]:
             positions, members = _alone(frame, found.views[0], located[0], found.origin_deg)
         else:
             positions, members = _together(frame, found, located, names, settings.ground.gate_sigmas)
-        yield Located(
+        yield GroundLocations(
             frame,
             positions,
             members,

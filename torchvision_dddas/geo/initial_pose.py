@@ -7,14 +7,14 @@ import numpy as np
 from torchvision_dddas.geo.pose_estimation import HEADING, Expected, Solution, fit_pose, moved
 from torchvision_dddas.geo.projection import lifted, rays
 from torchvision_dddas.geometry import turned
-from torchvision_dddas.types import Bool, Camera, CameraPose, Marks
+from torchvision_dddas.types import Bool, Camera, CameraPose, LandmarkObservations
 
 HEADINGS = 8
 """So many are tried where nothing else tells one."""
 
 
 def find_pose(
-    marks: Marks, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
+    marks: LandmarkObservations, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
 ) -> Solution | None:
     """The likeliest of the poses that the starts at hand lead to; None where none does.
 
@@ -36,12 +36,12 @@ def find_pose(
     return min(found, key=lambda one: one.cost) if found else None
 
 
-def rows(marks: Marks, which: np.ndarray) -> Marks:
+def rows(marks: LandmarkObservations, which: np.ndarray) -> LandmarkObservations:
     """Some of the landmarks of a frame: by their numbers or a (n,) bool."""
     return replace(marks, **{column.name: getattr(marks, column.name)[which] for column in fields(marks)})
 
 
-def _turned_about_up(marks: Marks, camera: Camera, expected: Expected) -> list[CameraPose]:
+def _turned_about_up(marks: LandmarkObservations, camera: Camera, expected: Expected) -> list[CameraPose]:
     """With a known tilt the pixels lie on the ground but for turn, size and place, which the landmarks tell."""
     known, pose = expected.known, moved(expected.reference, expected.mean[:7])
     if not known[:2].all() or len(marks) == 0:
@@ -118,7 +118,7 @@ def _seen_so(camera_from_world: np.ndarray, middle_seen: np.ndarray, middle: np.
     return CameraPose(place, camera_from_world.T)
 
 
-def _plain(marks: Marks, camera: Camera) -> np.ndarray:
+def _plain(marks: LandmarkObservations, camera: Camera) -> np.ndarray:
     """(3, 3) homography from local metres to metres right and down a metre of depth, unweighed: a start."""
     ground, flat = marks.east_north_m, lifted(marks.image_px, 1.0, camera)
     middle, size = ground.mean(axis=0), max(float(np.abs(ground - ground.mean(axis=0)).max()), 1e-9)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.config import LandmarkKnobs
+from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.geo.colour_patches import Patches
 from torchvision_dddas.geometry import cheapest, transfer
 
@@ -56,8 +56,8 @@ class Candidate:
 class Candidates:
     """The patches of one colour, and which of them is the landmark."""
 
-    def __init__(self, knobs: LandmarkKnobs) -> None:
-        self._knobs = knobs
+    def __init__(self, parameters: LandmarkParameters) -> None:
+        self._parameters = parameters
         self._all: list[Candidate] = []
         self.lock: Candidate | None = None
         self.sure = False
@@ -97,7 +97,7 @@ class Candidates:
             for row in largest
             if row not in taken.values()
         ]
-        self._all = [one for one in self._all if one.missed <= min(self._knobs.interval_frames, one.seen)] + new
+        self._all = [one for one in self._all if one.missed <= min(self._parameters.interval_frames, one.seen)] + new
         if self.lock is not None and not any(one is self.lock for one in self._all):
             self.lock, self.sure = None, False
 
@@ -106,7 +106,7 @@ class Candidates:
         area, near = found.area_px, np.zeros(len(found), bool)
         if self.lock is not None:
             area = np.minimum(area, _LARGE * self.lock.area_px)
-            near = np.linalg.norm(found.centre_px - self.lock.centre_px, axis=1) <= self._knobs.reach_px
+            near = np.linalg.norm(found.centre_px - self.lock.centre_px, axis=1) <= self._parameters.reach_px
         fill = found.area_px / found.box_px[:, 2:].prod(axis=1)
         return np.lexsort((-area * np.minimum(fill / _FILL, 1.0) ** 4, ~near))[:_MOST]
 
@@ -116,7 +116,7 @@ class Candidates:
             return {}
         before = np.array([one.centre_px for one in self._all])
         gate = np.array([np.sqrt(one.area_px) * (1 + 0.2 * one.missed) + 4 for one in self._all])
-        reach = max(self._knobs.reach_px, 4.0)
+        reach = max(self._parameters.reach_px, 4.0)
         gate = np.full(len(gate), reach) if self._blind else np.minimum(gate, reach)
         apart = np.linalg.norm(before[:, None] - found.centre_px[rows][None], axis=2) / gate[:, None]
         change = np.log(found.area_px[rows][None] / np.array([one.area_px for one in self._all])[:, None])
@@ -153,6 +153,6 @@ class Candidates:
         if np.isfinite(usual_px):
             score -= max(np.log(one.area_px / (_LARGE * usual_px)), 0.0)
         if np.isfinite(expected_px).all():
-            away = np.linalg.norm(one.centre_px - expected_px) / (2 * max(self._knobs.reach_px, 1.0))
+            away = np.linalg.norm(one.centre_px - expected_px) / (2 * max(self._parameters.reach_px, 1.0))
             score -= min(away**2 / 2, _FAR)
         return float(score)

@@ -20,7 +20,7 @@ from torchvision_dddas.geo.initial_pose import find_pose
 from torchvision_dddas.geo.pose_estimation import Expected, Solution, moved
 from torchvision_dddas.geo.projection import project_with_slopes
 from torchvision_dddas.geometry import cheapest
-from torchvision_dddas.types import Bool, Camera, Int, Marks
+from torchvision_dddas.types import Bool, Camera, Int, LandmarkObservations
 
 Hypothesis = tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]
 """Whose pixel each landmark has in truth, and which landmarks count."""
@@ -79,7 +79,7 @@ def _chance_above(freedom: int, value: float) -> float:
 
 
 def judge(
-    marks: Marks,
+    marks: LandmarkObservations,
     camera: Camera,
     expected: Expected,
     probability: float,
@@ -132,7 +132,7 @@ def judge(
     return Verdict(first, itself, everyone if first is not None else ~everyone, cause=cause, passed=False)
 
 
-def reordered(marks: Marks, order: Int[np.ndarray, "n"]) -> Marks:
+def reordered(marks: LandmarkObservations, order: Int[np.ndarray, "n"]) -> LandmarkObservations:
     """The landmarks with one another's pixels."""
     return replace(marks, image_px=marks.image_px[order], pixel_sigma=marks.pixel_sigma[order])
 
@@ -141,20 +141,20 @@ def reordered(marks: Marks, order: Int[np.ndarray, "n"]) -> Marks:
 # What may be wrong.
 
 
-def _one_change(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
+def _one_change(marks: LandmarkObservations, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
     n = len(marks)
     swaps = [_swapped(n, pair) for pair in combinations(range(n), 2)]
     drops = [_without(n, {one}) for one in range(n)]
     return _best_first(swaps + drops, marks, camera, expected)
 
 
-def _assignment(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
+def _assignment(marks: LandmarkObservations, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
     order = _assigned(marks, camera, expected)
     if order is not None:
         yield order, np.ones(len(marks), bool)
 
 
-def _two_changes(marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
+def _two_changes(marks: LandmarkObservations, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
     n = len(marks)
     drops = [_without(n, set(pair)) for pair in combinations(range(n), 2)]
     one_out = [_without(n, {one})[1] for one in range(n)]
@@ -172,7 +172,7 @@ def _without(n: int, rows: set[int]) -> Hypothesis:
     return np.arange(n), ~np.isin(np.arange(n), list(rows))
 
 
-def _assigned(marks: Marks, camera: Camera, expected: Expected) -> np.ndarray | None:
+def _assigned(marks: LandmarkObservations, camera: Camera, expected: Expected) -> np.ndarray | None:
     """Pixels to landmarks, the nearest in sum, once the shift that all have in common is taken away."""
     seen = _predicted(marks, camera, expected)[0]
     if not expected.known.all() or not np.isfinite(seen).all():
@@ -182,7 +182,7 @@ def _assigned(marks: Marks, camera: Camera, expected: Expected) -> np.ndarray | 
     return cheapest(distance**2)[1]
 
 
-def _spread_out(marks: Marks) -> bool:
+def _spread_out(marks: LandmarkObservations) -> bool:
     """Whether landmarks lie off one line by clearly more than their errors: on the ground and in the picture."""
     return all(
         np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] > APART * np.linalg.norm(sigma)
@@ -190,7 +190,7 @@ def _spread_out(marks: Marks) -> bool:
     )
 
 
-def _predicted(marks: Marks, camera: Camera, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
+def _predicted(marks: LandmarkObservations, camera: Camera, expected: Expected) -> tuple[np.ndarray, np.ndarray]:
     """Where the landmarks are expected in the picture (n, 2), with derivatives by pose and places (2n, 7 + 2n)."""
     n = len(marks)
     places = marks.east_north_m + expected.mean[7:].reshape(n, 2)
@@ -203,7 +203,9 @@ def _predicted(marks: Marks, camera: Camera, expected: Expected) -> tuple[np.nda
     return seen, slopes
 
 
-def _best_first(hypotheses: list[Hypothesis], marks: Marks, camera: Camera, expected: Expected) -> Iterator[Hypothesis]:
+def _best_first(
+    hypotheses: list[Hypothesis], marks: LandmarkObservations, camera: Camera, expected: Expected
+) -> Iterator[Hypothesis]:
     """The few hypotheses that explain most, by the sum of squares to first order about what is expected."""
     if len(hypotheses) <= FITTED or not expected.known.all():
         # Nothing to predict by: where no heading is known, say, only the full fit tells.

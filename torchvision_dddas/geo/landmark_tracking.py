@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.config import LandmarkKnobs
+from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.geo.colour_patches import patches_of
 from torchvision_dddas.geo.landmark_candidates import Candidates
 from torchvision_dddas.geo.ranging import touches_border
@@ -25,7 +25,7 @@ _MEMORY, _ENOUGH = 25, 3
 
 
 def separate(
-    colour_px: np.ndarray, blob_px: np.ndarray, knobs: LandmarkKnobs, allowed: np.ndarray | None = None
+    colour_px: np.ndarray, blob_px: np.ndarray, parameters: LandmarkParameters, allowed: np.ndarray | None = None
 ) -> np.ndarray:
     """(n,) int64, which of the m blobs is each landmark's, -1 for none; no blob is of two.
 
@@ -36,13 +36,13 @@ def separate(
     row by row, each landmark the nearest blob that is left.
     """
     distance = np.linalg.norm(colour_px[:, None] - blob_px[None], axis=2)
-    within = distance <= knobs.reach_px  # False for NaN
+    within = distance <= parameters.reach_px  # False for NaN
     if allowed is not None:
         within &= allowed
     match = np.full(len(colour_px), -1, np.int64)
     if not within.any():
         return match
-    if knobs.differentiation == "greedy":
+    if parameters.differentiation == "greedy":
         free = np.ones(len(blob_px), bool)
         for row, near in enumerate(within):
             if (near & free).any():
@@ -50,7 +50,7 @@ def separate(
                 free[match[row]] = False
         return match
     # One pair more is worth more than any saving of distance.
-    missing = 1.0 + knobs.reach_px * (min(distance.shape) + 1)
+    missing = 1.0 + parameters.reach_px * (min(distance.shape) + 1)
     rows, columns = cheapest(np.where(within, distance, missing))
     good = within[rows, columns]
     match[rows[good]] = columns[good]
@@ -98,9 +98,9 @@ class LandmarkFollower:
     interval_frames landmarks are told from targets anew; between, a landmark's blob is the one where it is predicted.
     """
 
-    def __init__(self, names: tuple[str, ...], knobs: LandmarkKnobs) -> None:
-        self.names, self._knobs = names, knobs
-        self._colours = [Candidates(knobs) for _ in names]
+    def __init__(self, names: tuple[str, ...], parameters: LandmarkParameters) -> None:
+        self.names, self._parameters = names, parameters
+        self._colours = [Candidates(parameters) for _ in names]
         self._blobs = [_Coupling() for _ in names]
         self._next = 0
 
@@ -125,7 +125,7 @@ class LandmarkFollower:
         size = masks.shape[2], masks.shape[1]
         anew = frame >= self._next
         if anew:
-            self._next = frame + self._knobs.interval_frames
+            self._next = frame + self._parameters.interval_frames
         boxes = detections.box_px
         blobs = centres_of(boxes, foreground)
         blob_area = detections.area_px if len(detections.area_px) else boxes[:, 2:].prod(axis=1)
@@ -142,7 +142,7 @@ class LandmarkFollower:
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
         for k, (coupling, box) in enumerate(zip(self._blobs, chosen, strict=True)):
             blob = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
-            if blob is not None and self._knobs.centre == "motion":
+            if blob is not None and self._parameters.centre == "motion":
                 image[k], by[k] = blob, "motion"
             elif box is not None and not touches_border(box[None], size)[0]:
                 image[k], by[k] = colour[k], "colour"
@@ -166,7 +166,7 @@ class LandmarkFollower:
         """Boxes, centres (K, 2) and areas (K,) of the landmarks' colours; None and NaN where not seen."""
         expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
         for mask, colour in zip(masks, self._colours, strict=True):
-            found = patches_of(mask, self._knobs.least_area_px)
+            found = patches_of(mask, self._parameters.least_area_px)
             colour.advance(now_from_before)
             colour.see(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)))
         # Vehicles of one team wear plates of like size: what others wear says what to look for.
@@ -190,7 +190,7 @@ class LandmarkFollower:
         seen to move. Where the colour is hidden any will do.
         """
         if anew:
-            match = separate(colour, blobs, self._knobs, near)
+            match = separate(colour, blobs, self._parameters, near)
             for coupling, blob in zip(self._blobs, match, strict=True):
                 coupling.coupled = bool(blob >= 0)
             return match
@@ -206,7 +206,7 @@ class LandmarkFollower:
                     moved = transfer(now_from_before, moved)[0]
                 velocity = 0.0 if candidates.lock is None else candidates.lock.velocity_px
                 predicted[k] = coupling.blob_px = moved + velocity
-        return separate(predicted, blobs, self._knobs, near | np.isnan(colour[:, :1]))
+        return separate(predicted, blobs, self._parameters, near | np.isnan(colour[:, :1]))
 
     def _shared(self, match: np.ndarray, touching: np.ndarray, area: np.ndarray, blob_area: np.ndarray) -> np.ndarray:
         """(N,) bool: the blobs that are much larger than the landmarks at them explain; takes note of what is usual.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import LandmarkKnobs
-from torchvision_dddas.types import Landmarks, Marks
+from torchvision_dddas.config import LandmarkParameters
+from torchvision_dddas.types import LandmarkObservations, Landmarks
 
 _SLACK = 1.5
 """Reports that are further apart than this many times their usual distance have a dropout between them."""
@@ -47,14 +47,14 @@ class Courses:
     is absent. A landmark's plan alone, without reports, will do.
     """
 
-    def __init__(self, landmarks: Landmarks, knobs: LandmarkKnobs, rate_hz: float) -> None:
+    def __init__(self, landmarks: Landmarks, parameters: LandmarkParameters, rate_hz: float) -> None:
         """landmarks: their places in local metres. Raises ValueError for degrees."""
         if landmarks.geographic:
             raise ValueError("these landmarks are in degrees; wanted local metres")
         self.names = landmarks.names
-        self._knobs, self._rate_hz = knobs, rate_hz
+        self._parameters, self._rate_hz = parameters, rate_hz
         known = np.isfinite(landmarks.place).all(axis=1)
-        sigma = np.where(np.isfinite(landmarks.sigma_m), landmarks.sigma_m, knobs.sigma_m)
+        sigma = np.where(np.isfinite(landmarks.sigma_m), landmarks.sigma_m, parameters.sigma_m)
         reports: list[_Track] = []
         plans: list[_Track] = []
         for k in range(len(landmarks.names)):
@@ -73,7 +73,7 @@ class Courses:
         """Whether the table itself says where pictures show landmarks."""
         return len(self._seen_frame) > 0
 
-    def at(self, frame: int) -> Marks:
+    def at(self, frame: int) -> LandmarkObservations:
         """The landmarks of a frame whose places are known.
 
         Where the table says places in pictures, those that it has for this frame; else all, with image_px NaN.
@@ -87,13 +87,13 @@ class Courses:
         found = [self._place(int(k), float(frame)) for k in landmark]
         kept = np.array([place is not None for place in found], bool)
         known = [place for place in found if place is not None]
-        return Marks(
+        return LandmarkObservations(
             landmark[kept].astype(np.int64),
             image[kept],
             np.array([place for place, _ in known], float).reshape(-1, 2),
             np.array([sigma for _, sigma in known], float),
-            np.full(len(known), self._knobs.pixel_sigma),
-            np.full(len(known), self._knobs.height_m),
+            np.full(len(known), self._parameters.pixel_sigma),
+            np.full(len(known), self._parameters.height_m),
         )
 
     def speed_m_s(self, frame: int) -> np.ndarray:
@@ -109,7 +109,7 @@ class Courses:
 
     def _usual_gap(self, frame: np.ndarray) -> float:
         """Frames between two reports; with two reports alone nothing is usual, and no gap up to gap_s is long."""
-        longest = self._knobs.gap_s * self._rate_hz / _SLACK
+        longest = self._parameters.gap_s * self._rate_hz / _SLACK
         if len(frame) < 3:
             return longest
         return float(np.median(np.diff(frame)))
@@ -123,7 +123,7 @@ class Courses:
             return reports.at(frame)
         if planned := self._planned(k, frame, past, ahead):
             return planned
-        longest = self._knobs.gap_s * self._rate_hz
+        longest = self._parameters.gap_s * self._rate_hz
         if past + ahead <= longest and (chord := reports.at(frame)):
             return chord[0], self._grown(chord[1], min(past, ahead))
         if past <= longest:
@@ -154,7 +154,7 @@ class Courses:
             return place, loose
         place = place + np.average(offsets, axis=0, weights=weights)
         # How far it strays from its plan grows with time, up to how well it keeps to it at all.
-        strayed = min(self._knobs.drift_m_s * min(past, ahead) / self._rate_hz, loose)
+        strayed = min(self._parameters.drift_m_s * min(past, ahead) / self._rate_hz, loose)
         return place, float(np.hypot(np.average(sigmas, weights=weights), strayed))
 
     def _straight_on(self, reports: _Track, last: int, frame: float) -> tuple[np.ndarray, float]:
@@ -171,4 +171,4 @@ class Courses:
         return reports.place[last] + velocity * gone, self._grown(float(reports.sigma_m[last]), abs(gone))
 
     def _grown(self, sigma_m: float, frames: float) -> float:
-        return float(np.hypot(sigma_m, self._knobs.drift_m_s * frames / self._rate_hz))
+        return float(np.hypot(sigma_m, self._parameters.drift_m_s * frames / self._rate_hz))

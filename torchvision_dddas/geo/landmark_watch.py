@@ -13,7 +13,7 @@ from torchvision_dddas.geo.plane import LEAST
 from torchvision_dddas.geo.projection import bent, project
 from torchvision_dddas.geo.solvers import ColourFinder
 from torchvision_dddas.geometry import transfer
-from torchvision_dddas.types import Colours, Detections, Fix, Landmarks, Marks, Scene
+from torchvision_dddas.types import Colours, Detections, Fix, LandmarkObservations, Landmarks, Scene
 
 REACH = 0.75
 """How far from its colour a vehicle reaches, in its lengths: its corners, and its shadow."""
@@ -95,7 +95,7 @@ class Watch:
             tuple(used[which] for which in look.marks.landmark.tolist()),
         )
 
-    def _found(self, scene: Scene, marks: Marks) -> tuple[Marks, Scene, tuple[str, ...]]:
+    def _found(self, scene: Scene, marks: LandmarkObservations) -> tuple[LandmarkObservations, Scene, tuple[str, ...]]:
         """The landmarks with their places in the picture, the scene without them, and by what each was seen."""
         assert self._follower is not None
         assert self._finder is not None
@@ -124,7 +124,7 @@ class Watch:
         marks = self._from_bodies(replace(marks, image_px=pixels), np.array([how == "motion" for how in by], bool))
         return marks, self._cut(scene, seen, length), tuple(by)
 
-    def _from_bodies(self, marks: Marks, moving: np.ndarray) -> Marks:
+    def _from_bodies(self, marks: LandmarkObservations, moving: np.ndarray) -> LandmarkObservations:
         """Blobs (n,) are of whole vehicles and their shadows; colours are at height_m, and stay as they are."""
         height = self.locator.settings.landmarks.height_m
         if not height or not moving.any():
@@ -138,15 +138,15 @@ class Watch:
 
     def _cut(self, scene: Scene, seen: Sighted, length_px: np.ndarray) -> Scene:
         """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
-        knobs = self.locator.settings.landmarks
+        parameters = self.locator.settings.landmarks
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
             return without(scene, seen.rows)
-        metre = np.nanmedian(length_px) / knobs.length_m if np.isfinite(length_px).any() else np.nan
+        metre = np.nanmedian(length_px) / parameters.length_m if np.isfinite(length_px).any() else np.nan
         least = max(self.locator.settings.small.min_area_px, LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
         found, mask = cut_out(scene.detections, scene.mask, seen.rows, seen.colour_px, REACH * length_px, least)
         return replace(scene, detections=found, mask=mask)
 
-    def _expected(self, marks: Marks, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def _expected(self, marks: LandmarkObservations, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(n, 2) where the landmarks should be, by how the frame before lay on the ground, and (n,) pixels a metre.
 
         NaN where unknown.

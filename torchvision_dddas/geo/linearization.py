@@ -7,7 +7,7 @@ import numpy as np
 from torchvision_dddas.geo.pose_estimation import Solution
 from torchvision_dddas.geo.projection import project_with_slopes
 from torchvision_dddas.geometry import slope_of_turn
-from torchvision_dddas.types import Camera, Marks
+from torchvision_dddas.types import Camera, LandmarkObservations
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Glimpse:
     used: np.ndarray
 
 
-def glimpse_of(marks: Marks, camera: Camera, used: np.ndarray, solution: Solution) -> Glimpse:
+def glimpse_of(marks: LandmarkObservations, camera: Camera, used: np.ndarray, solution: Solution) -> Glimpse:
     """The picture of one frame. The telemetry must tell all seven: a correction is then of what it says."""
     points = np.column_stack([solution.places, marks.up_m])[used]
     seen, by_pose, by_point = project_with_slopes(points, solution.pose, camera)

@@ -11,7 +11,7 @@ from torchvision_dddas.runtime import opened as open_graph
 LEAST = 4
 
 
-class OnboardSolver:
+class OnnxPlaneSolver:
     """Implements `PlaneSolver`."""
 
     name = "onboard"

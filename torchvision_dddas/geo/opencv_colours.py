@@ -8,7 +8,7 @@ import numpy as np
 _PIXELS = 1 << 17
 
 
-class OnboardColours:
+class OpenCVColourFinder:
     """Implements `ColourFinder`."""
 
     name = "onboard"

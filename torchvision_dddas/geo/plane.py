@@ -13,7 +13,7 @@ from torchvision_dddas.geo.ground_rays import by_rays
 from torchvision_dddas.geo.projection import inverse_2x2, unbent
 from torchvision_dddas.geo.terrain_intersection import Surface
 from torchvision_dddas.geometry import lonlat, transfer
-from torchvision_dddas.types import Camera, Fix, Float, Marks
+from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 
 LEAST = 4
 """Landmarks that a plane homography takes."""
@@ -24,7 +24,7 @@ VAGUE = 0.3
 
 
 class Solver(Protocol):
-    """What a back end offers to solve homographies with (vision.protocol.PlaneSolver)."""
+    """What a back end offers to solve homographies with (engine.protocol.PlaneSolver)."""
 
     def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weighted least squares."""
@@ -37,7 +37,7 @@ class Solver(Protocol):
 
 def homography_fix(
     frame: int,
-    marks: Marks,
+    marks: LandmarkObservations,
     solver: Solver,
     least_spread: float = 0.02,
     degrees: tuple[np.ndarray, tuple[float, float]] | None = None,
@@ -105,7 +105,7 @@ def too_few(frame: int, n: int, without: str = "") -> str:
     return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that are needed"
 
 
-def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
+def on_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
     """The cause of a refusal where landmarks stand on one line, or show in one spot; empty where they do not."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
@@ -118,7 +118,7 @@ def on_one_line(frame: int, marks: Marks, least_spread: float) -> str:
     )
 
 
-def width(marks: Marks) -> float:
+def width(marks: LandmarkObservations) -> float:
     """How wide landmarks lie, as a share of how long, on the ground or in the picture, whichever is less.
 
     Receivers' errors make a row on the ground wider than it is; a picture shows a row as one whatever they err.
@@ -196,7 +196,7 @@ def _no_homography(frame: int, n: int) -> str:
 
 
 def _as_printed(
-    frame: int, marks: Marks, solver: Solver, degrees: tuple[np.ndarray, tuple[float, float]] | None
+    frame: int, marks: LandmarkObservations, solver: Solver, degrees: tuple[np.ndarray, tuple[float, float]] | None
 ) -> Fix:
     """The source's solution, of raw degrees where there are any, brought to local metres; nothing of its errors."""
     n = len(marks)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchvision_dddas.config import AerialKnobs
+from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.projection import axes_of, project_with_slopes
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
-from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, Marks
+from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
 HEADING = 2
 """Which of the seven of a pose turns the heading."""
@@ -84,7 +84,7 @@ class Solution:
 def prior_of(
     flight: Flight | None,
     camera: Camera,
-    knobs: AerialKnobs,
+    parameters: AerialParameters,
     ground_up_m: float = 0.0,
     focal_known: bool = True,
 ) -> Prior | None:
@@ -101,22 +101,22 @@ def prior_of(
         return None
     sigma = np.full(7, np.inf)
     # A heading without a pitch is no more than a guess of how the camera is tilted, and so is no angle at all.
-    tilt = knobs.tilt_sigma_deg if np.isfinite(angles[1]) else knobs.tilt_guess_sigma_deg
+    tilt = parameters.tilt_sigma_deg if np.isfinite(angles[1]) else parameters.tilt_guess_sigma_deg
     sigma[:2] = np.radians(tilt)
-    sigma[2] = np.radians(knobs.heading_sigma_deg) if np.isfinite(angles[0]) else np.inf
-    sigma[3:5] = np.where(np.isfinite(place[:2]), knobs.position_sigma_m, np.inf)
+    sigma[2] = np.radians(parameters.heading_sigma_deg) if np.isfinite(angles[0]) else np.inf
+    sigma[3:5] = np.where(np.isfinite(place[:2]), parameters.position_sigma_m, np.inf)
     if np.isfinite(place[2]):
-        sigma[5] = np.hypot(knobs.altitude_sigma * flight.altitude_m, knobs.altitude_sigma_m)
-    focal, sigma[6] = _focal_of(flight.hfov_rad, camera, knobs, focal_known)
-    angles = np.where(np.isfinite(angles), angles, [0.0, np.radians(knobs.pitch_deg), 0.0])
+        sigma[5] = np.hypot(parameters.altitude_sigma * flight.altitude_m, parameters.altitude_sigma_m)
+    focal, sigma[6] = _focal_of(flight.hfov_rad, camera, parameters, focal_known)
+    angles = np.where(np.isfinite(angles), angles, [0.0, np.radians(parameters.pitch_deg), 0.0])
     pose = CameraPose(np.where(np.isfinite(place), place, 0.0), axes_of(*angles), focal)
     return Prior(pose, np.diag(1 / np.maximum(sigma, 1e-6) ** 2))
 
 
-def bare_prior(camera: Camera, knobs: AerialKnobs, focal_known: bool = True) -> Prior:
+def bare_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:
     """What is known without telemetry: the focal length."""
-    focal, sigma = _focal_of(float("nan"), camera, knobs, focal_known)
-    pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(knobs.pitch_deg), 0.0), focal)
+    focal, sigma = _focal_of(float("nan"), camera, parameters, focal_known)
+    pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(parameters.pitch_deg), 0.0), focal)
     return Prior(pose, np.diag([0.0] * 6 + [1 / max(sigma, 1e-6) ** 2]))
 
 
@@ -131,7 +131,7 @@ def expected_of(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
 
 
 def fit_pose(
-    marks: Marks,
+    marks: LandmarkObservations,
     camera: Camera,
     expected: Expected,
     start: CameraPose | None = None,
@@ -201,7 +201,7 @@ class Slopes:
 
 
 def slopes_at(
-    marks: Marks,
+    marks: LandmarkObservations,
     camera: Camera,
     expected: Expected,
     pose: CameraPose,
@@ -237,7 +237,7 @@ class _State:
 class _Problem:
     """The sum of squares: what is expected of pose and places, and where the picture shows the landmarks."""
 
-    def __init__(self, marks: Marks, camera: Camera, expected: Expected, used: np.ndarray) -> None:
+    def __init__(self, marks: LandmarkObservations, camera: Camera, expected: Expected, used: np.ndarray) -> None:
         self.marks, self.camera, self.expected, self.used = marks, camera, expected, used
         self.rows = np.arange(2 * int(used.sum()))[:, None]
         self.columns = 7 + 2 * np.repeat(np.flatnonzero(used), 2)[:, None] + [0, 1]
@@ -297,8 +297,8 @@ class _Problem:
         return _State(pose, places, cost, weighed @ missing - pull, weighed @ slopes + bent, here.correction)
 
 
-def _focal_of(hfov_rad: float, camera: Camera, knobs: AerialKnobs, known: bool) -> tuple[float, float]:
+def _focal_of(hfov_rad: float, camera: Camera, parameters: AerialParameters, known: bool) -> tuple[float, float]:
     """The focal length as a share of the camera's, and its standard deviation."""
     if np.isfinite(hfov_rad) and 0 < hfov_rad < np.pi:
-        return float(camera.size_px[0] / 2 / np.tan(hfov_rad / 2) / camera.focal_px[0]), knobs.focal_sigma
-    return 1.0, camera.focal_sigma if known else knobs.focal_guess_sigma
+        return float(camera.size_px[0] / 2 / np.tan(hfov_rad / 2) / camera.focal_px[0]), parameters.focal_sigma
+    return 1.0, camera.focal_sigma if known else parameters.focal_guess_sigma

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import GroundKnobs
+from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import straight
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
@@ -42,23 +42,23 @@ def sight(
     camera: Camera,
     poses: Poses,
     east_north_m: Float[np.ndarray, "N 2"],
-    knobs: GroundKnobs,
+    parameters: GroundParameters,
 ) -> Sightings:
     """Distance, bearing and place of people, a row a box.
 
     cut: the picture's border cuts the body, so its height tells nothing; the foot row still does where it is inside.
     poses: where the camera looked, a row a box; its place is not read but given in local metres as east_north_m.
-    Raises InputError where knobs.use asks for the foot row and the camera's height is not known.
+    Raises InputError where parameters.use asks for the foot row and the camera's height is not known.
     """
-    if knobs.use == "feet" and knobs.mode == "default" and not np.isfinite(camera.height_m):
+    if parameters.use == "feet" and parameters.mode == "default" and not np.isfinite(camera.height_m):
         raise InputError(
             f"{camera.name} has no height_m; ground.use = feet needs the camera's height above the ground. "
             "Add it, or set ground.use = height"
         )
-    if knobs.mode == "paper":
-        return _as_printed(box_px, camera, poses, east_north_m, knobs)
-    rays = _rays(box_px, cut, camera, poses, knobs)
-    inverse, share, by = _inverse_distance(rays, cut, camera, knobs)
+    if parameters.mode == "paper":
+        return _as_printed(box_px, camera, poses, east_north_m, parameters)
+    rays = _rays(box_px, cut, camera, poses, parameters)
+    inverse, share, by = _inverse_distance(rays, cut, camera, parameters)
     return _placed(rays, inverse, share, by, camera, poses, east_north_m)
 
 
@@ -86,7 +86,7 @@ class _Rays:
     feet_inside: np.ndarray
 
 
-def _rays(box_px: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, knobs: GroundKnobs) -> _Rays:
+def _rays(box_px: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, parameters: GroundParameters) -> _Rays:
     box = np.asarray(box_px, float).reshape(-1, 4)
     width, height = camera.size_px
     u = box[:, 0] + box[:, 2] / 2 - 0.5
@@ -106,10 +106,10 @@ def _rays(box_px: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, kno
     ahead_head, head = turned(y_head)
     aside = x / ahead_feet
 
-    row = np.hypot(knobs.feet_sigma * box[:, 3], PIXEL_SIGMA) / camera.focal_px[1]
-    tall = np.hypot(knobs.height_sigma * box[:, 3], PIXEL_SIGMA) / camera.focal_px[1]
+    row = np.hypot(parameters.feet_sigma * box[:, 3], PIXEL_SIGMA) / camera.focal_px[1]
+    tall = np.hypot(parameters.height_sigma * box[:, 3], PIXEL_SIGMA) / camera.focal_px[1]
     at_side = cut & ((box[:, 0] <= BORDER_PX) | (box[:, 0] + box[:, 2] >= width - BORDER_PX))
-    side = np.hypot(np.where(at_side, SIDE_SIGMA, knobs.feet_sigma) * box[:, 3], PIXEL_SIGMA) / camera.focal_px[0]
+    side = np.hypot(np.where(at_side, SIDE_SIGMA, parameters.feet_sigma) * box[:, 3], PIXEL_SIGMA) / camera.focal_px[0]
 
     d_feet, d_head, d_aside = (np.zeros((len(box), COLUMNS)) for _ in range(3))
     d_feet[:, FEET], d_head[:, FEET] = row / ahead_feet**2, row / ahead_head**2
@@ -144,13 +144,13 @@ def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 
 
 def _inverse_distance(
-    rays: _Rays, cut: np.ndarray, camera: Camera, knobs: GroundKnobs
+    rays: _Rays, cut: np.ndarray, camera: Camera, parameters: GroundParameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """1 / ahead (N,), its (N, 11) derivatives, and what told it (N,)."""
-    body, above = knobs.body_height_m, camera.height_m
+    body, above = parameters.body_height_m, camera.height_m
     by_height, by_feet = (rays.feet - rays.head) / body, rays.feet / above
-    can_height = (by_height > 0) & ~cut & (knobs.use != "feet")
-    can_feet = (by_feet > 0) & rays.feet_inside & (knobs.use != "height")
+    can_height = (by_height > 0) & ~cut & (parameters.use != "feet")
+    can_feet = (by_feet > 0) & rays.feet_inside & (parameters.use != "height")
     by = np.select([can_height & can_feet, can_height, can_feet], ["both", "height", "feet"], "bearing")
 
     d_height, d_feet = (rays.d_feet - rays.d_head) / body, rays.d_feet / above
@@ -158,7 +158,7 @@ def _inverse_distance(
     # came out too large would seem the surer.
     weighed = np.where(can_feet, by_feet, by_height)
     for _ in range(3):
-        d_height[:, BODY] = -weighed * knobs.body_height_sigma_m / body
+        d_height[:, BODY] = -weighed * parameters.body_height_sigma_m / body
         d_feet[:, HEIGHT] = -weighed * camera.height_sigma_m / above
         gap = d_height - d_feet
         weight = -(gap * d_feet).sum(axis=1) / np.maximum((gap**2).sum(axis=1), 1e-300)
@@ -167,7 +167,7 @@ def _inverse_distance(
         weighed = np.where(by == "bearing", np.nan, ours)
     share = np.where((weight == 0)[:, None], 0, weight[:, None] * d_height)
     share = share + np.where((weight == 1)[:, None], 0, (1 - weight[:, None]) * d_feet)
-    excess = np.abs(by_height - by_feet) - knobs.gate_sigmas * np.sqrt((gap**2).sum(axis=1))
+    excess = np.abs(by_height - by_feet) - parameters.gate_sigmas * np.sqrt((gap**2).sum(axis=1))
     share[:, DISPUTE] = np.where(by == "both", np.maximum(excess, 0) / 2, 0)
     # nan compares false: what is not surely fine enough is none.
     fine = (weighed > 0) & (np.sqrt((share**2).sum(axis=1)) < COARSEST * weighed)
@@ -206,11 +206,11 @@ def _placed(
 
 
 def _as_printed(
-    box_px: np.ndarray, camera: Camera, poses: Poses, east_north_m: np.ndarray, knobs: GroundKnobs
+    box_px: np.ndarray, camera: Camera, poses: Poses, east_north_m: np.ndarray, parameters: GroundParameters
 ) -> Sightings:
     """Eq. (13) to (15): the height alone, whatever the pitch, whether cut or not; nothing is known of the errors."""
     box = np.asarray(box_px, float).reshape(-1, 4)
-    distance = camera.focal_px[1] * knobs.body_height_m / box[:, 3]
+    distance = camera.focal_px[1] * parameters.body_height_m / box[:, 3]
     bearing = poses.heading_rad + np.arctan(
         (box[:, 0] + box[:, 2] / 2 - 0.5 - camera.centre_px[0]) / camera.focal_px[0]
     )

@@ -193,12 +193,14 @@ def camera_of(
             "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
             "--set aerial.mode=homography, which needs neither"
         )
-    knobs = settings.aerial
+    parameters = settings.aerial
     wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
-    hfov = float(np.median(wide)) if len(wide) else math.radians(knobs.hfov_deg)
+    hfov = float(np.median(wide)) if len(wide) else math.radians(parameters.hfov_deg)
     focal = size[0] / 2 / math.tan(hfov / 2)
-    made = Camera("camera", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2), focal_sigma=knobs.focal_sigma)
-    if len(wide) or knobs.mode != "pose":
+    made = Camera(
+        "camera", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2), focal_sigma=parameters.focal_sigma
+    )
+    if len(wide) or parameters.mode != "pose":
         return made, bool(len(wide)), []
-    note = f"neither a camera's file nor telemetry says the field of view: {knobs.hfov_deg:g} degrees were taken for it"
+    note = f"neither the camera file nor telemetry gives the field of view: using {parameters.hfov_deg:g} degrees"
     return made, False, [f"{note} (aerial.hfov_deg)"]

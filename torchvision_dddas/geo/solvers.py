@@ -40,20 +40,20 @@ class ColourFinder(Protocol):
 def load_solver(backend: str) -> PlaneSolver:
     """What solves plane homographies, on the engine that `wants_torch` names. Raises InputError as it does."""
     if not wants_torch(backend):
-        from torchvision_dddas.geo.onnx_plane import OnboardSolver
+        from torchvision_dddas.geo.onnx_plane import OnnxPlaneSolver
 
-        return OnboardSolver()
-    from torchvision_dddas.geo.torch_plane import TorchSolver
+        return OnnxPlaneSolver()
+    from torchvision_dddas.geo.torch_plane import TorchPlaneSolver
 
-    return TorchSolver()
+    return TorchPlaneSolver()
 
 
 def load_colours(backend: str) -> ColourFinder:
     """What finds colours, on the engine that `wants_torch` names. Raises InputError as it does."""
     if not wants_torch(backend):
-        from torchvision_dddas.geo.opencv_colours import OnboardColours
+        from torchvision_dddas.geo.opencv_colours import OpenCVColourFinder
 
-        return OnboardColours()
-    from torchvision_dddas.geo.torch_colours import TorchColours
+        return OpenCVColourFinder()
+    from torchvision_dddas.geo.torch_colours import TorchColourFinder
 
-    return TorchColours()
+    return TorchColourFinder()

@@ -8,13 +8,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_locator import Locator, Targets, chosen_rows
 from torchvision_dddas.geo.plane import LEAST, width
 from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.types import Grounded, Landmarks
+from torchvision_dddas.types import AerialLocations, Landmarks
 
 OUTSIDE = 0.25
 """A landmark or a target may show so far beyond the picture's edge, as a share of the picture's side."""
 
 
-def locate(table: DetectionTable, locator: Locator) -> Iterator[Grounded]:
+def locate(table: DetectionTable, locator: Locator) -> Iterator[AerialLocations]:
     """Where the targets of a table stand, in each of its frames and in those between that show landmarks."""
     lasting = table.identity > 0 if table.identity is not None else np.zeros(len(table), bool)
     score = np.clip(table.score, 0, 1) if table.probable else np.ones(len(table))
@@ -44,10 +44,10 @@ def check_table(table: DetectionTable, locator: Locator) -> None:
     That is: no place in a picture, one far outside of it, no frame in common, and, without telemetry, fewer than four
     landmarks in every frame or all of them on one line.
     """
-    site, knobs = locator.site, locator.settings.aerial
+    site, parameters = locator.site, locator.settings.aerial
     path = site.landmarks.path
     seen = np.isfinite(site.landmarks.image_px).all(axis=1)
-    helped = site.telemetry is not None and knobs.mode == "pose"
+    helped = site.telemetry is not None and parameters.mode == "pose"
     if not seen.any():
         raise InputError(f"landmarks {path} say no places in pictures; wanted columns u_px,v_px beside the places")
     _check_pictured(locator)
@@ -72,7 +72,7 @@ def check_table(table: DetectionTable, locator: Locator) -> None:
             f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
         )
     enough = [k for k, count in enumerate(counts.tolist()) if count >= LEAST]
-    if all(width(marks[k]) < knobs.least_spread for k in enough):
+    if all(width(marks[k]) < parameters.least_spread for k in enough):
         raise InputError(
             f"the {counts[enough[0]]} landmarks of frame {frames[enough[0]]} lie on one line, as in all others; "
             "give --telemetry, or a landmark away from it"

@@ -6,7 +6,7 @@ import torch
 from torchvision_dddas.functional import hsv
 
 
-class TorchColours:
+class TorchColourFinder:
     """Implements `ColourFinder`."""
 
     name = "torch"

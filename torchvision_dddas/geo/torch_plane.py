@@ -6,7 +6,7 @@ import torch
 from torchvision_dddas.functional import homography
 
 
-class TorchSolver:
+class TorchPlaneSolver:
     """Implements `PlaneSolver`."""
 
     name = "torch"

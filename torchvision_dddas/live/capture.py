@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from torchvision_dddas.config import LiveKnobs
+from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.io.sources import Problem, open_source
 from torchvision_dddas.io.stream_capture import OpenedStream, Stream, target_of, without_secrets
 from torchvision_dddas.live.capture_log import Diary
@@ -41,7 +41,7 @@ class LiveSource:
     def __init__(
         self,
         spec: str,
-        knobs: LiveKnobs | None = None,
+        parameters: LiveParameters | None = None,
         health: Health | None = None,
         *,
         rate_hz: float | None = None,
@@ -52,8 +52,8 @@ class LiveSource:
         """spec, rate_hz, full_scale: as `open_source` takes them. opener: opens the stream in place of OpenCV."""
         text = str(spec)
         self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
-        self.knobs, self.health, self._clock = knobs or LiveKnobs(), health or Health(), clock or Clock()
-        self._inbox = Inbox(self.knobs.queue_frames, self.health, self._clock)
+        self.parameters, self.health, self._clock = parameters or LiveParameters(), health or Health(), clock or Clock()
+        self._inbox = Inbox(self.parameters.queue_frames, self.health, self._clock)
         self._diary = Diary(self.health, self._clock)
         told = (self._inbox, self._diary, self.health, self._clock)
         target = target_of(text)
@@ -61,14 +61,14 @@ class LiveSource:
         self.recorded: int | None = None
         if opener is None and target is None:
             recording = open_source(text, rate_hz=rate_hz, full_scale=full_scale)
-            self._feed = Player(recording, self.knobs.pace, *told)
+            self._feed = Player(recording, self.parameters.pace, *told)
             self.rate_hz, self.size = recording.rate_hz, recording.size
             self.recorded = recording.count if recording.exact else None
             return
-        limit_s = self.knobs.stall_s
+        limit_s = self.parameters.stall_s
         where = text if target is None else target
         opening = opener or (lambda: OpenedStream(where, self.name, (OPENING * limit_s, limit_s)))
-        self._feed = Receiver(self.name, opening, rate_hz, self.knobs, *told)
+        self._feed = Receiver(self.name, opening, rate_hz, self.parameters, *told)
         self.rate_hz, self.size = self._feed.rate_hz, self._feed.size
 
     @property

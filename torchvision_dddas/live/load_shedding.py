@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.control import rules as control
 from torchvision_dddas.live.clock import Clock
 from torchvision_dddas.live.health import Health
@@ -73,13 +73,13 @@ class Shedding:
 
     def _change(self, moved: tuple[Adjustment, ...], number: int) -> None:
         rung = control.rungs(self._base, self._people)[self.load.rung]
-        self.settings = with_knobs(
+        self.settings = with_parameters(
             self._base, {name: value for name, value in rung.items() if name != control.SAMPLING}
         )
         self._source.look_at(int(rung[control.SAMPLING]))
         self._costs.clear()  # what was measured is no longer so
         self._show(rung)
-        words = ", ".join(f"{a.knob} {a.old:g} -> {a.new:g}" for a in moved)
+        words = ", ".join(f"{a.parameter} {a.old:g} -> {a.new:g}" for a in moved)
         self._health.event("load", f"{words}: {moved[0].cause}", number)
 
     def _show(self, rung: dict[str, float]) -> None:

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from torchvision_dddas.config import LiveKnobs
+from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.stream_capture import Stream, first_picture, scaled
 from torchvision_dddas.live.capture_log import Diary
@@ -48,20 +48,20 @@ class Receiver:
         name: str,
         opener: Callable[[], Stream],
         rate_hz: float | None,
-        knobs: LiveKnobs,
+        parameters: LiveParameters,
         inbox: Inbox,
         diary: Diary,
         health: Health,
         clock: Clock,
     ) -> None:
         self.name, self.rate_hz, self.size = name, rate_hz or 0.0, (0, 0)
-        self._opener, self._knobs, self._inbox, self._diary = opener, knobs, inbox, diary
+        self._opener, self._parameters, self._inbox, self._diary = opener, parameters, inbox, diary
         self._health, self._clock = health, clock
         self._failure: InputError | None = None
         self._ready = False
         self._turn = 0  # of the thread that counts
         self._call: tuple[float, float] | None = None  # since when it is in the driver, and how long it may be
-        self._pause_s = knobs.retry_s
+        self._pause_s = parameters.retry_s
         self._lost_s: float | None = None
         self._tries = 0
         self._start_s = float("nan")
@@ -96,11 +96,11 @@ class Receiver:
                 self._call = self._at_work = None
                 self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
             elif self._at_work is not None and self._at_work.is_alive():
-                return now_s + self._knobs.stall_s
+                return now_s + self._parameters.stall_s
             self.threads = [thread for thread in self.threads if thread.is_alive()]
             if len(self.threads) < _MOST_HUNG:
                 self._spawn()
-            return now_s + self._knobs.stall_s
+            return now_s + self._parameters.stall_s
 
     # -- beginning ---------------------------------------------------------------------------------------------------
 
@@ -111,7 +111,7 @@ class Receiver:
         thread.start()
 
     def _await_first(self) -> None:
-        allowed_s = 2 * _GRACE * OPENING * self._knobs.stall_s
+        allowed_s = 2 * _GRACE * OPENING * self._parameters.stall_s
         with self._inbox.changed:
             until_s = self._clock.now() + allowed_s
             while not self._ready and self._failure is None:
@@ -141,7 +141,7 @@ class Receiver:
             while not self._inbox.closed and turn == self._turn:
                 if self._ready:
                     self._inbox.sleep(self._clock.now() + self._pause_s)
-                    self._pause_s = min(2 * self._pause_s, self._knobs.retry_most_s)
+                    self._pause_s = min(2 * self._pause_s, self._parameters.retry_most_s)
                     if self._inbox.closed or turn != self._turn:
                         return
                 self._connected(turn)
@@ -178,8 +178,8 @@ class Receiver:
             if stream is not None:
                 with self._driver(turn):
                     stream.release()
-        if self._clock.now() - since_s > max(self._knobs.stall_s, self._pause_s):
-            self._pause_s = self._knobs.retry_s  # it held
+        if self._clock.now() - since_s > max(self._parameters.stall_s, self._pause_s):
+            self._pause_s = self._parameters.retry_s  # it held
         if not self._inbox.closed:
             self._lost(why)
 
@@ -188,7 +188,7 @@ class Receiver:
         """A call that may never return."""
         with self._inbox.changed:
             if turn == self._turn:
-                self._call = (self._clock.now(), _GRACE * times * self._knobs.stall_s)
+                self._call = (self._clock.now(), _GRACE * times * self._parameters.stall_s)
         try:
             yield
         finally:
@@ -209,14 +209,14 @@ class Receiver:
             if not came:
                 failed += 1
                 # A driver's own limit may pass again and again: one is enough.
-                if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._knobs.stall_s:
+                if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._parameters.stall_s:
                     return "it sends no more pictures"
                 continue
             failed, came_s = 0, self._clock.now()
             taken_s = came_s
             if self._picture(stream, taken_s):
                 good_s = taken_s
-            elif taken_s - good_s > self._knobs.stall_s:
+            elif taken_s - good_s > self._parameters.stall_s:
                 return f"none of its pictures could be decoded for {taken_s - good_s:.1f} s"
         return ""
 
@@ -258,7 +258,7 @@ class Receiver:
             self._diary.tell(f"{what}: they are left out", topic="size")
         # One is a slip; a camera that was set otherwise is another matter, as long as it shows the same.
         same = abs(image.shape[1] * height - image.shape[0] * width) <= 0.02 * image.shape[1] * height
-        if taken_s - self._odd[1] < self._knobs.stall_s or not same:
+        if taken_s - self._odd[1] < self._parameters.stall_s or not same:
             return None
         self._diary.tell(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
         return scaled(image, self.size)

@@ -12,7 +12,7 @@ from torchvision_dddas.io.telemetry import at
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.pipeline import Clip
-from torchvision_dddas.types import Followed, Frame, Surveyed, Telemetry
+from torchvision_dddas.types import Frame, FrameResult, Telemetry, TrackedFrame
 
 _IN_VAIN = 25
 """So many new beginnings in a row without any result are enough: it would go on like this for ever."""
@@ -44,7 +44,7 @@ class Stream(Protocol):
         """As the user wrote it."""
         ...
 
-    def write(self, surveyed: Surveyed | None, people: Followed | None = None) -> None:
+    def write(self, surveyed: FrameResult | None, people: TrackedFrame | None = None) -> None:
         """Send a frame."""
 
 
@@ -118,7 +118,7 @@ class Feed:
             self._health.event("telemetry", f"telemetry is {words}", frame.number)
 
 
-Result = tuple[Surveyed, Followed | None]
+Result = tuple[FrameResult, TrackedFrame | None]
 """A frame, and the people in it; None where nobody is looked for."""
 
 
@@ -140,7 +140,7 @@ class _Renumbered:
     def anew(self) -> None:
         self._before = list(self._highest)
 
-    def _known(self, kind: int, followed: Followed) -> Followed:
+    def _known(self, kind: int, followed: TrackedFrame) -> TrackedFrame:
         before, tracks = self._before[kind], followed.tracks
         self._highest[kind] = max(self._highest[kind], before + int(tracks.identity.max(initial=0)))
         return replace(followed, tracks=replace(tracks, identity=tracks.identity + before)) if before else followed

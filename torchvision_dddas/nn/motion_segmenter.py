@@ -1,7 +1,7 @@
-"""What moves, softly: from differences of registered pictures to a mask with a gradient in the knobs.
+"""What moves, softly: from differences of registered pictures to a mask with a gradient in the parameters.
 
-Up to the differences no knob that can be tuned has a say: registration, warps and exposure are done once, hard. After
-them every step is that of the hard pipeline, by the same functions of `ops`:
+Up to the differences no parameter that can be tuned has a say: registration, warps and exposure are done once, hard.
+After them every step is that of the hard pipeline, by the same functions of `ops`:
 
     noise units -> blur -> largest over the pairs -> margin over the threshold -> erode -> close -> soft threshold
 
@@ -33,7 +33,7 @@ Values = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Differences:
-    """A batch of windows as far as no tunable knob has a say.
+    """A batch of windows as far as no tunable parameter has a say.
 
     least: (B, P, H, W) uint8, the difference that both neighbours of each near pair show, grey levels. both: where both
     are seen. texture: (B, 1, H, W), 4 x grey levels a pixel, and textured: where it is enough to tell how well the
@@ -80,30 +80,30 @@ class SoftMotion(nn.Module):
 
     def __init__(self, settings: Settings, whole: bool = True) -> None:
         super().__init__()
-        self.knobs = settings
+        self.settings = settings
         self.whole = whole
 
     def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
         """The core mask. values: by name, those that are tuned. softness: a share of the settings' threshold."""
-        threshold = self._knob("difference.threshold", values)
+        threshold = self._parameter("difference.threshold", values)
         evidence = self.evidence(differences, values)
         margin = evidence - threshold
         margin = sizes.between(
-            self._knob("morphology.erode_px", values), lambda side: extremum.erode(margin, side, "ellipse")
+            self._parameter("morphology.erode_px", values), lambda side: extremum.erode(margin, side, "ellipse")
         )
         eroded = margin
         margin = sizes.between(
-            self._knob("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
+            self._parameter("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
         )
-        return Core(step(margin, softness * self.knobs.difference.threshold), margin, evidence)
+        return Core(step(margin, softness * self.settings.difference.threshold), margin, evidence)
 
     def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
         """The largest difference over the near pairs, in noise units or grey levels."""
-        normalized = self.knobs.difference.kind == "normalized"
+        normalized = self.settings.difference.kind == "normalized"
         weight: Tensor | None = None
         if normalized:
-            noise_levels = self._knob("difference.noise_levels", values)
-            gradient_share = self._knob("difference.gradient_share", values)
+            noise_levels = self._parameter("difference.noise_levels", values)
+            gradient_share = self._parameter("difference.gradient_share", values)
             weight = difference.noise_weight(differences.texture, noise_levels, gradient_share) * differences.steps
         largest: Tensor | None = None
         for k in range(differences.least.shape[1]):
@@ -124,8 +124,8 @@ class SoftMotion(nn.Module):
             core.evidence,
             found.near,
             found.count,
-            self._knob("gates.min_area_px", values),
-            self._knob("difference.peak", values),
+            self._parameter("gates.min_area_px", values),
+            self._parameter("difference.peak", values),
             softness,
         )
         drawn = core.mask * regions.of_pixels(gate, found.near)
@@ -133,11 +133,11 @@ class SoftMotion(nn.Module):
         carried = (core.margin <= 0) | (found.filled != found.near)
         return torch.maximum(drawn, regions.of_pixels(gate, found.filled) * carried)
 
-    def _knob(self, name: str, values: Values) -> float | Tensor:
+    def _parameter(self, name: str, values: Values) -> float | Tensor:
         if name in values:
             return values[name]
         group, key = name.split(".")
-        return float(getattr(getattr(self.knobs, group), key))
+        return float(getattr(getattr(self.settings, group), key))
 
     def _blurred(self, levels: Tensor, values: Values) -> Tensor:
         def of_size(side: int) -> Tensor:
@@ -146,7 +146,7 @@ class SoftMotion(nn.Module):
             smooth = blur.gaussian(levels, side)
             return passing.through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
 
-        return sizes.between(self._knob("difference.blur_px", values), of_size, pitch=2)
+        return sizes.between(self._parameter("difference.blur_px", values), of_size, pitch=2)
 
     def _in_units(self, z: Tensor, textured: Tensor, steps: float) -> Tensor:
         """Evidence by its median over textured pixels, where that is above one noise unit."""

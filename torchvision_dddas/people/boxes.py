@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.people.suppression import group, nms, settled
 from torchvision_dddas.types import Float, People
 
 # A body that comes so near to the picture's border, in its own heights, may be cut by it: twice what foot rows miss by.
 _NEAR = 0.05
 
-# Arrays here, tensors where knobs are tuned by gradient: one formula for both.
+# Arrays here, tensors where parameters are tuned by gradient: one formula for both.
 Column = Any
 Share = Any
 
@@ -20,28 +20,28 @@ def people_of(
     window_px: Float[np.ndarray, "N 4"],
     margin: Float[np.ndarray, " N"],
     size: tuple[int, int],
-    knobs: PeopleKnobs,
+    parameters: PeopleParameters,
 ) -> People:
     """The people whom windows show, best first. size: (width, height) of the picture."""
     window_px, margin = np.asarray(window_px, float).reshape(-1, 4), np.asarray(margin, float)
-    if knobs.suppression == "nms":
-        kept = nms(body(window_px, knobs), margin, knobs.overlap, knobs.contained)
+    if parameters.suppression == "nms":
+        kept = nms(body(window_px, parameters), margin, parameters.overlap, parameters.contained)
         # The best windows are the best placed ones: cubed, so that those that hardly passed say little.
-        window_px = settled(window_px, (margin - knobs.threshold) ** 3, kept, knobs.settle)
+        window_px = settled(window_px, (margin - parameters.threshold) ** 3, kept, parameters.settle)
         margin = margin[kept]
     else:
-        if knobs.suppression == "opencv":
-            window_px, margin = group(window_px, margin, knobs.group, knobs.group_distance)
+        if parameters.suppression == "opencv":
+            window_px, margin = group(window_px, margin, parameters.group, parameters.group_distance)
         order = np.argsort(-margin, kind="stable")
         window_px, margin = window_px[order], margin[order]
-    box_px = body(window_px, knobs)
-    return People(box_px, probability(margin, knobs), margin, cut(box_px, size), window_px)
+    box_px = body(window_px, parameters)
+    return People(box_px, probability(margin, parameters), margin, cut(box_px, size), window_px)
 
 
-def body(window_px: Float[np.ndarray, "N 4"], knobs: PeopleKnobs) -> Float[np.ndarray, "N 4"]:
+def body(window_px: Float[np.ndarray, "N 4"], parameters: PeopleParameters) -> Float[np.ndarray, "N 4"]:
     """The body's box in a window, by ratios that were calibrated on true boxes."""
     x, y, width, height = window_px.T
-    sides = body_sides(x, y, width, height, knobs.height_share, knobs.width_share, knobs.feet_share)
+    sides = body_sides(x, y, width, height, parameters.height_share, parameters.width_share, parameters.feet_share)
     return np.stack(sides, axis=1)
 
 
@@ -53,9 +53,11 @@ def body_sides(
     return x + (width - wide) / 2, y + feet_share * height - tall, wide, tall
 
 
-def probability(margin: Float[np.ndarray, " N"], knobs: PeopleKnobs) -> Float[np.ndarray, " N"]:
+def probability(margin: Float[np.ndarray, " N"], parameters: PeopleParameters) -> Float[np.ndarray, " N"]:
     """That a window of this score shows a person (Platt scaling)."""
-    return 1 / (1 + np.exp(-np.clip(log_odds(margin, knobs.probability_slope, knobs.probability_even), -50, 50)))
+    return 1 / (
+        1 + np.exp(-np.clip(log_odds(margin, parameters.probability_slope, parameters.probability_even), -50, 50))
+    )
 
 
 def log_odds(margin: Column, slope: Share, even: Share) -> Column:

@@ -13,7 +13,7 @@ from torchvision_dddas.types import LinearSvm
 SHIPPED = {"opencv": Path(__file__).parents[1] / "models" / "opencv_people.txt"}
 
 Layout = Mapping[str, object]
-"""What a file may say of the descriptor it was trained on: the keys of `PeopleKnobs.descriptor`, all or some."""
+"""What a file may say of the descriptor it was trained on: the keys of `PeopleParameters.descriptor`, all or some."""
 
 _KNOBS = {
     "window": "people.window_width_px and people.window_height_px",
@@ -32,9 +32,9 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
     """The classifier of a shipped name, or of a file; features: the length of the descriptor it must fit.
 
     Files: text (numbers apart by blanks, commas or lines; `#` begins a comment), .npy, .npz (weights, bias, and any of
-    the keys of `PeopleKnobs.descriptor`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor with its
-    SVMDetector, or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the descriptor in
-    use, which must be the one that the file tells of, if it does.
+    the keys of `PeopleParameters.descriptor`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor
+    with its SVMDetector, or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the
+    descriptor in use, which must be the one that the file tells of, if it does.
     Raises InputError: no such file, not readable, another length (with both), another descriptor, not finite numbers.
     """
     path = SHIPPED.get(str(name), Path(name))
@@ -74,11 +74,11 @@ def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
 
 
 def _agree(told: Layout, wanted: Layout, path: Path) -> None:
-    for name, knob in _KNOBS.items():
+    for name, parameter in _KNOBS.items():
         if name in told and name in wanted and not _same(told[name], wanted[name]):
             raise InputError(
                 f"classifier {path} was trained with a {name} of {_shown(told[name], wanted[name])}, the "
-                f"settings say {_shown(wanted[name], wanted[name])}; change {knob}"
+                f"settings say {_shown(wanted[name], wanted[name])}; change {parameter}"
             )
 
 

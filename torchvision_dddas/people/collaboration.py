@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.config import ConfirmKnobs, GroundKnobs, PeopleKnobs
+from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters
 from torchvision_dddas.geometry import shared_px
 from torchvision_dddas.people.pyramid import smallest_body_px
 from torchvision_dddas.types import Bool, Camera, Float
@@ -41,7 +41,7 @@ class View:
 
 
 def view_of(
-    camera: Camera, east_north_m: np.ndarray, heading_rad: float, people: PeopleKnobs, ground: GroundKnobs
+    camera: Camera, east_north_m: np.ndarray, heading_rad: float, people: PeopleParameters, ground: GroundParameters
 ) -> View:
     """The view of a camera that stands at a place, by the body heights in pixels that the people settings can find."""
     height_m, (width_px, height_px) = ground.body_height_m, camera.size_px
@@ -84,7 +84,7 @@ def look(
     person_m2: Float[np.ndarray, "M 2 2"],
     score: Float[np.ndarray, "M"],
     views: Sequence[View],
-    knobs: ConfirmKnobs,
+    parameters: ConfirmParameters,
 ) -> Look:
     """One frame on the ground: places and covariances (NaN: unknown) of the blobs and of one vehicle's people.
 
@@ -92,16 +92,16 @@ def look(
     improbable people, or those of another blob, is in doubt. views: of the cameras that found these people.
     """
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
-    blob_m2, person_m2 = (_known(covariance, knobs) for covariance in (blob_m2, person_m2))
+    blob_m2, person_m2 = (_known(covariance, parameters) for covariance in (blob_m2, person_m2))
     apart = person_m[None] - blob_m[:, None]
     # A micrometre at least: where nothing is unsure, no distance could be told in standard deviations.
-    both = blob_m2[:, None] + person_m2[None] + max(knobs.spread_m, 1e-6) ** 2 * np.eye(2)
+    both = blob_m2[:, None] + person_m2[None] + max(parameters.spread_m, 1e-6) ** 2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
-    inside = sigmas <= math.sqrt(-2 * math.log(1 - knobs.gate_probability))  # chi-square of two degrees of freedom
-    people, best = _assigned(sigmas, inside, score, knobs)
+    inside = sigmas <= math.sqrt(-2 * math.log(1 - parameters.gate_probability))  # chi-square of two degrees of freedom
+    people, best = _assigned(sigmas, inside, score, parameters)
     clear = np.zeros(len(blob_m), bool)
     for view in views:
-        clear |= _well_within(blob_m, blob_m2, view, knobs) & ~_hidden(blob_m, person_m, view, knobs)
+        clear |= _well_within(blob_m, blob_m2, view, parameters) & ~_hidden(blob_m, person_m, view, parameters)
     nearest_m = np.linalg.norm(apart, axis=-1).min(axis=1, initial=np.inf)
     nearest_sigmas = sigmas.min(axis=1, initial=np.inf)
     return Look((people > 0) | (clear & ~inside.any(axis=1)), people, nearest_m, nearest_sigmas, best)
@@ -111,7 +111,7 @@ def confirm_boxes(
     blob_px: Float[np.ndarray, "N 4"],
     person_px: Float[np.ndarray, "M 4"],
     score: Float[np.ndarray, "M"],
-    knobs: ConfirmKnobs,
+    parameters: ConfirmParameters,
     least_px: float = 0.0,
     aspect: float = 0.4,
 ) -> Look:
@@ -124,8 +124,8 @@ def confirm_boxes(
     blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
     common = shared_px(blob_px[:, None], person_px)
     areas = blob_px[:, None, 2:].prod(axis=-1), person_px[:, 2:].prod(axis=-1)
-    inside = common >= knobs.share * np.minimum(*areas)
-    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, knobs)
+    inside = common >= parameters.share * np.minimum(*areas)
+    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, parameters)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
     unknown = np.full(len(blob_px), np.nan)
     places = np.maximum(blob_px[:, 2] / np.maximum(aspect * blob_px[:, 3], 1e-9), 1.0)
@@ -139,24 +139,24 @@ class Beliefs:
     Two looks of one vehicle at one target err alike, so all but the first weigh `fresh` only.
     """
 
-    knobs: ConfirmKnobs
+    parameters: ConfirmParameters
     _odds: dict[Hashable, float] = field(default_factory=dict)
     _seen: set[tuple[Hashable, Hashable]] = field(default_factory=set)
 
     def add(self, targets: Sequence[Hashable], looks: Iterable[tuple[Hashable, Look]]) -> None:
         """Learn from the looks, (vehicle, look), of one frame; targets: the name of each row."""
         for vehicle, seen in looks:
-            weights = evidence(seen, self.knobs)
+            weights = evidence(seen, self.parameters)
             for row in np.flatnonzero(seen.looked).tolist():
                 key = targets[row]
-                weight = self.knobs.fresh if (vehicle, key) in self._seen else 1.0
+                weight = self.parameters.fresh if (vehicle, key) in self._seen else 1.0
                 self._seen.add((vehicle, key))
-                odds = self._odds.get(key, _log_odds(self.knobs.prior)) + weight * weights[row]
-                self._odds[key] = float(np.clip(odds, -self.knobs.limit, self.knobs.limit))
+                odds = self._odds.get(key, _log_odds(self.parameters.prior)) + weight * weights[row]
+                self._odds[key] = float(np.clip(odds, -self.parameters.limit, self.parameters.limit))
 
     def probability(self, target: Hashable) -> float:
         """That a target is human; the prior where nothing was seen of it."""
-        return 1 / (1 + math.exp(-self._odds.get(target, _log_odds(self.knobs.prior))))
+        return 1 / (1 + math.exp(-self._odds.get(target, _log_odds(self.parameters.prior))))
 
     def kind(self, target: Hashable) -> str:
         """human, not_human or unseen."""
@@ -165,38 +165,38 @@ class Beliefs:
         return HUMAN if self.probability(target) >= 0.5 else NOT_HUMAN
 
 
-def evidence(seen: Look, knobs: ConfirmKnobs) -> Float[np.ndarray, "N"]:
+def evidence(seen: Look, parameters: ConfirmParameters) -> Float[np.ndarray, "N"]:
     """What a look adds to the log-odds, (N,); 0 without a look.
 
     With d and f the detection and false-alarm rates: ln (1 - d)/(1 - f) where nobody is; for a person the odds of their
     own probability, and ln d/f at most: a probability of 1 is no proof. Each further place in a blob as wide as several
     people where nobody is says ln (1 - c d)/(1 - f), c = crowd_share: one chance hit makes no crowd of a car.
     """
-    d, f = knobs.detection_rate, knobs.false_rate
+    d, f = parameters.detection_rate, parameters.false_rate
     sure = 1 / (1 + f / d)  # the probability whose odds are d/f
     best = np.clip(seen.best, 0.5, max(sure, 0.5))
     first = np.where(seen.people > 0, np.log(best / (1 - best)), math.log((1 - d) / (1 - f)))
     places = np.ones(len(best)) if seen.places is None else seen.places
     empty = np.maximum(places - np.maximum(seen.people, 1), 0)
-    return np.where(seen.looked, first + empty * min(math.log((1 - knobs.crowd_share * d) / (1 - f)), 0.0), 0.0)
+    return np.where(seen.looked, first + empty * min(math.log((1 - parameters.crowd_share * d) / (1 - f)), 0.0), 0.0)
 
 
 def _log_odds(probability: float) -> float:
     return math.log(probability / (1 - probability))
 
 
-def _known(covariance_m2: np.ndarray, knobs: ConfirmKnobs) -> np.ndarray:
+def _known(covariance_m2: np.ndarray, parameters: ConfirmParameters) -> np.ndarray:
     """(N, 2, 2), with the stated standard deviation where nothing is known."""
     covariance_m2 = np.asarray(covariance_m2, float).reshape(-1, 2, 2)
     unknown = ~np.isfinite(covariance_m2).all(axis=(1, 2), keepdims=True)
-    return np.where(unknown, knobs.unknown_sigma_m**2 * np.eye(2), covariance_m2)
+    return np.where(unknown, parameters.unknown_sigma_m**2 * np.eye(2), covariance_m2)
 
 
 def _assigned(
     distance: Float[np.ndarray, "N M"],
     inside: Bool[np.ndarray, "N M"],
     score: Float[np.ndarray, "M"],
-    knobs: ConfirmKnobs,
+    parameters: ConfirmParameters,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each person to the nearest blob whose gate they are in: (N,) probable people, (N,) the highest score of any."""
     blobs = len(distance)
@@ -206,12 +206,14 @@ def _assigned(
     ours = inside.any(axis=0)
     nearest = np.where(inside, distance, np.inf).argmin(axis=0)[ours]
     known = np.nan_to_num(np.asarray(score, float)[ours], nan=1.0)
-    np.add.at(people, nearest[known >= knobs.least_score], 1)
+    np.add.at(people, nearest[known >= parameters.least_score], 1)
     np.maximum.at(best, nearest, known)
     return people, best
 
 
-def _well_within(blob_m: np.ndarray, blob_m2: np.ndarray, view: View, knobs: ConfirmKnobs) -> Bool[np.ndarray, "N"]:
+def _well_within(
+    blob_m: np.ndarray, blob_m2: np.ndarray, view: View, parameters: ConfirmParameters
+) -> Bool[np.ndarray, "N"]:
     """Whether a blob is `inside_sigmas` of its own and of the camera's standard deviations within a view."""
     apart = blob_m - view.east_north_m
     distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
@@ -224,7 +226,7 @@ def _well_within(blob_m: np.ndarray, blob_m2: np.ndarray, view: View, knobs: Con
     bearing = np.arctan2(along[:, 0], along[:, 1]) - view.heading_rad
     off = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
     angle = np.hypot(np.arctan2(lateral, distance), view.heading_sigma_rad)
-    k = knobs.inside_sigmas
+    k = parameters.inside_sigmas
     return (
         (off + k * angle <= view.half_rad)
         & (distance - k * radial >= view.near_m)
@@ -232,7 +234,9 @@ def _well_within(blob_m: np.ndarray, blob_m2: np.ndarray, view: View, knobs: Con
     )
 
 
-def _hidden(blob_m: np.ndarray, person_m: np.ndarray, view: View, knobs: ConfirmKnobs) -> Bool[np.ndarray, "N"]:
+def _hidden(
+    blob_m: np.ndarray, person_m: np.ndarray, view: View, parameters: ConfirmParameters
+) -> Bool[np.ndarray, "N"]:
     """Whether another blob or a person stands before a blob, nearer the camera by a body's width at least."""
     apart = blob_m - view.east_north_m
     distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
@@ -240,5 +244,5 @@ def _hidden(blob_m: np.ndarray, person_m: np.ndarray, view: View, knobs: Confirm
     others = np.concatenate([blob_m, person_m]) - view.east_north_m
     ahead = along @ others.T
     aside = np.abs(along[:, :1] * others[:, 1] - along[:, 1:] * others[:, 0])
-    before = (ahead > 0) & (ahead < distance[:, None] - knobs.body_width_m) & (aside < knobs.body_width_m)
+    before = (ahead > 0) & (ahead < distance[:, None] - parameters.body_width_m) & (aside < parameters.body_width_m)
     return before.any(axis=1)

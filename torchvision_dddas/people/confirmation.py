@@ -12,7 +12,7 @@ from torchvision_dddas.io.camera_files import PoseTable, poses_at
 from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.people.collaboration import Beliefs, Look, View, confirm_boxes, look, view_of
 from torchvision_dddas.people.pyramid import smallest_body_px
-from torchvision_dddas.types import Camera, Confirmed, Positions
+from torchvision_dddas.types import Camera, Confirmation, Positions
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def confirm_positions(
     interval: int = 1,
     lasting: bool = True,
     rate_hz: float | None = None,
-) -> Iterator[Confirmed]:
+) -> Iterator[Confirmation]:
     """Blobs and people on the ground. The vehicles looked at frames 1, 1 + interval, ...
 
     lasting: whether a target's number is an identity, so that looks add up over frames.
@@ -67,11 +67,13 @@ def confirm_positions(
 
 def confirm_pictures(
     blobs: DetectionTable, people: Sequence[DetectionTable], names: Sequence[str], settings: Settings, interval: int = 1
-) -> Iterator[Confirmed]:
+) -> Iterator[Confirmation]:
     """Blobs and people of the same pictures, as `dddas people` found them at frames 1, 1 + interval, ..."""
-    knobs = settings.people
-    least_px = smallest_body_px(knobs)
-    aspect = knobs.width_share * knobs.window_width_px / (knobs.height_share * knobs.window_height_px)
+    parameters = settings.people
+    least_px = smallest_body_px(parameters)
+    aspect = (
+        parameters.width_share * parameters.window_width_px / (parameters.height_share * parameters.window_height_px)
+    )
 
     def looks(frame: int, rows: slice) -> Iterator[tuple[str, Look]]:
         for name, table in zip(names, people, strict=True):
@@ -90,7 +92,7 @@ def _frames(
     looks: Callable[[int, slice], Iterator[tuple[str, Look]]],
     settings: Settings,
     interval: int,
-) -> Iterator[Confirmed]:
+) -> Iterator[Confirmation]:
     beliefs = Beliefs(settings.confirm)
     for number in np.unique(frame).tolist():
         rows = _rows(frame, number)
@@ -108,7 +110,7 @@ def _frames(
 
 def confirmed_by(
     number: int, rows: slice, targets: Sequence[Hashable], beliefs: Beliefs, seen: Sequence[tuple[str, Look]]
-) -> Confirmed:
+) -> Confirmation:
     """What is believed of the targets of a frame. rows: their places in their table; seen: who looked in this frame."""
     count = len(targets)
     nothing = Look(*(np.zeros(count, kind) for kind in (bool, np.int64)), *(np.full(count, np.nan) for _ in range(3)))
@@ -117,7 +119,7 @@ def confirmed_by(
     nearest_m, nearest_sigmas = (np.where(np.isfinite(v), v, np.inf).min(axis=0) for v in least)
     people = np.stack([one.people for one in all_looks]).max(axis=0)
     best = np.stack([np.nan_to_num(one.best) for one in all_looks]).max(axis=0)
-    return Confirmed(
+    return Confirmation(
         number,
         np.arange(rows.start, rows.stop),
         tuple(beliefs.kind(name) for name in targets),

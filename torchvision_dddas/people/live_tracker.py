@@ -10,10 +10,10 @@ from torchvision_dddas.io.source import looked_at
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import UNREAD, checked
-from torchvision_dddas.people.scorer import Recognizer
+from torchvision_dddas.people.scorer import WindowScorer
 from torchvision_dddas.people.search_regions import Search
 from torchvision_dddas.tracking.sequence import Follower
-from torchvision_dddas.types import Adjustment, Detections, Followed, Scene, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Scene, TrackedFrame, Tracks
 
 KIND = "person"
 
@@ -24,14 +24,14 @@ class Spotter:
     A scene whose picture could not be read has no people. Identities are from 1, apart from those of what moves.
     """
 
-    def __init__(self, recognizer: Recognizer, settings: Settings, interval: int, size: tuple[int, int]) -> None:
+    def __init__(self, recognizer: WindowScorer, settings: Settings, interval: int, size: tuple[int, int]) -> None:
         """size: (width, height) of the pictures. Raises InputError where they are smaller than the window."""
         self._recognizer, self._interval, self._size = recognizer, interval, size
         self._box_px = np.zeros((0, 4))
         self._search = Search(settings.people, lambda number: self._box_px)
         self._follower = Follower(settings, interval, size, pictures=False)
         self._steps: list[np.ndarray] = []
-        self._settled: dict[int, Followed] = {}
+        self._settled: dict[int, TrackedFrame] = {}
         scan.everywhere(size, settings.people)
 
     def retune(self, settings: Settings) -> None:
@@ -45,7 +45,7 @@ class Spotter:
         if not looked_at(scene.frame.number, self._interval):
             return
         found, adjustments, seconds = self._found(scene)
-        followed = Followed(
+        followed = TrackedFrame(
             scene.frame.number,
             scene.frame,
             found,
@@ -59,7 +59,7 @@ class Spotter:
         for settled in self._follower.take(followed):
             self._settled[settled.number] = settled
 
-    def of(self, number: int, ended: bool) -> Followed | None:
+    def of(self, number: int, ended: bool) -> TrackedFrame | None:
         """The people of a frame, once; None where they are not settled. Those of frames before it are forgotten.
 
         ended: whether no scene follows.
@@ -70,14 +70,14 @@ class Spotter:
         return self._settled.pop(number, None)
 
     def _found(self, scene: Scene) -> tuple[Detections, tuple[Adjustment, ...], dict[str, float]]:
-        image, knobs = scene.frame.image, self._search.knobs
+        image, parameters = scene.frame.image, self._search.parameters
         if image.shape[1::-1] != self._size or scene.cause == UNREAD:
             return Detections(kind=KIND), (), {}
         start = time.perf_counter()
         self._box_px = scene.detections.box_px
         look = self._search.look(scene.frame.number, self._size)
         maps = self._recognizer.scores([checked(image, f"frame {scene.frame.number}")], [look.parts])[0]
-        people = people_of(*scan.windows(look.parts, maps, self._size, knobs), self._size, knobs)
+        people = people_of(*scan.windows(look.parts, maps, self._size, parameters), self._size, parameters)
         self._search.learn(scene.frame.number, people, look)
         unknown = np.full(len(people), np.nan)
         found = Detections(people.box_px, people.score, people.box_px[:, 2:].prod(axis=1), unknown, unknown, KIND)

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people.opencv_gradient import Gradient
 from torchvision_dddas.people.scratch import spans
@@ -37,18 +37,18 @@ _GRADIENT_PX = 160_000
 _BLOCKS = 2_500
 
 
-class OnboardRecognizer:
-    """Implements `Recognizer`."""
+class OnnxScorer:
+    """Implements `WindowScorer`."""
 
     name = "onboard"
 
-    def __init__(self, knobs: PeopleKnobs, svm: LinearSvm) -> None:
+    def __init__(self, parameters: PeopleParameters, svm: LinearSvm) -> None:
         """Raises InputError where the SVM has another length than the descriptor, or the graphs another layout."""
-        self.knobs, self.svm, self.graphs = knobs, svm, graphs(knobs)
+        self.parameters, self.svm, self.graphs = parameters, svm, graphs(parameters)
         self.svm_feed = {
-            "weights": arranged(svm, knobs),
+            "weights": arranged(svm, parameters),
             "bias": np.array(svm.bias, np.float32),
-            "clip": np.array(knobs.clip, np.float32),
+            "clip": np.array(parameters.clip, np.float32),
         }
         self.local = threading.local()
 
@@ -89,15 +89,15 @@ class OnboardRecognizer:
 
     def _of_part(self, level: np.ndarray, part: Part) -> np.ndarray:
         """A part's scores, every window stride. level: uint8 (H, W) or (H, W, 4) BGRA."""
-        knobs, stride = self.knobs, self.knobs.window_stride_px
-        width = max(0, (part.width - knobs.window_width_px) // stride + 1)
-        height = max(0, (part.height - knobs.window_height_px) // stride + 1)
+        parameters, stride = self.parameters, self.parameters.window_stride_px
+        width = max(0, (part.width - parameters.window_width_px) // stride + 1)
+        height = max(0, (part.height - parameters.window_height_px) // stride + 1)
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
-        common = math.gcd(stride, knobs.block_stride_px)
-        phases, every = knobs.block_stride_px // common, stride // common
+        common = math.gcd(stride, parameters.block_stride_px)
+        phases, every = parameters.block_stride_px // common, stride // common
         for row in range(min(phases, height)):
             for column in range(min(phases, width)):
                 x, y = column * stride, row * stride
@@ -122,11 +122,11 @@ class OnboardRecognizer:
     def _histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
         gradient = self._gradient
-        block, stride = self.knobs.block_px, self.knobs.block_stride_px
+        block, stride = self.parameters.block_px, self.parameters.block_stride_px
         down, across = ((length - block) // stride + 1 for length in (part.height, part.width))
         channels = 1 if level.ndim == 2 else 3
         side = max(1, (_TILE_PX - block) // stride + 1)
-        size = self.knobs.bins * (block // self.knobs.cell_px) ** 2
+        size = self.parameters.bins * (block // self.parameters.cell_px) ** 2
         found = gradient.scratch("histograms", (size, down, across))
         for first, last in spans(down, max(side, _GRADIENT_PX // (part.width + 2) // stride)):
             # The channels of these rows alone: those of the whole would take 6 MB at 1280x720.
@@ -149,15 +149,15 @@ class OnboardRecognizer:
     def _gradient(self) -> Gradient:
         """This thread's."""
         if not hasattr(self.local, "gradient"):
-            self.local.gradient = Gradient(self.knobs.gamma, self.knobs.signed)
+            self.local.gradient = Gradient(self.parameters.gamma, self.parameters.signed)
         held: Gradient = self.local.gradient
         return held
 
 
-def graphs(knobs: PeopleKnobs) -> Path:
+def graphs(parameters: PeopleParameters) -> Path:
     """The folder of the graphs. Raises InputError where they are not those of the manifest, or of another layout."""
-    folder = SHIPPED if knobs.graphs == "shipped" else Path(knobs.graphs)
-    wanted = {name: int(getattr(knobs, name)) for name in BAKED}
+    folder = SHIPPED if parameters.graphs == "shipped" else Path(parameters.graphs)
+    wanted = {name: int(getattr(parameters, name)) for name in BAKED}
     settings = " ".join(f"--set people.{name}={value}" for name, value in wanted.items())
     make = f"make such graphs with `dddas export --graph people --out FOLDER {settings}`"
     make = f"{make}, and give people.graphs=FOLDER; or take --backend torch"
@@ -203,16 +203,16 @@ def fill(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
         cv2.copyMakeBorder(held, top, bottom, left, right, cv2.BORDER_REFLECT_101, dst=plane)
 
 
-def arranged(svm: LinearSvm, knobs: PeopleKnobs) -> np.ndarray:
+def arranged(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
     """(down, across, F) weights as `ops.hog.arranged` has them.
 
     Raises InputError where the SVM is of another length than the descriptor.
     """
-    (across, down), cells = knobs.blocks, knobs.block_px // knobs.cell_px
-    if svm.weights.size != knobs.features:
+    (across, down), cells = parameters.blocks, parameters.block_px // parameters.cell_px
+    if svm.weights.size != parameters.features:
         raise InputError(
             f"the classifier {svm.origin} has {svm.weights.size} weights; a window of these settings has "
-            f"{knobs.features}"
+            f"{parameters.features}"
         )
-    weights = svm.weights.astype(np.float32).reshape(across, down, cells, cells, knobs.bins)
+    weights = svm.weights.astype(np.float32).reshape(across, down, cells, cells, parameters.bins)
     return np.ascontiguousarray(weights.transpose(1, 0, 4, 3, 2)).reshape(down, across, -1)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Float, Part
 
@@ -27,23 +27,23 @@ class Level:
     scale: float
 
 
-def levels(size: tuple[int, int], knobs: PeopleKnobs) -> list[Level]:
+def levels(size: tuple[int, int], parameters: PeopleParameters) -> list[Level]:
     """The levels of a picture of (width, height) px, largest first; they end where the window no longer fits.
 
     The picture itself is one of them, so that all that OpenCV's levels show is seen; those before it are the enlarged
     ones. A level of the same rounded size as the one before is left out: it shows nothing new.
     Raises InputError if not even the first holds a window.
     """
-    width, height = knobs.window_width_px, knobs.window_height_px
+    width, height = parameters.window_width_px, parameters.window_height_px
     found: list[Level] = []
-    scale = first = 1 / enlarged(knobs)
-    for _ in range(knobs.max_levels):
+    scale = first = 1 / enlarged(parameters)
+    for _ in range(parameters.max_levels):
         level = round(size[0] / scale), round(size[1] / scale)
         if level[0] < width or level[1] < height:
             break
         if not found or found[-1].size != level:
             found.append(Level(level, scale))
-        scale *= knobs.scale_step
+        scale *= parameters.scale_step
     if not found:
         raise InputError(
             f"a picture of {size[0]} x {size[1]} px, enlarged {1 / first:.3g} times, is smaller than the window of "
@@ -52,42 +52,45 @@ def levels(size: tuple[int, int], knobs: PeopleKnobs) -> list[Level]:
     return found
 
 
-def enlarged(knobs: PeopleKnobs) -> float:
+def enlarged(parameters: PeopleParameters) -> float:
     """How many times larger than the picture the first level is: whole scale steps, `people.enlarge` at most."""
-    return float(knobs.scale_step ** np.floor(np.log(knobs.enlarge) / np.log(knobs.scale_step) + 1e-9))
+    return float(parameters.scale_step ** np.floor(np.log(parameters.enlarge) / np.log(parameters.scale_step) + 1e-9))
 
 
-def smallest_body_px(knobs: PeopleKnobs) -> float:
+def smallest_body_px(parameters: PeopleParameters) -> float:
     """Height of the smallest body that a pyramid shows, in the picture's pixels."""
-    return knobs.height_share * knobs.window_height_px / enlarged(knobs)
+    return parameters.height_share * parameters.window_height_px / enlarged(parameters)
 
 
-def _padding(knobs: PeopleKnobs) -> int:
+def _padding(parameters: PeopleParameters) -> int:
     """Of each level, in px: raised to a multiple of what windows and blocks lie on, as OpenCV does."""
-    grid = math.gcd(knobs.window_stride_px, knobs.block_stride_px)
-    return -(-knobs.padding_px // grid) * grid
+    grid = math.gcd(parameters.window_stride_px, parameters.block_stride_px)
+    return -(-parameters.padding_px // grid) * grid
 
 
-def everywhere(size: tuple[int, int], knobs: PeopleKnobs) -> list[Part]:
+def everywhere(size: tuple[int, int], parameters: PeopleParameters) -> list[Part]:
     """Every level as one part, with its padding."""
-    pad = _padding(knobs)
+    pad = _padding(parameters)
     return [
-        Part(level.size, -pad, -pad, level.size[0] + 2 * pad, level.size[1] + 2 * pad) for level in levels(size, knobs)
+        Part(level.size, -pad, -pad, level.size[0] + 2 * pad, level.size[1] + 2 * pad)
+        for level in levels(size, parameters)
     ]
 
 
-def tiles(parts: Sequence[Part], most_px: float, knobs: PeopleKnobs) -> list[Part]:
+def tiles(parts: Sequence[Part], most_px: float, parameters: PeopleParameters) -> list[Part]:
     """The parts, cut where they have more pixels than this, but into no less than some windows along each side."""
-    stride, cut = knobs.window_stride_px, []
+    stride, cut = parameters.window_stride_px, []
     for part in parts:
-        across, down = _windows(part, knobs)
-        high = _along(most_px / part.width, knobs.window_height_px, down, stride)
-        wide = _along(most_px / (knobs.window_height_px + (high - 1) * stride), knobs.window_width_px, across, stride)
+        across, down = _windows(part, parameters)
+        high = _along(most_px / part.width, parameters.window_height_px, down, stride)
+        wide = _along(
+            most_px / (parameters.window_height_px + (high - 1) * stride), parameters.window_width_px, across, stride
+        )
         for top, bottom in _cut(down, high):
             for left, right in _cut(across, wide):
                 x, y = part.x + left * stride, part.y + top * stride
-                width = (right - left - 1) * stride + knobs.window_width_px
-                height = (bottom - top - 1) * stride + knobs.window_height_px
+                width = (right - left - 1) * stride + parameters.window_width_px
+                height = (bottom - top - 1) * stride + parameters.window_height_px
                 cut.append(Part(part.level, x, y, width, height))
     return cut
 
@@ -106,7 +109,7 @@ def within(
     regions_px: Float[np.ndarray, "R 4"],
     heights_px: Float[np.ndarray, "R 2"],
     size: tuple[int, int],
-    knobs: PeopleKnobs,
+    parameters: PeopleParameters,
 ) -> list[Part]:
     """The parts whose windows show a body that lies in a region: few of them, merged where they overlap.
 
@@ -115,32 +118,32 @@ def within(
     that the pyramid reaches. Windows stand where a search everywhere has them.
     """
     regions_px, heights_px = np.asarray(regions_px, float).reshape(-1, 4), np.asarray(heights_px, float).reshape(-1, 2)
-    slack = knobs.scale_step**0.5
+    slack = parameters.scale_step**0.5
     least = np.where(np.isnan(heights_px[:, 0]), 0.0, heights_px[:, 0]) / slack
     largest = np.where(np.isnan(heights_px[:, 1]), regions_px[:, 3], heights_px[:, 1]) * slack
     parts: list[Part] = []
-    for level in levels(size, knobs):
-        body = knobs.height_share * knobs.window_height_px * level.scale
+    for level in levels(size, parameters):
+        body = parameters.height_share * parameters.window_height_px * level.scale
         wanted = regions_px[(least <= body) & (body <= largest)]
-        spans = [span for region in wanted if (span := _span(region, level, knobs)) is not None]
-        parts += [_part(span, level, knobs) for span in _merged(spans, knobs)]
+        spans = [span for region in wanted if (span := _span(region, level, parameters)) is not None]
+        parts += [_part(span, level, parameters) for span in _merged(spans, parameters)]
     return parts
 
 
 def windows(
-    parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], knobs: PeopleKnobs
+    parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters
 ) -> tuple[np.ndarray, np.ndarray]:
     """The windows that score the threshold or more, each once: x, y, width, height in the picture (N, 4), scores (N,).
 
     maps: (ny, nx) scores of each part. With OpenCV's grouping the windows are rounded to whole pixels, as there.
     """
-    scale_of = {level.size: level.scale for level in levels(size, knobs)}
-    width, height, stride = knobs.window_width_px, knobs.window_height_px, knobs.window_stride_px
+    scale_of = {level.size: level.scale for level in levels(size, parameters)}
+    width, height, stride = parameters.window_width_px, parameters.window_height_px, parameters.window_stride_px
     boxes, scores, seen = [], [], []
     for part, scored in zip(parts, maps, strict=True):
-        row, column = np.nonzero(scored >= knobs.threshold)
+        row, column = np.nonzero(scored >= parameters.threshold)
         x, y = part.x + column * stride, part.y + row * stride
-        if knobs.suppression == "opencv":
+        if parameters.suppression == "opencv":
             scale = scale_of[part.level]
             box = np.stack([x, y, np.full_like(x, width), np.full_like(y, height)], axis=1) * scale
             box = np.rint(box)
@@ -157,9 +160,9 @@ def windows(
     return np.concatenate(boxes)[first].astype(np.float64), np.concatenate(scores)[first]
 
 
-def cost(parts: Sequence[Part], knobs: PeopleKnobs) -> int:
+def cost(parts: Sequence[Part], parameters: PeopleParameters) -> int:
     """How many windows the parts hold."""
-    return sum(across * down for across, down in (_windows(part, knobs) for part in parts))
+    return sum(across * down for across, down in (_windows(part, parameters) for part in parts))
 
 
 def pixels(parts: Sequence[Part]) -> float:
@@ -168,26 +171,26 @@ def pixels(parts: Sequence[Part]) -> float:
     return sum(part.width * part.height for part in parts) + _RESIZED * made
 
 
-def _windows(part: Part, knobs: PeopleKnobs) -> tuple[int, int]:
+def _windows(part: Part, parameters: PeopleParameters) -> tuple[int, int]:
     """How many windows a part holds, across and down."""
-    stride = knobs.window_stride_px
-    across = max((part.width - knobs.window_width_px) // stride + 1, 0)
-    return across, max((part.height - knobs.window_height_px) // stride + 1, 0)
+    stride = parameters.window_stride_px
+    across = max((part.width - parameters.window_width_px) // stride + 1, 0)
+    return across, max((part.height - parameters.window_height_px) // stride + 1, 0)
 
 
 # Spans count windows of a level: (first column, first row, last column, last row).
 _Span = tuple[int, int, int, int]
 
 
-def _span(region: np.ndarray, level: Level, knobs: PeopleKnobs) -> _Span | None:
+def _span(region: np.ndarray, level: Level, parameters: PeopleParameters) -> _Span | None:
     """The windows whose body lies in the region, and the next ones outwards; None where the region is off the level."""
-    width, height, stride = knobs.window_width_px, knobs.window_height_px, knobs.window_stride_px
-    side = (1 - knobs.width_share) / 2 * width
-    above, below = (knobs.feet_share - knobs.height_share) * height, (1 - knobs.feet_share) * height
+    width, height, stride = parameters.window_width_px, parameters.window_height_px, parameters.window_stride_px
+    side = (1 - parameters.width_share) / 2 * width
+    above, below = (parameters.feet_share - parameters.height_share) * height, (1 - parameters.feet_share) * height
     low = region[:2] / level.scale - (side, above)
     high = (region[:2] + region[2:]) / level.scale + (side, below) - (width, height)
     high = np.maximum(low, high)  # a region smaller than the body still has the window that begins with it
-    pad = _padding(knobs)
+    pad = _padding(parameters)
     last = (np.array(level.size) + 2 * pad - (width, height)) // stride
     begin = np.floor((low + pad) / stride).astype(int)
     end = np.ceil((high + pad) / stride).astype(int)
@@ -197,15 +200,15 @@ def _span(region: np.ndarray, level: Level, knobs: PeopleKnobs) -> _Span | None:
     return int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
 
 
-def _area(span: _Span, knobs: PeopleKnobs) -> int:
+def _area(span: _Span, parameters: PeopleParameters) -> int:
     """Pixels that the windows of a span cover: what it costs."""
-    stride = knobs.window_stride_px
-    return ((span[2] - span[0]) * stride + knobs.window_width_px) * (
-        (span[3] - span[1]) * stride + knobs.window_height_px
+    stride = parameters.window_stride_px
+    return ((span[2] - span[0]) * stride + parameters.window_width_px) * (
+        (span[3] - span[1]) * stride + parameters.window_height_px
     )
 
 
-def _merged(spans: list[_Span], knobs: PeopleKnobs) -> list[_Span]:
+def _merged(spans: list[_Span], parameters: PeopleParameters) -> list[_Span]:
     """Spans joined as long as one around two costs no more than the two."""
     spans = sorted(set(spans))
     joined = True
@@ -215,7 +218,7 @@ def _merged(spans: list[_Span], knobs: PeopleKnobs) -> list[_Span]:
             for j in range(i + 1, len(spans)):
                 other = spans[j]
                 both = min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
-                if _area(both, knobs) <= _area(one, knobs) + _area(other, knobs):
+                if _area(both, parameters) <= _area(one, parameters) + _area(other, parameters):
                     spans = sorted({*spans[:i], *spans[i + 1 : j], *spans[j + 1 :], both})
                     joined = True
                     break
@@ -224,12 +227,12 @@ def _merged(spans: list[_Span], knobs: PeopleKnobs) -> list[_Span]:
     return spans
 
 
-def _part(span: _Span, level: Level, knobs: PeopleKnobs) -> Part:
-    stride, pad = knobs.window_stride_px, _padding(knobs)
+def _part(span: _Span, level: Level, parameters: PeopleParameters) -> Part:
+    stride, pad = parameters.window_stride_px, _padding(parameters)
     return Part(
         level.size,
         span[0] * stride - pad,
         span[1] * stride - pad,
-        (span[2] - span[0]) * stride + knobs.window_width_px,
-        (span[3] - span[1]) * stride + knobs.window_height_px,
+        (span[2] - span[0]) * stride + parameters.window_width_px,
+        (span[3] - span[1]) * stride + parameters.window_height_px,
     )

@@ -5,13 +5,13 @@ from typing import Protocol
 
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import LinearSvm, Part
 
 
-class Recognizer(Protocol):
-    """A back end's scorer of windows, for one classifier and one layout of its descriptor (`PeopleKnobs`)."""
+class WindowScorer(Protocol):
+    """A back end's scorer of windows, for one classifier and one layout of its descriptor (`PeopleParameters`)."""
 
     name: str
 
@@ -25,12 +25,12 @@ class Recognizer(Protocol):
         ...
 
 
-def load_recognizer(backend: str, knobs: PeopleKnobs, svm: LinearSvm) -> Recognizer:
+def load_scorer(backend: str, parameters: PeopleParameters, svm: LinearSvm) -> WindowScorer:
     """What scores windows for people, on the engine that `wants_torch` names. Raises InputError as it does."""
     if not wants_torch(backend):
-        from torchvision_dddas.people.onnx_scorer import OnboardRecognizer
+        from torchvision_dddas.people.onnx_scorer import OnnxScorer
 
-        return OnboardRecognizer(knobs, svm)
-    from torchvision_dddas.people.torch_scorer import TorchRecognizer
+        return OnnxScorer(parameters, svm)
+    from torchvision_dddas.people.torch_scorer import TorchScorer
 
-    return TorchRecognizer(knobs, svm)
+    return TorchScorer(parameters, svm)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.geometry import shared_px
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.types import Adjustment, Float, Part, People
@@ -66,8 +66,8 @@ class Expected:
     a person who was missed comes back, and a window that looked like one for a frame is soon forgotten.
     """
 
-    def __init__(self, knobs: PeopleKnobs) -> None:
-        self.knobs = knobs
+    def __init__(self, parameters: PeopleParameters) -> None:
+        self.parameters = parameters
         self.frame = 0
         self.place_px = np.zeros((0, 2))  # centres
         self.velocity_px = np.zeros((0, 2))
@@ -85,16 +85,19 @@ class Expected:
 
     def regions(self, frame: int) -> Regions:
         """Around them."""
-        box_px, knobs = self.box_px(frame), self.knobs
-        margin = knobs.region_margin
-        return grown(box_px, margin, margin, margin), box_px[:, 3:] * (1 / knobs.region_scales, knobs.region_scales)
+        box_px, parameters = self.box_px(frame), self.parameters
+        margin = parameters.region_margin
+        return grown(box_px, margin, margin, margin), box_px[:, 3:] * (
+            1 / parameters.region_scales,
+            parameters.region_scales,
+        )
 
     def learn(self, frame: int, people: People) -> int:
         """Take in whom a look found; returns how many of those expected are among them."""
         steps = max(frame - self.frame, 1)
         box_px = self.box_px(frame)
         place, size = people.box_px[:, :2] + people.box_px[:, 2:] / 2, people.box_px[:, 2:]
-        row, column = _pairs(box_px, people.box_px, self.knobs.region_scales)
+        row, column = _pairs(box_px, people.box_px, self.parameters.region_scales)
         self.place_px = box_px[:, :2] + box_px[:, 2:] / 2
         miss = place[column] - self.place_px[row]
         self.place_px[row] += _PLACE_GAIN * miss
@@ -102,7 +105,7 @@ class Expected:
         self.size_px[row] *= (size[column] / self.size_px[row]) ** _PLACE_GAIN
         self.found[row] += 1
         self.seen[row] = frame
-        stay = frame - self.seen <= np.minimum(4 * self.found, 2 * self.knobs.rescan_frames)
+        stay = frame - self.seen <= np.minimum(4 * self.found, 2 * self.parameters.rescan_frames)
         new = np.setdiff1d(np.arange(len(people)), column)
         self.place_px = np.concatenate([self.place_px[stay], place[new]])
         self.velocity_px = np.concatenate([self.velocity_px[stay], np.zeros((len(new), 2))])
@@ -153,29 +156,29 @@ class Search:
     `regions` those too, where no one expected explains them.
     """
 
-    def __init__(self, knobs: PeopleKnobs, blobs: Callable[[int], np.ndarray] | None = None) -> None:
+    def __init__(self, parameters: PeopleParameters, blobs: Callable[[int], np.ndarray] | None = None) -> None:
         self.blobs = blobs
-        self.steered = knobs.search == "regions"
-        self.expected = Expected(knobs)
+        self.steered = parameters.search == "regions"
+        self.expected = Expected(parameters)
         self.looks = 0
-        self.retune(knobs)
+        self.retune(parameters)
         self.there = 0  # people whom the last look found
         self.lost = 0  # how many the look before it had found, where it found none of them
         self.told = 1.0  # share of windows in the last line of the record
 
-    def retune(self, knobs: PeopleKnobs) -> None:
+    def retune(self, parameters: PeopleParameters) -> None:
         """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
-        self.knobs = self.expected.knobs = knobs
-        self.bound = knobs.look_share < 1
+        self.parameters = self.expected.parameters = parameters
+        self.bound = parameters.look_share < 1
 
     def look(self, frame: int, size: tuple[int, int]) -> Look:
         """Where to search a frame of (width, height)."""
-        everywhere = scan.everywhere(size, self.knobs)
+        everywhere = scan.everywhere(size, self.parameters)
         if not self.steered and self.blobs is None:
             return Look(everywhere, None, 1.0)
-        all_windows = scan.cost(everywhere, self.knobs)
+        all_windows = scan.cost(everywhere, self.parameters)
         if self.steered and not self.bound:
-            if not self.looks or frame - self.expected.frame > self.knobs.rescan_frames:
+            if not self.looks or frame - self.expected.frame > self.parameters.rescan_frames:
                 return Look(everywhere, None, 1.0)
             if self.lost:
                 return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
@@ -183,34 +186,34 @@ class Search:
         if self.steered and self.bound:
             return self._bounded(frame, known, moving, everywhere, size)
         region_px, heights_px = _both(known, moving)
-        parts = scan.within(region_px, heights_px, size, self.knobs)
-        around = scan.cost(parts, self.knobs) / all_windows
+        parts = scan.within(region_px, heights_px, size, self.parameters)
+        around = scan.cost(parts, self.parameters) / all_windows
         if not self.steered:
             return Look(parts, region_px, around)
         if around > _DEAR:
             return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
-        due = self._due(everywhere, self.knobs.rescan_frames)
+        due = self._due(everywhere, self.parameters.rescan_frames)
         levels = {part.level for part in due}
         parts = due + [part for part in parts if part.level not in levels]
-        return Look(parts, region_px, scan.cost(parts, self.knobs) / all_windows, self._told(frame, around))
+        return Look(parts, region_px, scan.cost(parts, self.parameters) / all_windows, self._told(frame, around))
 
     def _bounded(
         self, frame: int, known: Regions, moving: Regions, everywhere: list[Part], size: tuple[int, int]
     ) -> Look:
         """A look that costs `people.look_share` of one at all: what is due, around those expected, around movers."""
         whole = scan.pixels(everywhere)
-        most = self.knobs.look_share * whole
-        tiles = scan.tiles(everywhere, most / 2, self.knobs)
+        most = self.parameters.look_share * whole
+        tiles = scan.tiles(everywhere, most / 2, self.parameters)
         # Half of what a look may take is for the rest of the picture.
-        parts = self._due(tiles, max(self.knobs.rescan_frames, math.ceil(scan.pixels(tiles) / (most / 2))))
+        parts = self._due(tiles, max(self.parameters.rescan_frames, math.ceil(scan.pixels(tiles) / (most / 2))))
         around = 0.0
         for regions in (known, moving):
-            wanted = scan.within(*regions, size, self.knobs)
+            wanted = scan.within(*regions, size, self.parameters)
             around += scan.pixels(wanted)
             parts += self._thinned(wanted, most - scan.pixels(parts))
         region_px, _ = _both(known, moving)
-        share = scan.cost(parts, self.knobs) / scan.cost(everywhere, self.knobs)
-        return Look(parts, region_px, share, self._told(frame, min(around / whole, self.knobs.look_share)))
+        share = scan.cost(parts, self.parameters) / scan.cost(everywhere, self.parameters)
+        return Look(parts, region_px, share, self._told(frame, min(around / whole, self.parameters.look_share)))
 
     def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
         """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import PeopleKnobs
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import hog
 from torchvision_dddas.functional.resize import reflected, resize
@@ -18,19 +18,19 @@ from torchvision_dddas.types import LinearSvm, Part
 _PIXELS = {"cpu": 1 << 18, "cuda": 1 << 24}
 
 
-class TorchRecognizer:
-    """Implements `Recognizer`."""
+class TorchScorer:
+    """Implements `WindowScorer`."""
 
     name = "torch"
 
-    def __init__(self, knobs: PeopleKnobs, svm: LinearSvm, device: str | torch.device | None = None) -> None:
+    def __init__(self, parameters: PeopleParameters, svm: LinearSvm, device: str | torch.device | None = None) -> None:
         """device: by default the GPU where there is one.
 
         Raises InputError where cells, blocks and window do not fit one another, or the SVM is of another length.
         """
-        self.knobs, self.svm = knobs, svm
+        self.parameters, self.svm = parameters, svm
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        self.layout = layout(knobs)
+        self.layout = layout(parameters)
         if svm.weights.size != self.layout.features:
             raise InputError(
                 f"the classifier {svm.origin} has {svm.weights.size} weights; "
@@ -72,11 +72,11 @@ class TorchRecognizer:
         rows = reflected(part.y - 1, part.y + part.height + 1, height, levels.device)
         columns = reflected(part.x - 1, part.x + part.width + 1, width, levels.device)
         bordered = resize(levels, (height, width), rows, columns)
-        return strided_scores(bordered, self.weights, self.bias, self.layout, self.knobs.window_stride_px)
+        return strided_scores(bordered, self.weights, self.bias, self.layout, self.parameters.window_stride_px)
 
     def _windows(self, part: Part) -> tuple[int, int]:
         """Windows of a part, (across, down)."""
-        stride, (width, height) = self.knobs.window_stride_px, self.layout.window
+        stride, (width, height) = self.parameters.window_stride_px, self.layout.window
         return max(0, (part.width - width) // stride + 1), max(0, (part.height - height) // stride + 1)
 
     def _tensor(self, image: np.ndarray) -> Tensor:
@@ -85,17 +85,17 @@ class TorchRecognizer:
         return channels.to(self.device).permute(2, 0, 1).float().contiguous()
 
 
-def layout(knobs: PeopleKnobs) -> hog.Layout:
+def layout(parameters: PeopleParameters) -> hog.Layout:
     """The descriptor of the settings. Raises InputError where they do not fit one another."""
     return hog.Layout(
-        (knobs.window_width_px, knobs.window_height_px),
-        knobs.cell_px,
-        knobs.block_px,
-        knobs.block_stride_px,
-        knobs.bins,
-        knobs.signed,
-        knobs.clip,
-        knobs.gamma,
+        (parameters.window_width_px, parameters.window_height_px),
+        parameters.cell_px,
+        parameters.block_px,
+        parameters.block_stride_px,
+        parameters.bins,
+        parameters.signed,
+        parameters.clip,
+        parameters.gamma,
     )
 
 

@@ -21,15 +21,15 @@ class AerialCamera:
     """The UAV's camera above a world. A picture depends on the seed and its moment alone, not on those before it."""
 
     def __init__(self, world: World, scenario: Scenario) -> None:
-        knobs = scenario.camera
-        size = knobs.width_px, knobs.height_px
-        focal = size[0] / 2 / np.tan(np.radians(knobs.hfov_deg) / 2)
+        parameters = scenario.camera
+        size = parameters.width_px, parameters.height_px
+        focal = size[0] / 2 / np.tan(np.radians(parameters.hfov_deg) / 2)
         self.camera = Camera("uav", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2))
-        self._world, self._exposure_s = world, knobs.exposure_s
-        self._shutter = Shutter(self.camera, knobs.readout_s, knobs.vibration_px, scenario.seed)
+        self._world, self._exposure_s = world, parameters.exposure_s
+        self._shutter = Shutter(self.camera, parameters.readout_s, parameters.vibration_px, scenario.seed)
         self._terrain = Terrain(world, self._shutter)
-        self._painter = Painter(world, self._shutter, knobs.exposure_s, scenario.seed)
-        self._sensor = Sensor(knobs, size, scenario.seed)
+        self._painter = Painter(world, self._shutter, parameters.exposure_s, scenario.seed)
+        self._sensor = Sensor(parameters, size, scenario.seed)
 
     def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The picture (H, W, 3) uint8 BGR, its targets (H, W) uint16 and its bodies (H, W) uint16; 0: neither."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torchvision_dddas.simulation.receiver import Receivers
-from torchvision_dddas.simulation.scenario import AircraftKnobs
+from torchvision_dddas.simulation.scenario import AircraftParameters
 from torchvision_dddas.simulation.ways import Way
 from torchvision_dddas.types import CameraPose
 
@@ -77,31 +77,33 @@ class Aircraft:
     """
 
     def __init__(
-        self, knobs: AircraftKnobs, half_m: float, up_m: Callable[[np.ndarray], np.ndarray], seed: int
+        self, parameters: AircraftParameters, half_m: float, up_m: Callable[[np.ndarray], np.ndarray], seed: int
     ) -> None:
-        self._knobs, self._half, self._up = knobs, half_m, up_m
-        self._way = Way(np.array([knobs.start_m, *knobs.way_m], float), knobs.speed_m_s)
-        self._altitude = knobs.altitude_m
+        self._parameters, self._half, self._up = parameters, half_m, up_m
+        self._way = Way(np.array([parameters.start_m, *parameters.way_m], float), parameters.speed_m_s)
+        self._altitude = parameters.altitude_m
         self._fly_to: np.ndarray | None = None
         self._look_at: np.ndarray | None = None
-        self._heading, self._turning = float(np.radians(knobs.heading_deg)), 0.0
+        self._heading, self._turning = float(np.radians(parameters.heading_deg)), 0.0
         point, going = self._way.at(0.0)
         back = self._back_m()
         for _ in range(8):  # as far back as the ground's heights ask for
             behind = point - back * self._ahead()
-            rise = knobs.altitude_m + self._ground(behind) - self._ground(point)
+            rise = parameters.altitude_m + self._ground(behind) - self._ground(point)
             back = max(rise, 1.0) * self._cotangent()
         self._relief_m = back - self._back_m()
         place = np.append(point - back * self._ahead(), 0.0)
-        place[2] = knobs.altitude_m + self._ground(place[:2])
+        place[2] = parameters.altitude_m + self._ground(place[:2])
         aim, still = np.append(point, self._ground(point)), np.append(going, 0.0)
         self._craft, self._aim = _Pursuer(place, still), _Pursuer(aim, still)
-        gust = knobs.wind_m_s * _HELD * _GUST_S * np.array([1.0, 1.0, 0.5])
+        gust = parameters.wind_m_s * _HELD * _GUST_S * np.array([1.0, 1.0, 0.5])
         self._blown = Swaying(gust, _GUST_S, np.random.default_rng([seed, 50]))
-        self._shaken = Swaying(np.full(3, np.radians(knobs.shake_deg)), _SHAKE_S, np.random.default_rng([seed, 51]))
+        self._shaken = Swaying(
+            np.full(3, np.radians(parameters.shake_deg)), _SHAKE_S, np.random.default_rng([seed, 51])
+        )
 
     def _cotangent(self) -> float:
-        return float(1 / np.tan(np.radians(self._knobs.pitch_deg))) if self._knobs.pitch_deg < 90 else 0.0
+        return float(1 / np.tan(np.radians(self._parameters.pitch_deg))) if self._parameters.pitch_deg < 90 else 0.0
 
     def _back_m(self) -> float:
         """How far behind what it looks at it flies, over level ground."""
@@ -134,7 +136,7 @@ class Aircraft:
         aim, aim_going = (point, going) if self._look_at is None else (self._look_at, np.zeros(2))
         craft, target = self._craft, self._aim
         goal_up = self._altitude + self._ground(craft.place)
-        fastest = max(self._knobs.maximum_m_s, self._knobs.speed_m_s if self._fly_to is None else 0.0)
+        fastest = max(self._parameters.maximum_m_s, self._parameters.speed_m_s if self._fly_to is None else 0.0)
         craft.step(np.append(goal, goal_up), np.append(going, 0.0), fastest, ACCELERATION_M_S2, seconds)
         aim_up = self._ground(target.place)
         if self._look_at is None:
@@ -189,12 +191,12 @@ class Telemetry:
 
     NEW = 0.1
 
-    def __init__(self, knobs: AircraftKnobs, seed: int) -> None:
+    def __init__(self, parameters: AircraftParameters, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 52])
-        tilt, heading = np.radians(knobs.angle_error_deg), np.radians(knobs.heading_error_deg)
-        self._sigma = np.array([tilt, tilt, heading, knobs.altitude_error])
+        tilt, heading = np.radians(parameters.angle_error_deg), np.radians(parameters.heading_error_deg)
+        self._sigma = np.array([tilt, tilt, heading, parameters.altitude_error])
         self._lasting = self._sigma * self._rng.standard_normal(4)
-        self.receiver = Receivers(1, knobs.place_error95_m, 0.02, 60.0, 0.0, self._rng)
+        self.receiver = Receivers(1, parameters.place_error95_m, 0.02, 60.0, 0.0, self._rng)
 
     def errors(self, seconds: float) -> np.ndarray:
         """(6,) rotation about east, north and up, rad; share of the altitude; metres east, north; so much later."""

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation.scenario import AircraftKnobs
+from torchvision_dddas.simulation.scenario import AircraftParameters
 from torchvision_dddas.simulation.world import World
 
 CLEAR_M = 1.0
@@ -15,21 +15,21 @@ _STEP_M = 1.0
 _PARTS = 64
 
 
-def check_way(knobs: AircraftKnobs, world: World) -> None:
+def check_way(parameters: AircraftParameters, world: World) -> None:
     """Raises InputError where what stands there reaches up to its way, or the ground hides what it looks at."""
-    aimed = _places(knobs)
+    aimed = _places(parameters)
     aimed_up = world.up_m(aimed)
-    heading, pitch = np.radians(knobs.heading_deg), np.radians(knobs.pitch_deg)
-    back = knobs.altitude_m / np.tan(pitch) if knobs.pitch_deg < 90 else 0.0
+    heading, pitch = np.radians(parameters.heading_deg), np.radians(parameters.pitch_deg)
+    back = parameters.altitude_m / np.tan(pitch) if parameters.pitch_deg < 90 else 0.0
     flown = aimed - back * np.array([np.sin(heading), np.cos(heading)])
     tall = heights_m(world, flown)
-    if (low := tall + CLEAR_M > knobs.altitude_m).any():
+    if (low := tall + CLEAR_M > parameters.altitude_m).any():
         k = int(np.where(low, tall, -1).argmax())
         raise InputError(
-            f"uav.altitude_m = {knobs.altitude_m:g} is too low: {tall[k]:.1f} m stand at {_at(flown[k])} on its way; "
+            f"uav.altitude_m = {parameters.altitude_m:g} is too low: {tall[k]:.1f} m stand at {_at(flown[k])}; "
             f"fly {np.ceil(tall[k] + CLEAR_M):g} m high or more"
         )
-    flown_up = knobs.altitude_m + world.up_m(flown)
+    flown_up = parameters.altitude_m + world.up_m(flown)
     share = np.linspace(0, 1, _PARTS, endpoint=False)[:, None]
     rays = flown + share[..., None] * (aimed - flown)
     ground = world.up_m(rays.reshape(-1, 2)).reshape(rays.shape[:2])
@@ -37,9 +37,9 @@ def check_way(knobs: AircraftKnobs, world: World) -> None:
     if (over < 0).any():
         part, aim = divmod(int(over.argmin()), over.shape[1])
         raise InputError(
-            f"uav.altitude_m = {knobs.altitude_m:g} is below the terrain that it looks over: at "
+            f"uav.altitude_m = {parameters.altitude_m:g} is below the terrain that it looks over: at "
             f"{_at(rays[part, aim])} the ground is {-over[part, aim]:.1f} m above its line of sight; fly "
-            f"higher, or look down more steeply than uav.pitch_deg = {knobs.pitch_deg:g}"
+            f"higher, or look down more steeply than uav.pitch_deg = {parameters.pitch_deg:g}"
         )
 
 
@@ -53,9 +53,9 @@ def heights_m(world: World, east_north_m: np.ndarray) -> np.ndarray:
     return world.surface[places[0], places[1]].astype(float)
 
 
-def _places(knobs: AircraftKnobs) -> np.ndarray:
+def _places(parameters: AircraftParameters) -> np.ndarray:
     """(N, 2) the ground that it looks at, a metre from one to the next."""
-    corners = np.array([knobs.start_m, *knobs.way_m], float)
+    corners = np.array([parameters.start_m, *parameters.way_m], float)
     legs = [corners[:1]]
     for begin, end in pairwise(corners):
         count = max(1, int(np.ceil(np.linalg.norm(end - begin) / _STEP_M)))

@@ -10,7 +10,7 @@ from torchvision_dddas.io.output.detection_output import uninterrupted
 from torchvision_dddas.io.output.pipeline_output import ALL, SurveyOutput
 from torchvision_dddas.io.output.pipeline_output import SAVED as MADE
 from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput
-from torchvision_dddas.types import Surveyed, Truth
+from torchvision_dddas.types import FrameResult, Truth
 
 SAVED = (*MADE, "truth")
 """What --save may name. The tables and run.json are always written."""
@@ -31,7 +31,7 @@ class FlownOutput(SurveyOutput):
         if self._truth is not None:
             self._ahead.append(truth)
 
-    def survey(self, item: Surveyed) -> None:
+    def survey(self, item: FrameResult) -> None:
         """Write a frame and what is true until then. Raises InputError if the disk refuses."""
         with uninterrupted():
             super().survey(item)

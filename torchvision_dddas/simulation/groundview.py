@@ -14,7 +14,7 @@ from torchvision_dddas.simulation.camera import View, axes, view_of
 from torchvision_dddas.simulation.figures import Dress, Figures, draw_figure, dress, figures, shadow
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.receiver import SIGMAS_95
-from torchvision_dddas.simulation.scenario import CameraKnobs, Scenario
+from torchvision_dddas.simulation.scenario import CameraParameters, Scenario
 from torchvision_dddas.simulation.sensor import Sensor
 from torchvision_dddas.simulation.world import World
 from torchvision_dddas.types import Bodies, Camera, CameraPose, GroundPicture
@@ -26,7 +26,7 @@ HEADING_SIGMA_RAD = float(np.radians(2.0))
 """How well a vehicle knows whither its camera looks."""
 
 _LEAST_SIGMA_M = 0.02
-_SENSOR = CameraKnobs(sharpness_px=0.7, shot_noise=0.12, read_noise=1.2, drift=0.03, quality=90)
+_SENSOR = CameraParameters(sharpness_px=0.7, shot_noise=0.12, read_noise=1.2, drift=0.03, quality=90)
 _STREAM = 100  # of the sensors' noise, so that no vehicle shares it with the camera in the air
 _SHADE = 0.5  # of the light that is left in a shadow
 _SHADED_M = 120.0  # beyond, no shadow is drawn

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.obstacles import Obstacles, round_discs
-from torchvision_dddas.simulation.scenario import AircraftKnobs, TeamKnobs
+from torchvision_dddas.simulation.scenario import AircraftParameters, TeamParameters
 from torchvision_dddas.simulation.vehicles import UGV_LENGTH_M, UGV_WIDTH_M
 from torchvision_dddas.simulation.ways import Way
 from torchvision_dddas.types import Colours
@@ -47,16 +47,18 @@ def plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
 class Team:
     """All ground vehicles as plain arrays: place (K, 2), course, heading (of the camera), speed (K,)."""
 
-    def __init__(self, knobs: TeamKnobs, flight: AircraftKnobs, side_m: float, obstacles: Obstacles, seed: int) -> None:
-        count = knobs.ugvs
-        self._knobs, self._half, self._obstacles, self._seed = knobs, side_m / 2, obstacles, seed
+    def __init__(
+        self, parameters: TeamParameters, flight: AircraftParameters, side_m: float, obstacles: Obstacles, seed: int
+    ) -> None:
+        count = parameters.ugvs
+        self._parameters, self._half, self._obstacles, self._seed = parameters, side_m / 2, obstacles, seed
         rng = np.random.default_rng([seed, 30])
         self.names = plates(count)[0]
         turn = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 1)
         self._spoke = np.stack([np.sin(turn), np.cos(turn)], axis=1)
-        self._middle = np.array(knobs.middle_m, float)
+        self._middle = np.array(parameters.middle_m, float)
         self._way = Way(np.array([flight.start_m, *flight.way_m], float), flight.speed_m_s)
-        self.place = self._inside(obstacles.outside(self._middle + knobs.ring_m * self._spoke, 1.5))
+        self.place = self._inside(obstacles.outside(self._middle + parameters.ring_m * self._spoke, 1.5))
         self._start = self.place.copy()
         self.course = rng.uniform(0, 2 * np.pi, count)
         self.speed = np.zeros(count)
@@ -124,14 +126,14 @@ class Team:
 
     def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """(K, 2) whither, (K,) how fast."""
-        knobs, patrol = self._knobs, self._knobs.patrol
-        speed = np.full(len(self), knobs.patrol_m_s)
+        parameters, patrol = self._parameters, self._parameters.patrol
+        speed = np.full(len(self), parameters.patrol_m_s)
         if patrol == "random":
             goal = np.array([self._random(k, int(n)) for k, n in enumerate(self._passed)]).reshape(-1, 2)
             self._passed = self._passed + self._there(goal, 1.0)
         elif patrol == "gather":
             reach = max(_GATHERED_M, len(self) * _ROOM_M / 6)
-            goal = self._middle + min(reach, knobs.ring_m) * self._spoke
+            goal = self._middle + min(reach, parameters.ring_m) * self._spoke
             far = np.hypot(*(goal - self.place).T) > _NEAR_M
             speed = np.where(far, _FAST * speed, speed)
         elif patrol == "along":
@@ -156,7 +158,7 @@ class Team:
         """(2,) the n-th place of a vehicle within the ring."""
         if (k, n) not in self._drawn:
             rng = np.random.default_rng([self._seed, 31, k, n])
-            reach, turn = self._knobs.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+            reach, turn = self._parameters.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
             self._drawn[k, n] = self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
         return self._drawn[k, n]
 

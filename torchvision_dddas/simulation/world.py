@@ -11,7 +11,7 @@ from torchvision_dddas.simulation import sunlight
 from torchvision_dddas.simulation.cover import Crowns, Things, scatter
 from torchvision_dddas.simulation.noise import enlarged
 from torchvision_dddas.simulation.ortho import Photographed
-from torchvision_dddas.simulation.scenario import WorldKnobs
+from torchvision_dddas.simulation.scenario import WorldParameters
 from torchvision_dddas.simulation.soil import COARSE, lie, soil
 from torchvision_dddas.types import Elevation, Ortho
 
@@ -47,7 +47,7 @@ class World:
 
 
 def build(
-    knobs: WorldKnobs,
+    parameters: WorldParameters,
     seed: int,
     elevation: Elevation | None = None,
     photo: Ortho | None = None,
@@ -59,18 +59,18 @@ def build(
     local metres and how many metres about them nothing may stand.
     Raises InputError where the texture would be too large, or the elevation does not cover the world.
     """
-    cells = max(round(knobs.side_m / knobs.texel_m / COARSE), 2)
-    side_px, side_m = cells * COARSE, knobs.side_m
+    cells = max(round(parameters.side_m / parameters.texel_m / COARSE), 2)
+    side_px, side_m = cells * COARSE, parameters.side_m
     if side_px > MOST_TEXELS:
         raise InputError(
-            f"a world of {side_m:g} m in pixels of {knobs.texel_m:g} m has {side_px} of them along a side, and at most "
+            f"a world of {side_m:g} m in pixels of {parameters.texel_m:g} m has {side_px} of them a side; at most "
             f"{MOST_TEXELS} are possible; set world.texel_m to {np.ceil(1000 * side_m / MOST_TEXELS) / 1000:g} or more"
         )
     texel = side_m / side_px
-    to_sun = sunlight.towards(knobs.sun_azimuth_deg, knobs.sun_height_deg)
+    to_sun = sunlight.towards(parameters.sun_azimuth_deg, parameters.sun_height_deg)
     rng = np.random.default_rng([seed, 10])
     relief = (
-        reliefs.hills(side_m, knobs.relief_m, knobs.above_sea_m, rng)
+        reliefs.hills(side_m, parameters.relief_m, parameters.above_sea_m, rng)
         if elevation is None
         else reliefs.of_raster(elevation, side_m)
     )
@@ -82,7 +82,7 @@ def build(
     wished = (0.12 + 0.5 * ground.grass**2 + 0.8 * banks) * off_road * (ground.wash_m > 0.8 * ground.wash_half_m)
     built = np.clip((np.abs(ground.road_m) - 9) / 2, 0, 1) * (ground.wash_m > ground.wash_half_m + 8)
     hectares = (side_m / 100) ** 2
-    counts = round(knobs.bushes_per_ha * hectares), round(knobs.trees_per_ha * hectares), knobs.buildings
+    counts = round(parameters.bushes_per_ha * hectares), round(parameters.trees_per_ha * hectares), parameters.buildings
     places, radius = keep_clear if keep_clear is not None else (np.zeros((0, 2)), 0.0)
     clear = np.asarray(places, float).reshape(-1, 2), radius
     things = scatter(counts, side_m, np.clip(wished, 0, 1), built, clear, np.random.default_rng([seed, 20]))

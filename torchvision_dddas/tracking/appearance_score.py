@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchvision_dddas.config import TrackKnobs
+from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.geometry import namespace
 
 _HOPELESS, _CLOSE = -8.0, 7.0  # links that no look can save, and apart by more than looks can turn
@@ -10,13 +10,13 @@ _WORST = -1.0  # light, shadow and turning change a look at once: little of it s
 
 
 def likeness_scores(
-    signature: np.ndarray, other: np.ndarray, other_visible: np.ndarray, knobs: TrackKnobs
+    signature: np.ndarray, other: np.ndarray, other_visible: np.ndarray, parameters: TrackParameters
 ) -> np.ndarray:
     """(N, M) scores from histograms (N, D) of tracks and (M, D) of detections, each of sum 1 or, where unknown, 0.
 
     What is unknown scores 0. other_visible: (M,) shares of the boxes.
     """
-    return scores_of(likeness(signature, other), other_visible, knobs)
+    return scores_of(likeness(signature, other), other_visible, parameters)
 
 
 def likeness(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -25,11 +25,11 @@ def likeness(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(known, np.sqrt(signature) @ np.sqrt(other).T, np.nan)
 
 
-def scores_of(likeness: np.ndarray, visible: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
+def scores_of(likeness: np.ndarray, visible: np.ndarray, parameters: TrackParameters) -> np.ndarray:
     """(N, M) scores of likenesses, 0 for NaN. visible: (M,) shares of the boxes. Arrays or tensors."""
     functions = namespace(likeness)
     known = likeness == likeness
-    score = knobs.appearance_weight * (functions.where(known, likeness, 1.0) - knobs.appearance_offset)
+    score = parameters.appearance_weight * (functions.where(known, likeness, 1.0) - parameters.appearance_offset)
     return functions.where(known, functions.clip(score, _WORST, None) * functions.sqrt(visible)[..., None, :], 0.0)
 
 

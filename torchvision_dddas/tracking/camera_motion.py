@@ -10,7 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.engine import View, Vision
+from torchvision_dddas.detection.engine import Engine, View
 
 # The shorter side of the picture that is registered, at least: corners then differ by 0.1 to 0.4 px (median) from a
 # registration at full size, for 30 to 45 % of its time.
@@ -33,8 +33,8 @@ class Camera:
     a slow pan is not lost in steps that are each too small to see, unless it takes longer than _OLDEST looks to be.
     """
 
-    def __init__(self, vision: Vision) -> None:
-        self.vision = vision
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
         self.anchor: _Look | None = None
         self.last: _Look | None = None
         self.lost: _Look | None = None  # the latest look whose motion is not known, shown since `last`
@@ -45,7 +45,7 @@ class Camera:
 
         None where the camera stood still, and where the motion is unknown, then with a cause in words.
         """
-        look = _Look(image, self.vision)
+        look = _Look(image, self.engine)
         self.age += 1
         if self.anchor is None or self.last is None:
             self.anchor = self.last = look
@@ -60,7 +60,7 @@ class Camera:
         # been told of none in between.
         earlier = [self.anchor, *(e for e in (self.last, self.lost) if e is not None and e is not self.anchor)]
         for other in earlier:
-            (found,) = self.vision.register([(other.view, look.view)])
+            (found,) = self.engine.register([(other.view, look.view)])
             if found.reliable:
                 self.anchor = self.last = look
                 self.lost, self.age = None, 0
@@ -79,7 +79,7 @@ class _Look:
     """One picture, and what is made of it where it is needed."""
 
     image: np.ndarray
-    vision: Vision
+    engine: Engine
 
     @cached_property
     def grey(self) -> np.ndarray:
@@ -89,7 +89,7 @@ class _Look:
     def view(self) -> View:
         """The reduced picture, for the back end."""
         times = max(1, min(self.grey.shape) // _REGISTERED_PX)
-        return self.vision.prepare(_reduced(self.grey, times))
+        return self.engine.prepare(_reduced(self.grey, times))
 
     @cached_property
     def full_from_small(self) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from torchvision_dddas.config import PaperKnobs
+from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.tracking.jaccard import similarity
 from torchvision_dddas.types import Float, Int
 
@@ -55,15 +55,17 @@ def dissimilarity(feature: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N N"]
     return apart
 
 
-def of_window(of_frames: Sequence[float], counts: Sequence[int], knobs: PaperKnobs) -> float:
+def of_window(of_frames: Sequence[float], counts: Sequence[int], parameters: PaperParameters) -> float:
     """The dispersion that speaks for a window, newest frame first, by the reading that `dispersion_of` names."""
-    return min(of_frames[: speaking(counts, knobs)])
+    return min(of_frames[: speaking(counts, parameters)])
 
 
-def speaking(counts: Sequence[int], knobs: PaperKnobs) -> int:
+def speaking(counts: Sequence[int], parameters: PaperParameters) -> int:
     """How many frames of a window, from the newest on, have a say: the smallest of their dispersions counts."""
     differ = len(set(counts)) > 1
-    smallest = knobs.dispersion_of == "smallest" or (knobs.dispersion_of == "smallest_if_counts_differ" and differ)
+    smallest = parameters.dispersion_of == "smallest" or (
+        parameters.dispersion_of == "smallest_if_counts_differ" and differ
+    )
     return len(counts) if smallest else 1
 
 

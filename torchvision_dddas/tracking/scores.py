@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import TrackKnobs
+from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.geometry import namespace
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import HEIGHT, PP, SEEN, SS, USUAL_SPEED, WIDTH, X, Y
@@ -38,9 +38,9 @@ class Sight:
     doubt: float = 0.0
     size: tuple[float, float] | None = None
 
-    def agility(self, knobs: TrackKnobs) -> float:
+    def agility(self, parameters: TrackParameters) -> float:
         """Sd of the change of velocity in a frame, heights/frame: who is fast turns fast."""
-        return knobs.agility * self.speed / USUAL_SPEED
+        return parameters.agility * self.speed / USUAL_SPEED
 
 
 def births_of(births: int, seen: int, doubt: float, interval: int) -> float:
@@ -61,50 +61,52 @@ def near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.ndar
 
 
 def link_scores(
-    state: np.ndarray, left_at_border: np.ndarray, box_px: np.ndarray, sight: Sight, knobs: TrackKnobs
+    state: np.ndarray, left_at_border: np.ndarray, box_px: np.ndarray, sight: Sight, parameters: TrackParameters
 ) -> np.ndarray:
     """(N, M) scores of the links from tracks to the detections of a look, appearance left out.
 
     state: (N, kalman.COLUMNS) as last seen. left_at_border: (N,) whether they were seen at the border then. box_px:
-    (M, 4). Arrays, or tensors with a gradient in the knobs.
+    (M, 4). Arrays, or tensors with a gradient in the parameters.
     """
     functions = namespace(state)
-    later = kalman.predicted(state, sight.frame, sight.agility(knobs))
+    later = kalman.predicted(state, sight.frame, sight.agility(parameters))
     centre, height = box_px[..., :2] + box_px[..., 2:] / 2, functions.log(box_px[..., 3])
-    score = _closeness(later, later[..., PP] + knobs.scatter**2, centre, knobs)
-    score = score - _misfit(later, height, sight.doubt, knobs.size_scatter)
+    score = _closeness(later, later[..., PP] + parameters.scatter**2, centre, parameters)
+    score = score - _misfit(later, height, sight.doubt, parameters.size_scatter)
     gap = sight.frame - state[..., SEEN]
     missed = gap > sight.interval
     if not missed.any():
         return score
     # Who was lost may have stood still behind something: that tells where better than any velocity.
-    rest = _closeness(state, knobs.scatter**2 + knobs.rest_drift**2 * gap, centre, knobs)
-    rest = rest - _misfit(state, height, sight.doubt, knobs.size_scatter)
-    lost = functions.maximum(score, rest - knobs.rest_price)
+    rest = _closeness(state, parameters.scatter**2 + parameters.rest_drift**2 * gap, centre, parameters)
+    rest = rest - _misfit(state, height, sight.doubt, parameters.size_scatter)
+    lost = functions.maximum(score, rest - parameters.rest_price)
     late = functions.clip(gap - sight.interval, 0, None)
-    lost = lost - (knobs.missed + 0.5 * functions.log1p(late / _MISSED_FRAMES))[..., None]
+    lost = lost - (parameters.missed + 0.5 * functions.log1p(late / _MISSED_FRAMES))[..., None]
     # A target seen at the border after a gap is more likely another one.
     lost = lost - (
-        knobs.border * near_border(box_px, sight.size)[..., None, :] + knobs.left * left_at_border[..., None]
+        parameters.border * near_border(box_px, sight.size)[..., None, :] + parameters.left * left_at_border[..., None]
     )
     # Where targets keep appearing out of nowhere, this is one more rather than one come back.
     crowding = functions.log(functions.clip(sight.births / _USUAL_BIRTHS, 1.0, None))
-    lost = lost - functions.clip(knobs.births * crowding, None, _MOST_BIRTHS)
+    lost = lost - functions.clip(parameters.births * crowding, None, _MOST_BIRTHS)
     return functions.where(missed[..., None], lost, score)
 
 
-def _closeness(place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray, knobs: TrackKnobs) -> np.ndarray:
+def _closeness(
+    place: np.ndarray, variance: np.ndarray, centre_px: np.ndarray, parameters: TrackParameters
+) -> np.ndarray:
     """(N, M) logarithm of the density of centres around places, and the prior. variance: (N,) in squared heights."""
     functions = namespace(place)
     # Standing people move less up and down in the picture than across it.
     level = functions.ones_like(variance)
-    upright = functions.where(place[..., HEIGHT] > place[..., WIDTH], knobs.upright * level, level)
+    upright = functions.where(place[..., HEIGHT] > place[..., WIDTH], parameters.upright * level, level)
     unit = (place[..., HEIGHT] ** 2 * variance)[..., None]
     across = centre_px[..., None, :, 0] - place[..., X : X + 1]
     along = (centre_px[..., None, :, 1] - place[..., Y : Y + 1]) / upright[..., None]
     away = (across * across + along * along) / unit
-    peak = knobs.prior - functions.log(2 * math.pi * variance * upright)
-    return peak[..., None] - (1 + knobs.tail / 2) * functions.log1p(away / knobs.tail)
+    peak = parameters.prior - functions.log(2 * math.pi * variance * upright)
+    return peak[..., None] - (1 + parameters.tail / 2) * functions.log1p(away / parameters.tail)
 
 
 def _misfit(state: np.ndarray, height: np.ndarray, doubt: float, scatter: float) -> np.ndarray:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.engine import Vision
+from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.source import Source, looked_at
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.types import Adjustment, Detections, Followed, Frame, Scene, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Frame, Scene, TrackedFrame, Tracks
 
 if TYPE_CHECKING:
     from torchvision_dddas.tracking.source_tracker import PaperTracker
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def follow_scenes(
     scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
-) -> Iterator[Followed]:
+) -> Iterator[TrackedFrame]:
     """A clip's own detections. The registrations from frame to frame are chained over the interval.
 
     Each counts as certain: its score grades its contrast, and it has been confirmed over several frames already.
@@ -47,7 +47,7 @@ def follow_scenes(
         known = [step for step in steps if step is not None]
         now_from_before = chain(known) if known else None
         yield from follower.take(
-            Followed(
+            TrackedFrame(
                 number,
                 scene.frame,
                 scene.detections,
@@ -64,19 +64,23 @@ def follow_scenes(
 
 def _for_own(settings: Settings) -> Settings:
     """With the scatter of blobs, which come in parts, with shadows and joined, in place of that of whole targets."""
-    knobs = settings.track
-    own = {"scatter": knobs.own_scatter, "size_scatter": knobs.own_size_scatter, "births": knobs.own_births}
-    return settings.model_copy(update={"track": knobs.model_copy(update=own)})
+    parameters = settings.track
+    own = {
+        "scatter": parameters.own_scatter,
+        "size_scatter": parameters.own_size_scatter,
+        "births": parameters.own_births,
+    }
+    return settings.model_copy(update={"track": parameters.model_copy(update=own)})
 
 
 def follow_clip(
-    source: Source, table: DetectionTable, vision: Vision, settings: Settings, interval: int
-) -> Iterator[Followed]:
+    source: Source, table: DetectionTable, engine: Engine, settings: Settings, interval: int
+) -> Iterator[TrackedFrame]:
     """A table of detections along its clip. Frames that cannot be read, or lie after its end, are fed without picture.
 
     The camera's motion is taken from one picture to the next one that can be read.
     """
-    follower, camera, number = _follower(table, settings, interval, source.size), Camera(vision), 1
+    follower, camera, number = _follower(table, settings, interval, source.size), Camera(engine), 1
     start = time.perf_counter()
     for frame in source.every(interval):
         read = time.perf_counter()
@@ -92,7 +96,7 @@ def follow_clip(
     yield from follower.end()
 
 
-def follow_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[Followed]:
+def follow_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[TrackedFrame]:
     """A table alone: no registration, no appearance. From its first to its last row, frames without rows are empty.
 
     A stretch of these is left out from where all tracks are forgotten and settled to the frame before the next row.
@@ -131,14 +135,14 @@ def _of(
     now_from_before: np.ndarray | None = None,
     cause: str = "",
     seconds: dict[str, float] | None = None,
-) -> Followed:
+) -> TrackedFrame:
     lines = table.line[table.rows(number)]
-    return Followed(
+    return TrackedFrame(
         number, frame, table.at(number), Tracks(number), now_from_before, lines, cause, seconds=seconds or {}
     )
 
 
-def _unread(table: DetectionTable, number: int) -> Followed:
+def _unread(table: DetectionTable, number: int) -> TrackedFrame:
     return _of(table, number, cause="the frame could not be read")
 
 
@@ -162,9 +166,9 @@ class Follower:
         self.likeness = _likeness(settings)
         self.certain, self.pictures = certain, pictures
         self.spent = 0.0  # seconds on pictures, this frame's and, where a doubt asks for it later, the one before
-        self.waiting: deque[Followed] = deque()
+        self.waiting: deque[TrackedFrame] = deque()
 
-    def take(self, followed: Followed) -> Iterator[Followed]:
+    def take(self, followed: TrackedFrame) -> Iterator[TrackedFrame]:
         """Feed a frame, whose tracks are not known yet; yields the frames that are settled by it."""
         detections, frame, before = followed.detections, followed.frame, self.spent
         if self.certain:
@@ -189,11 +193,11 @@ class Follower:
         self.waiting.append(replace(followed, seconds=followed.seconds | took))
         yield from self._settle(settled)
 
-    def end(self) -> Iterator[Followed]:
+    def end(self) -> Iterator[TrackedFrame]:
         """The frames that were still waiting."""
         yield from self._settle(self.tracker.end())
 
-    def _settle(self, settled: list[Tracks]) -> Iterator[Followed]:
+    def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
         for tracks in settled:
             followed = self.waiting.popleft()
             assert followed.number == tracks.frame, "the tracker settles frames in the order in which they were fed"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import PaperKnobs, Settings
+from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.tracking import assignment, jaccard
 from torchvision_dddas.tracking import lagrangian as relaxation
@@ -44,7 +44,7 @@ class Look:
             if self._made.shape != (len(self), 768):
                 raise InputError(
                     f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
-                    f"got {self._made.shape}. Make them with vision.histograms.rgb_histograms."
+                    f"got {self._made.shape}. Make them with engine.histograms.rgb_histograms."
                 )
         assert self._made is not None
         return jaccard.per_channel(self._made) if normalization == "channel" else self._made
@@ -60,55 +60,59 @@ class Association:
     appearance_dispersion: float | None
 
 
-def associate(window: Sequence[Look], knobs: PaperKnobs) -> Association:
+def associate(window: Sequence[Look], parameters: PaperParameters) -> Association:
     """Assign the targets of two or three frames, newest first: weigh, gate, solve."""
     counts = [len(look) for look in window]
-    location = of_window([dispersion(look.centre_px, knobs.location_cut) for look in window], counts, knobs)
+    location = of_window([dispersion(look.centre_px, parameters.location_cut) for look in window], counts, parameters)
 
     def appearance() -> float:
-        found = [dispersion(look.histogram(knobs.histogram), knobs.appearance_cut) for look in window]
-        return of_window(found, counts, knobs)
+        found = [dispersion(look.histogram(parameters.histogram), parameters.appearance_cut) for look in window]
+        return of_window(found, counts, parameters)
 
     asked: float | None = None
     if not all(look.has_picture or not len(look) for look in window):
         weight = 1.0
-    elif knobs.rule == "fixed":
-        weight = knobs.weight
+    elif parameters.rule == "fixed":
+        weight = parameters.weight
     else:
-        weight, asked = location_weight(location, appearance, knobs.lowest_dispersion)
-    by_location = affinity([look.centre_px for look in window], knobs) if weight > 0 else None
-    by_appearance = affinity([look.histogram(knobs.histogram) for look in window], knobs) if weight < 1 else None
-    return Association(assign(by_location, by_appearance, weight, knobs), weight, location, asked)
+        weight, asked = location_weight(location, appearance, parameters.lowest_dispersion)
+    by_location = affinity([look.centre_px for look in window], parameters) if weight > 0 else None
+    by_appearance = (
+        affinity([look.histogram(parameters.histogram) for look in window], parameters) if weight < 1 else None
+    )
+    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, asked)
 
 
 def assign(
     location: Float[np.ndarray, "N1 M1 *L1"] | None,
     appearance: Float[np.ndarray, "N1 M1 *L1"] | None,
     weight: float,
-    knobs: PaperKnobs,
+    parameters: PaperParameters,
 ) -> Int[np.ndarray, "Z K"]:
     """The best assignment of affinities with a dummy first on each axis; a feature of no weight may be None.
 
     Every real target stands in exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
     """
     parts = [(share, score) for share, score in ((weight, location), (1 - weight, appearance)) if score is not None]
-    by_feature = knobs.gated == "features"
-    score = sum(share * (gate(part, knobs.threshold, knobs.gate) if by_feature else part) for share, part in parts)
+    by_feature = parameters.gated == "features"
+    score = sum(
+        share * (gate(part, parameters.threshold, parameters.gate) if by_feature else part) for share, part in parts
+    )
     assert isinstance(score, np.ndarray)
     if not by_feature:
-        score = gate(score, knobs.threshold, knobs.gate)
+        score = gate(score, parameters.threshold, parameters.gate)
     if score.ndim == 2:
         return _best_pairs(score)
-    if max(score.shape) - 1 <= knobs.exact_targets:
+    if max(score.shape) - 1 <= parameters.exact_targets:
         return assignment.triplets_exact(score)
-    return relaxation.triplets(score, knobs.gap).triplets
+    return relaxation.triplets(score, parameters.gap).triplets
 
 
-def affinity(features: Sequence[np.ndarray], knobs: PaperKnobs) -> np.ndarray:
+def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.ndarray:
     """Of the targets of two or three frames by one feature, newest first, with a dummy first on each axis."""
     if len(features) == 2:
         return jaccard.pairs(features[0], features[1])
-    return jaccard.triplets(features[0], features[1], features[2], knobs.dummy)
+    return jaccard.triplets(features[0], features[1], features[2], parameters.dummy)
 
 
 def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
@@ -128,9 +132,9 @@ class PaperTracker:
 
     def __init__(self, settings: Settings, interval_frames: int, size: tuple[float, float] | None = None) -> None:
         """interval_frames, size: not needed here; what is fed is what is associated, in pixels of the picture."""
-        self.knobs = settings.paper
-        self.window: deque[Look] = deque(maxlen=self.knobs.window)  # newest first
-        self.identities: deque[np.ndarray] = deque(maxlen=self.knobs.window)
+        self.parameters = settings.paper
+        self.window: deque[Look] = deque(maxlen=self.parameters.window)  # newest first
+        self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window)
         self.next_identity = 1
         self.association: Association | None = None  # the newest window's, to be looked at
 
@@ -152,7 +156,7 @@ class PaperTracker:
         self.window.appendleft(Look(detections.box_px, appearance))
         identity = np.zeros(len(detections), np.int64)
         if len(self.window) > 1:
-            self.association = associate(list(self.window), self.knobs)
+            self.association = associate(list(self.window), self.parameters)
             identity = inherited(self.association.rows, len(detections), list(self.identities)[: len(self.window) - 1])
         new = np.flatnonzero(identity == 0)
         identity[new] = self.next_identity + np.arange(len(new))

@@ -57,10 +57,10 @@ class Tracker:
 
     def __init__(self, settings: Settings, interval_frames: int, size: tuple[float, float] | None = None) -> None:
         """interval_frames: usual distance of the frames fed. size: (width, height) of the picture, None if unknown."""
-        self.knobs, self.interval, self.size = settings.track, interval_frames, size
-        self.pace = Pace(self.knobs.speed)
+        self.parameters, self.interval, self.size = settings.track, interval_frames, size
+        self.pace = Pace(self.parameters.speed)
         self.roster = Roster()
-        self.ledger = Ledger(self.knobs.hits, self.knobs.smooth, interval_frames)
+        self.ledger = Ledger(self.parameters.hits, self.parameters.smooth, interval_frames)
         self.begun = 0
         self.before: _Look | None = None
         self.waiting: _Look | None = None
@@ -80,15 +80,15 @@ class Tracker:
         appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, and maybe with
         the next frame. interval_frames: from the frame before, where that is not the usual distance.
         """
-        row = np.flatnonzero(detections.score >= self.knobs.min_score)
+        row = np.flatnonzero(detections.score >= self.parameters.min_score)
         box = detections.box_px[row]
-        asked = None if self.knobs.appearance == "never" else appearance
+        asked = None if self.parameters.appearance == "never" else appearance
         unknown = np.zeros((len(row), 0), np.float32), np.ones(len(row))
         interval = self.interval if interval_frames is None else interval_frames
         look = _Look(frame, box, detections.score[row], row, now_from_before, asked, *unknown, interval)
-        if self.knobs.appearance == "always":
+        if self.parameters.appearance == "always":
             look.examine()
-        if not self.knobs.look_ahead:
+        if not self.parameters.look_ahead:
             self._decide(look, None)
         else:
             if self.waiting is not None:
@@ -138,20 +138,20 @@ class Tracker:
 
     def _scores(self, roster: Roster, look: _Look, box_px: np.ndarray) -> np.ndarray:
         """(N, M) scores of links to a look's detections, whose boxes are given in the roster's coordinates."""
-        scores = link_scores(roster.state, roster.at_border, box_px, self._sight(look), self.knobs)
+        scores = link_scores(roster.state, roster.at_border, box_px, self._sight(look), self.parameters)
         if roster.signature.shape[1] and look.signature.shape[1]:
-            scores += likeness_scores(roster.signature, look.signature, look.visible, self.knobs)
+            scores += likeness_scores(roster.signature, look.signature, look.visible, self.parameters)
         return scores
 
     def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray, at_border: np.ndarray) -> Roster:
         """The tracks (K,) after a detection (K,) each. at_border: (M,) which of the look's detections are."""
         old, box, sight = self.roster, look.box_px[now], self._sight(look)
-        later = kalman.predicted(old.state[tracks], look.frame, sight.agility(self.knobs))
+        later = kalman.predicted(old.state[tracks], look.frame, sight.agility(self.parameters))
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], look.signature.shape[1])
         signature, seen = widened(old.signature, width)[tracks], widened(look.signature, width)[now]
         return Roster(
-            kalman.updated(later, box, look.frame, self.knobs.scatter, self.knobs.size_scatter),
+            kalman.updated(later, box, look.frame, self.parameters.scatter, self.parameters.size_scatter),
             blended(signature, seen, look.visible[now], hits) if width else signature,
             at_border[now],
             old.number[tracks],
@@ -162,7 +162,7 @@ class Tracker:
         """Tracks that would begin with each detection (M,) of a look, without numbers yet."""
         box, count = look.box_px, len(look.row)
         return Roster(
-            kalman.started(box, look.frame, self.knobs.scatter, self.pace.speed, self.knobs.size_scatter),
+            kalman.started(box, look.frame, self.parameters.scatter, self.pace.speed, self.parameters.size_scatter),
             look.signature,
             near_border(box, self.size),
             np.full(count, -1),
@@ -173,7 +173,7 @@ class Tracker:
         """Write down that these tracks (K,), now `followed`, have these detections (K,), and begin new ones."""
         unmatched = np.ones(len(look.row), bool)
         unmatched[now] = False
-        beginning = unmatched & (look.score >= self.knobs.birth_score)
+        beginning = unmatched & (look.score >= self.parameters.birth_score)
         new = np.flatnonzero(beginning)
         begun = replace(born.only(beginning), number=self.begun + np.arange(len(new)))
         self.begun += len(begun)
@@ -188,7 +188,7 @@ class Tracker:
 
     def _forget(self, look: _Look) -> None:
         """Drop the tracks that were lost too long ago, or left, or were seen too seldom to be anything."""
-        keep = remembered(self.roster.state, look.frame, look.interval, self.size, self.knobs)
+        keep = remembered(self.roster.state, look.frame, look.interval, self.size, self.parameters)
         late = look.frame - self.roster.state[:, SEEN] > (FILLED + 1) * look.interval
         if late.any():
             keep &= ~late | self.ledger.confirmed(self.roster.number)

@@ -1,7 +1,7 @@
 """What is true of a picture from the air: landmarks, telemetry and targets whose places are known, and their spreads.
 
-Which variances a knob adds to is asked of `targets.pose.prior_of` itself, with one knob at a time: the formulas stay
-there.
+Which variances a parameter adds to is asked of `targets.pose.prior_of` itself, with one parameter at a time: the
+formulas stay there.
 """
 
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchvision_dddas.config import AerialKnobs, LandmarkKnobs, Settings
+from torchvision_dddas.config import AerialParameters, LandmarkParameters, Settings
 from torchvision_dddas.geo.ground_rays import met_with_slopes
 from torchvision_dddas.geo.initial_pose import find_pose
 from torchvision_dddas.geo.landmark_faults import passes
 from torchvision_dddas.geo.pose_estimation import EXACT_M, Prior, bare_prior, expected_of, prior_of, slopes_at
 from torchvision_dddas.geo.terrain_intersection import Surface
 from torchvision_dddas.tuning.soft_places import Linear, Spread
-from torchvision_dddas.types import Camera, CameraPose, Flight, Marks
+from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 
 PRIOR = (
     "focal_sigma",
@@ -52,7 +52,7 @@ class Look:
     reference: CameraPose
     known: np.ndarray
     prior: Spread
-    marks: Marks
+    marks: LandmarkObservations
     places: Spread
     pixels: Spread
     targets_px: np.ndarray
@@ -76,7 +76,7 @@ class Laid:
 class Seen:
     """A look as an example has it: what its loss is taken from. settings: with what it was prepared.
 
-    fit: to go on from in place of a hard fit with the knobs of the moment (see `kept`); None: fit anew each time.
+    fit: to go on from in place of a hard fit with the parameters of the moment (see `kept`); None: fit anew each time.
     """
 
     look: Look
@@ -96,7 +96,7 @@ def kept(seen: Seen) -> Seen | None:
 def look_at(
     camera: Camera,
     flight: Flight | None,
-    marks: Marks,
+    marks: LandmarkObservations,
     targets_px: np.ndarray,
     true_m: np.ndarray,
     settings: Settings,
@@ -106,21 +106,21 @@ def look_at(
     focal_known: bool = True,
     surface: Surface | None = None,
 ) -> Look:
-    """A look whose knobs count for the rest.
+    """A look whose parameters count for the rest.
 
     marks: with the standard deviations of the settings. own: (n,) bool, which landmarks' reports do not say how well
     they are known, so that landmarks.sigma_m counts. side_px: (T,) of the boxes that aerial.own_sigma counts for.
     """
     aerial, landmarks = settings.aerial, settings.landmarks
-    of_knobs = _prior(flight, camera, aerial, focal_known)
+    of_parameters = _prior(flight, camera, aerial, focal_known)
     share = landmarks.sigma_m**2
     told = marks.sigma_m**2 - np.where(own, share, 0.0)
     count = len(targets_px)
     side = np.zeros(count) if side_px is None else side_px
     return Look(
         camera,
-        of_knobs.pose,
-        of_knobs.known,
+        of_parameters.pose,
+        of_parameters.known,
         _spread_of(flight, camera, focal_known),
         marks,
         Spread(_column(np.maximum(told, 0)), {"landmarks.sigma_m": _column(own)}),
@@ -136,11 +136,11 @@ def look_at(
     )
 
 
-def laid(look: Look, knobs: dict[str, torch.Tensor]) -> Laid | None:
+def laid(look: Look, parameters: dict[str, torch.Tensor]) -> Laid | None:
     """The hard fit with these knobs, detached; None where no pose shows the landmarks, or a ray meets no ground."""
     n = len(look.marks)
-    prior, sigma_m, pixel_sigma = _hard(look, knobs)
-    marks = Marks(
+    prior, sigma_m, pixel_sigma = _hard(look, parameters)
+    marks = LandmarkObservations(
         look.marks.landmark,
         look.marks.image_px,
         look.marks.east_north_m,
@@ -165,11 +165,11 @@ def laid(look: Look, knobs: dict[str, torch.Tensor]) -> Laid | None:
     return Laid(problem, _column(place - look.true_m), _column(by_pose), _column(by_pixel))
 
 
-def only_noise(look: Look, knobs: dict[str, torch.Tensor], probability: float) -> bool:
+def only_noise(look: Look, parameters: dict[str, torch.Tensor], probability: float) -> bool:
     """Whether landmarks and telemetry agree, if not by what is said of their errors then by NO_NOISE times as much."""
-    prior, sigma_m, pixel_sigma = _hard(look, knobs)
+    prior, sigma_m, pixel_sigma = _hard(look, parameters)
     wide = Prior(prior.pose, prior.information / NO_NOISE**2)
-    marks = Marks(
+    marks = LandmarkObservations(
         look.marks.landmark,
         look.marks.image_px,
         look.marks.east_north_m,
@@ -181,29 +181,31 @@ def only_noise(look: Look, knobs: dict[str, torch.Tensor], probability: float) -
 
 
 def joined(parts: Sequence[Spread]) -> Spread:
-    """Spreads of equal length and knobs, one above the other."""
+    """Spreads of equal length and parameters, one above the other."""
     gain = {name: torch.stack([part.gain[name] for part in parts]) for name in parts[0].gain}
     return Spread(torch.stack([part.base for part in parts]), gain)
 
 
-def _hard(look: Look, knobs: dict[str, torch.Tensor]) -> tuple[Prior, np.ndarray, np.ndarray]:
-    """What is expected under these knobs: the prior, and standard deviations of landmarks' places and pixels."""
+def _hard(look: Look, parameters: dict[str, torch.Tensor]) -> tuple[Prior, np.ndarray, np.ndarray]:
+    """What is expected under these parameters: the prior, and standard deviations of landmarks' places and pixels."""
     with torch.no_grad():
-        variance = look.prior.variance(knobs).numpy()
-        sigma_m = look.places.variance(knobs).clamp(min=EXACT_M**2).sqrt().numpy()
-        pixel_sigma = look.pixels.variance(knobs).sqrt().numpy()
+        variance = look.prior.variance(parameters).numpy()
+        sigma_m = look.places.variance(parameters).clamp(min=EXACT_M**2).sqrt().numpy()
+        pixel_sigma = look.pixels.variance(parameters).sqrt().numpy()
     return Prior(look.reference, np.diag(look.known / np.maximum(variance, _FLOOR))), sigma_m, pixel_sigma
 
 
-def _prior(flight: Flight | None, camera: Camera, knobs: AerialKnobs, focal_known: bool) -> Prior:
-    return prior_of(flight, camera, knobs, focal_known=focal_known) or bare_prior(camera, knobs, focal_known)
+def _prior(flight: Flight | None, camera: Camera, parameters: AerialParameters, focal_known: bool) -> Prior:
+    return prior_of(flight, camera, parameters, focal_known=focal_known) or bare_prior(camera, parameters, focal_known)
 
 
 def _spread_of(flight: Flight | None, camera: Camera, focal_known: bool) -> Spread:
-    """What each knob adds to the variances of the prior."""
+    """What each parameter adds to the variances of the prior."""
 
-    def variance(**knobs: float) -> np.ndarray:
-        prior = _prior(flight, camera, AerialKnobs().model_copy(update=dict.fromkeys(PRIOR, 0.0) | knobs), focal_known)
+    def variance(**parameters: float) -> np.ndarray:
+        prior = _prior(
+            flight, camera, AerialParameters().model_copy(update=dict.fromkeys(PRIOR, 0.0) | parameters), focal_known
+        )
         return np.where(prior.known, 1 / np.maximum(np.diag(prior.information), 1e-300), 0.0)
 
     base = variance()
@@ -224,14 +226,17 @@ SPREADS = (
     "landmarks.sigma_m",
     "landmarks.common_sigma_m",
 )
-"""All knobs that have a say in where ellipses from the air lie and how large they are."""
+"""All parameters that have a say in where ellipses from the air lie and how large they are."""
 
 
 def of_settings(settings: Settings) -> dict[str, torch.Tensor]:
     """The values of SPREADS."""
-    groups: dict[str, AerialKnobs | LandmarkKnobs] = {"aerial": settings.aerial, "landmarks": settings.landmarks}
+    groups: dict[str, AerialParameters | LandmarkParameters] = {
+        "aerial": settings.aerial,
+        "landmarks": settings.landmarks,
+    }
     values = {}
     for name in SPREADS:
-        group, _, knob = name.partition(".")
-        values[name] = torch.tensor(float(getattr(groups[group], knob)), dtype=torch.float64)
+        group, _, parameter = name.partition(".")
+        values[name] = torch.tensor(float(getattr(groups[group], parameter)), dtype=torch.float64)
     return values

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import PaperKnobs, Settings
+from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
@@ -30,8 +30,8 @@ WINDOWS = 10
 SOFTNESS: Mapping[str, tuple[float, float]] = {"wrong": (0.1, 0.02), "likelihood": (0.05, 0.05)}
 """Of affinities, by loss, at the first and the last step.
 
-wrong: the targets that are expected to be linked wrongly. likelihood: of the true links; it follows those that no knob
-can save, the more so the colder it is.
+wrong: the targets that are expected to be linked wrongly. likelihood: of the true links; it follows those that no
+parameter can save, the more so the colder it is.
 """
 
 
@@ -68,7 +68,7 @@ class Affinities:
         return replace(self, interval=interval_frames)
 
     def check(self, names: Sequence[str], settings: Settings) -> None:
-        """Raises InputError for knobs that these settings never ask, and settings that have no loss here."""
+        """Raises InputError for parameters that these settings never ask, and settings that have no loss here."""
         paper = settings.paper
         idle = {
             "dispersion": ("paper.weight",),
@@ -104,12 +104,12 @@ class Affinities:
                 tick()
         return found
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) of a box of the newer frames: the share of wrong ones, or nats. See `family.Family`."""
         settings: Settings = batch[0].content.settings
-        tuned = {name.removeprefix("paper."): value for name, value in knobs.items()}
-        paper = PaperKnobs.model_construct(**(dict(settings.paper) | tuned))
-        device = next(iter(knobs.values())).device
+        tuned = {name.removeprefix("paper."): value for name, value in parameters.items()}
+        paper = PaperParameters.model_construct(**(dict(settings.paper) | tuned))
+        device = next(iter(parameters.values())).device
         windows = together([window for example in batch for window in example.content.windows], device)
         lost = (wrong_links if self.loss_name == "wrong" else unlikeliness)(paper, windows, softness)
         owner = np.repeat(np.arange(len(batch)), [len(example.content.windows) for example in batch])
@@ -141,25 +141,25 @@ def _boxes(windows: Windows, like: Tensor) -> Tensor:
 
 
 def _windows(
-    clip: Clip, table: TrackTable, knobs: PaperKnobs, interval: int
+    clip: Clip, table: TrackTable, parameters: PaperParameters, interval: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
     """The newer frame's number and what is known of it and the one before."""
     before: tuple[np.ndarray, Look] | None = None
     for number, identity, look in _looks(clip, table, interval):
         if before is not None:
-            yield number, window_of((look, before[1]), (identity, before[0]), knobs)
+            yield number, window_of((look, before[1]), (identity, before[0]), parameters)
         before = identity, look
 
 
 def window_of(
-    looks: tuple[Look, Look], identities: tuple[np.ndarray, np.ndarray], knobs: PaperKnobs
+    looks: tuple[Look, Look], identities: tuple[np.ndarray, np.ndarray], parameters: PaperParameters
 ) -> dict[str, np.ndarray]:
     """One of `Windows`, without its first axis. looks, identities: newer frame first."""
     counts = [len(look) for look in looks]
     pictured = all(look.has_picture or not len(look) for look in looks)
     features = [[look.centre_px for look in looks]]
-    features += [[look.histogram(knobs.histogram) for look in looks]] if pictured else features
-    similarity = np.stack([affinity(pair, knobs) for pair in features])
+    features += [[look.histogram(parameters.histogram) for look in looks]] if pictured else features
+    similarity = np.stack([affinity(pair, parameters) for pair in features])
     joined, there = np.zeros((2, 2, max(counts), max(counts))), np.zeros((2, max(counts)), bool)
     for frame, count in enumerate(counts):
         there[frame, :count] = True
@@ -167,13 +167,13 @@ def window_of(
             joined[place, frame, :count, :count] = joined_at(dissimilarity(pair[frame]))
     return {
         "similarity": similarity,
-        "alternative": np.stack([alternatives(score, knobs.gate) for score in similarity]),
+        "alternative": np.stack([alternatives(score, parameters.gate) for score in similarity]),
         "now": np.ones(counts[0], bool),
         "before": np.ones(counts[1], bool),
         "true": identities[0][:, None] == identities[1][None],
         "joined_at": joined,
         "there": there,
-        "speaks": np.arange(2) < speaking(counts, knobs),
+        "speaks": np.arange(2) < speaking(counts, parameters),
         "pictured": np.array(pictured),
     }
 

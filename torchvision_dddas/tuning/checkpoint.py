@@ -14,20 +14,22 @@ from torchvision_dddas.config import changes
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 from torchvision_dddas.tuning.family import Family, loss_of
-from torchvision_dddas.tuning.parameters import Knobs
+from torchvision_dddas.tuning.parameters import Parameters
 
 FORMAT = 3
 
 
-def facts(family: Family, knobs: Knobs, plan: Mapping[str, Any], seen: Sequence[str], cost: object) -> dict[str, Any]:
+def facts(
+    family: Family, parameters: Parameters, plan: Mapping[str, Any], seen: Sequence[str], cost: object
+) -> dict[str, Any]:
     """What a descent depends on, in words and numbers. seen: its examples, in order."""
     return {
         "family": family.name,
         "task": family.task,
         "interval": getattr(family, "interval", 1),
         "loss": loss_of(family),
-        "knobs": ", ".join(knobs.names),
-        "settings": json.dumps(changes(knobs.base), default=str),
+        "knobs": ", ".join(parameters.names),
+        "settings": json.dumps(changes(parameters.base), default=str),
         **plan,
         "examples": hashlib.sha256("\n".join(seen).encode()).hexdigest()[:16],
         "cost": "" if cost is None else repr(cost),

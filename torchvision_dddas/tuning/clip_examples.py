@@ -21,14 +21,14 @@ from torchvision_dddas.geo.elevation import surface
 from torchvision_dddas.geo.landmark_trajectories import Courses
 from torchvision_dddas.tuning.aerial_examples import Seen, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.types import Grounded
+from torchvision_dddas.types import AerialLocations
 
 if TYPE_CHECKING:
     from torchvision_dddas.cli.aerial import AerialInput
     from torchvision_dddas.io.detection_tables import DetectionTable
 
 PROBE = 2.0
-"""What landmarks.sigma_m adds to a variance is told by what the variance is at so many times the knob."""
+"""What landmarks.sigma_m adds to a variance is told by what the variance is at so many times the parameter."""
 
 
 def looks_of(clip: Clip, settings: Settings, backend: str = "auto") -> Iterator[Example]:
@@ -54,7 +54,7 @@ def _look(
     truth: Truth,
     places: Positions,
     locator: Locator,
-    grounded: Grounded,
+    grounded: AerialLocations,
     targets: Targets,
     probe: Courses,
     added: float,
@@ -101,10 +101,10 @@ def _look(
 
 def _probe(locator: Locator) -> tuple[Courses, float]:
     """The landmarks' courses with another landmarks.sigma_m, and by how much its square is more."""
-    knobs = locator.settings.landmarks
-    wider = max(PROBE * knobs.sigma_m, 1.0)
-    other = knobs.model_copy(update={"sigma_m": wider})
-    return Courses(locator.site.landmarks, other, locator.rate_hz), wider**2 - knobs.sigma_m**2
+    parameters = locator.settings.landmarks
+    wider = max(PROBE * parameters.sigma_m, 1.0)
+    other = parameters.model_copy(update={"sigma_m": wider})
+    return Courses(locator.site.landmarks, other, locator.rate_hz), wider**2 - parameters.sigma_m**2
 
 
 def _true_m(clip: Clip, places: Positions, origin: tuple[float, float] | None) -> np.ndarray:
@@ -125,7 +125,7 @@ def _given(clip: Clip) -> "AerialInput":
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
-def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, Grounded, Targets]]:
+def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
     from torchvision_dddas.cli.prepared import prepared
     from torchvision_dddas.evaluation.studies.stages import opened
     from torchvision_dddas.pipeline import survey
@@ -133,7 +133,7 @@ def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locat
     source = opened(clip)
     ready = prepared(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
     assert ready.watch is not None, "there are landmarks"
-    for surveyed in survey(source, ready.vision, ready.settings, ready.flight, ready.watch, pictures=False):
+    for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, pictures=False):
         grounded = surveyed.grounded
         if grounded is not None:
             count = len(grounded.box_px)
@@ -142,7 +142,7 @@ def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locat
             yield ready.watch.locator, grounded, targets
 
 
-def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, Grounded, Targets]]:
+def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
     from torchvision_dddas.cli.aerial import locator_for
     from torchvision_dddas.geo import check_table, locate
     from torchvision_dddas.io.detection_tables import read_detections

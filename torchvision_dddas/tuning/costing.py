@@ -3,14 +3,15 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, stdev
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Found, Task
@@ -19,7 +20,7 @@ from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 from torchvision_dddas.tuning.parameters import TUNABLE
 
 FACTORS = (0.5, 2.0)
-"""A knob is measured at its value, and at these parts and multiples of it, within its range."""
+"""A parameter is measured at its value, and at these parts and multiples of it, within its range."""
 
 REPEATS = 3
 NOISE = 2.0
@@ -28,15 +29,15 @@ NOISE = 2.0
 
 @dataclass(frozen=True)
 class Curve:
-    """How many times as long a frame takes at some values of a knob, which ascend; 1 at the value that it has."""
+    """How many times as long a frame takes at some values of a parameter, which ascend; 1 at the value that it has."""
 
-    knob: str
+    parameter: str
     values: tuple[float, ...]
     times: tuple[float, ...]
 
     def factor(self, value: Tensor) -> Tensor:
         """Between the values in straight lines over the knob's scale, beyond them as at the last."""
-        tunable = TUNABLE[self.knob]
+        tunable = TUNABLE[self.parameter]
         values = torch.tensor(self.values, dtype=value.dtype, device=value.device)
         places, here = (((x + tunable.offset).log() if tunable.log else x) for x in (values, value))
         found = value.new_tensor(self.times[0]) + 0 * value
@@ -54,16 +55,21 @@ class TimeCost:
     seconds: float
     curves: tuple[Curve, ...]
 
-    def term(self, knobs: Mapping[str, Tensor]) -> Tensor:
-        """Weight × (expected seconds / seconds with the settings as they are − 1)."""
-        return self.weight * (self.expected(knobs) / self.seconds - 1)
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers and texts, as `read` takes them."""
+        curves = [{"knob": c.parameter, "values": list(c.values), "times": list(c.times)} for c in self.curves]
+        return {"weight": self.weight, "seconds": self.seconds, "curves": curves}
 
-    def expected(self, knobs: Mapping[str, Tensor]) -> Tensor:
+    def term(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Weight × (expected seconds / seconds with the settings as they are − 1)."""
+        return self.weight * (self.expected(parameters) / self.seconds - 1)
+
+    def expected(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Seconds a frame: the knobs' factors multiplied, as if none changed what another costs."""
         found = torch.tensor(self.seconds, dtype=torch.float64)
         for curve in self.curves:
-            if curve.knob in knobs:
-                found = found * curve.factor(knobs[curve.knob])
+            if curve.parameter in parameters:
+                found = found * curve.factor(parameters[curve.parameter])
         return found
 
 
@@ -103,7 +109,7 @@ def measured(
 
 
 def points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
-    """What is timed: a knob and its value, and first no knob at all."""
+    """What is timed: a parameter and its value, and first no parameter at all."""
     found = [("", 0.0)]
     for name in names:
         tunable, start = TUNABLE[name], _value(settings, name)
@@ -119,7 +125,7 @@ def write(place: Path, cost: TimeCost) -> None:
     """Keep what was measured: another time it would be a little other. Raises InputError where the disk refuses."""
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(place, (json.dumps(asdict(cost), indent=2) + "\n").encode())
+        write_whole(place, (json.dumps(cost.as_json(), indent=2) + "\n").encode())
     except OSError as error:
         raise cannot_write(place, error) from error
 
@@ -136,7 +142,7 @@ def read(place: Path) -> TimeCost:
             raise ValueError
         return TimeCost(float(told["weight"]), float(told["seconds"]), tuple(curves))
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        raise InputError(f"{place} does not tell the cost of the knobs; begin again without --resume") from None
+        raise InputError(f"{place} does not tell the cost of the parameters; begin again without --resume") from None
 
 
 def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
@@ -153,7 +159,7 @@ def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable
 
 def _at(settings: Settings, point: tuple[str, float]) -> Settings:
     name, value = point
-    return with_knobs(settings, {name: TUNABLE[name].rounded(value)}) if name else settings
+    return with_parameters(settings, {name: TUNABLE[name].rounded(value)}) if name else settings
 
 
 def _possible(settings: Settings, point: tuple[str, float]) -> bool:

@@ -19,7 +19,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.tuning import checkpoint
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.nonfinite import blamed
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.split import batch_of, parted, shares
 
 FADED = 0.1
@@ -29,18 +29,18 @@ SIZED = 0.5
 """Of the steps: after them sizes are whole, and what is no size follows; where such has no say, sizes go on."""
 
 GAIN = 1e-5
-"""A loss that is less by no more than this is rounding, and no reason to move a knob."""
+"""A loss that is less by no more than this is rounding, and no reason to move a parameter."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How to descend. rate: of Adam, in units of which one is about a factor e of a knob.
+    """How to descend. rate: of Adam, in units of which one is about a factor e of a parameter.
 
     look_every: steps from one look at the watched examples to the next. patience: looks without a gain that end the
     descent. watched: share of each clip's examples, its last, that nothing is learned from. most_watched: of all clips
     together. most_s: no step is begun after so many seconds. pull: towards the knobs' values before the first step; a
-    loss is charged half of it times the square of how far each knob is from there, in the rate's units: what few
-    examples say weakly does not move a knob far.
+    loss is charged half of it times the square of how far each parameter is from there, in the rate's units: what few
+    examples say weakly does not move a parameter far.
     """
 
     steps: int = 100
@@ -70,14 +70,14 @@ class Plan:
 class Cost(Protocol):
     """What a loss is charged for time: see `costing`."""
 
-    def term(self, knobs: Mapping[str, Tensor]) -> Tensor:
+    def term(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """To be added to a loss, a number without axes."""
         ...
 
 
 @dataclass(frozen=True)
 class Step:
-    """The knobs after a step, of which 0 is before the first, and the losses, which hold the cost.
+    """The parameters after a step, of which 0 is before the first, and the losses, which hold the cost.
 
     loss: of the step's batch, NaN at step 0. watched: the mean of the watched examples, as hard as at the last step;
     None where they were not looked at.
@@ -87,18 +87,18 @@ class Step:
     softness: float
     loss: float
     watched: float | None
-    knobs: Mapping[str, float]
+    parameters: Mapping[str, float]
 
 
 @dataclass
 class Descended:
-    """What became of it. knobs: in their best state, which is that after step `best`. ended: why, in words.
+    """What became of it. parameters: in their best state, which is that after step `best`. ended: why, in words.
 
-    failed: in a line, which clip, frame and knob gave no number; empty where all went well. taken: steps in `seconds`,
-    without those that a checkpoint held.
+    failed: in a line, which clip, frame and parameter gave no number; empty where all went well. taken: steps in
+    `seconds`, without those that a checkpoint held.
     """
 
-    knobs: Knobs
+    parameters: Parameters
     best: int
     history: list[Step] = field(default_factory=list)
     ended: str = ""
@@ -110,12 +110,12 @@ class Descended:
     @property
     def settings(self) -> Settings:
         """The settings of the best state, as every command takes them."""
-        return self.knobs.settings()
+        return self.parameters.settings()
 
 
 def descend(
     family: Family,
-    knobs: Knobs,
+    parameters: Parameters,
     examples: Sequence[Example],
     plan: Plan | None = None,
     cost: Cost | None = None,
@@ -126,13 +126,13 @@ def descend(
     """Move knobs to where the family's loss is least. The knobs that are given are moved, and end in their best state.
 
     place: the file of a checkpoint, written at every look. resume: go on from it if it is there; tell is then called
-    for the steps that it holds too. Raises InputError where there are no examples, where no knob has a say in the loss,
-    where the loss is no number before the first step, and for a checkpoint of another descent.
+    for the steps that it holds too. Raises InputError where there are no examples, where no parameter has a say in the
+    loss, where the loss is no number before the first step, and for a checkpoint of another descent.
     """
     plan = plan or Plan()
     if not examples:
         raise InputError(f"there is nothing to tune {family.name} on; wanted clips with truth that it can learn from")
-    run = _Run(family, knobs, examples, plan, cost)
+    run = _Run(family, parameters, examples, plan, cost)
     began = time.perf_counter()
     if resume and place is not None and place.is_file():
         run.load(place)
@@ -159,12 +159,12 @@ class _Run:
     """A descent under way."""
 
     def __init__(
-        self, family: Family, knobs: Knobs, examples: Sequence[Example], plan: Plan, cost: Cost | None
+        self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan, cost: Cost | None
     ) -> None:
-        self._family, self._knobs, self._plan, self._cost = family, knobs, plan, cost
+        self._family, self._parameters, self._plan, self._cost = family, parameters, plan, cost
         self._learned, self._watched = parted(examples, plan.watched, plan.most_watched)
         self._clips = [example.clip for example in self._learned]
-        self._adam = torch.optim.Adam(knobs.parameters(), lr=plan.rate, betas=(0.9, 0.99))
+        self._adam = torch.optim.Adam(parameters.parameters(), lr=plan.rate, betas=(0.9, 0.99))
         self._moved: set[str] = set()
         self._best: dict[str, Tensor] = {}
         self._least, self._best_step, self._since = math.inf, 0, 0
@@ -174,7 +174,7 @@ class _Run:
     def begin(self) -> Step:
         """Look before the first step."""
         with torch.no_grad():
-            values = self._knobs.values()
+            values = self._parameters.values()
         if cause := self._unfit(self._watched, values, self._hardest):
             raise InputError(f"{cause}, before the first step")
         return self._told(0, self._softness(1), math.nan, look=True)
@@ -186,7 +186,7 @@ class _Run:
         batch = [self._learned[i] for i in batch_of(number - 1, self._clips, self._plan.batch, self._plan.seed)]
         follow = any(TUNABLE[name].rounding == "none" for name in self._moved)
         whole = number > SIZED * self._plan.steps and follow
-        values = self._knobs.values(whole)
+        values = self._parameters.values(whole)
         for value in values.values():
             if value.requires_grad:
                 value.retain_grad()
@@ -197,7 +197,7 @@ class _Run:
             self._fail(number, batch, values, softness)
             return None
         if not (charged.requires_grad or self._moved or self._heard(values, softness)):
-            raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(self._knobs.names)}")
+            raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(self._parameters.names)}")
         self._adam.zero_grad()
         if loss.requires_grad:
             loss.backward()
@@ -226,7 +226,7 @@ class _Run:
     def load(self, place: Path) -> None:
         """Take up what a checkpoint holds. Raises InputError for one of another descent."""
         state = checkpoint.read(place, self._facts())
-        self._knobs.load_state_dict(state["knobs"])
+        self._parameters.load_state_dict(state["knobs"])
         self._adam.load_state_dict(state["adam"])
         self._best, self._least, self._best_step = state["best"], state["least"], state["best_step"]
         self._since, self._moved = state["since"], set(state["moved"])
@@ -238,7 +238,7 @@ class _Run:
         if place is None:
             return
         state = {
-            "knobs": self._knobs.state_dict(),
+            "knobs": self._parameters.state_dict(),
             "adam": self._adam.state_dict(),
             "best": self._best,
             "least": self._least,
@@ -252,19 +252,21 @@ class _Run:
         checkpoint.write(place, self._facts(), state)
 
     def result(self, seconds: float, held: int) -> Descended:
-        """The knobs in their best state, and how they came there."""
-        self._knobs.load_state_dict(self._best)
+        """The parameters in their best state, and how they came there."""
+        self._parameters.load_state_dict(self._best)
         ended = self.ended or "a loss was no number"
-        idle = tuple(name for name in self._knobs.names if name not in self._moved) if len(self.history) > 1 else ()
+        idle = (
+            tuple(name for name in self._parameters.names if name not in self._moved) if len(self.history) > 1 else ()
+        )
         taken = self.history[-1].step - held
-        return Descended(self._knobs, self._best_step, self.history, ended, self.failed, seconds, idle, taken)
+        return Descended(self._parameters, self._best_step, self.history, ended, self.failed, seconds, idle, taken)
 
     def _told(self, number: int, softness: float, loss: float, look: bool) -> Step:
-        """Take note of the knobs as they are now, and where they are looked at of how good they are."""
+        """Take note of the parameters as they are now, and where they are looked at of how good they are."""
         with torch.no_grad():
-            values = self._knobs.values()
+            values = self._parameters.values()
             # Rounded as settings are: between whole sizes a blend may do well, and either of them badly.
-            settled = self._knobs.settled() if look else {}
+            settled = self._parameters.settled() if look else {}
             watched = self._mean(settled) if look else None
         if watched is not None and not math.isfinite(watched):
             self._fail(number, self._watched, settled, self._hardest)
@@ -279,7 +281,7 @@ class _Run:
     def _judge(self, number: int, watched: float) -> None:
         if not self._best or watched < self._least - GAIN:
             self._least, self._best_step, self._since = watched, number, 0
-            self._best = {name: value.clone() for name, value in self._knobs.state_dict().items()}
+            self._best = {name: value.clone() for name, value in self._parameters.state_dict().items()}
             return
         self._since += 1
         if self._since >= self._plan.patience:
@@ -299,13 +301,13 @@ class _Run:
         return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
 
     def _pull(self, whole: bool = False) -> Tensor:
-        """For what the knobs are away from where they began; whole: sizes stay where they are."""
+        """For what the parameters are away from where they began; whole: sizes stay where they are."""
         if not self._plan.pull:
             return torch.zeros((), dtype=torch.float64)
-        return self._plan.pull / 2 * self._knobs.moved(whole)
+        return self._plan.pull / 2 * self._parameters.moved(whole)
 
     def _heard(self, values: Mapping[str, Tensor], softness: float) -> bool:
-        """Whether any example that is learned from depends on a knob; that of one batch may not."""
+        """Whether any example that is learned from depends on a parameter; that of one batch may not."""
         size = self._plan.batch
         parts = (self._learned[i : i + size] for i in range(0, len(self._learned), size))
         return any(self._family.loss(values, part, softness).requires_grad for part in parts)
@@ -314,7 +316,7 @@ class _Run:
         self.failed = f"{self._unfit(batch, values, softness) or 'the cost is no number'}, at step {number}"
 
     def _unfit(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
-        known = [self.history[i].knobs for i in (-1, self._best_step, 0)] if self.history else []
+        known = [self.history[i].parameters for i in (-1, self._best_step, 0)] if self.history else []
         before = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
         return blamed(self._family, batch, values, before, softness, self._plan.batch)
 
@@ -331,4 +333,4 @@ class _Run:
         """What a descent depends on: of a checkpoint it has to be the same."""
         plan = {name: value for name, value in asdict(self._plan).items() if name != "most_s"}
         seen = [f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched)]
-        return checkpoint.facts(self._family, self._knobs, plan, seen, self._cost)
+        return checkpoint.facts(self._family, self._parameters, plan, seen, self._cost)

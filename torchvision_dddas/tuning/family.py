@@ -1,7 +1,7 @@
 """What a family of knobs has to offer to be tuned: examples of what is true, and a loss on them that has a gradient.
 
-A family is a stage of the pipeline together with those of its knobs that a gradient can move (`modules.tunable`). The
-loop of `descent` knows nothing else of it.
+A family is a stage of the pipeline together with those of its parameters that a gradient can move (`modules.tunable`).
+The loop of `descent` knows nothing else of it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -69,11 +69,11 @@ class Family(Protocol):
         """
         ...
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """How wrong each example is: (B,), least is best, with a gradient in the knobs; on the knobs' device.
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """How wrong each example is: (B,), least is best, with a gradient in the parameters; on the knobs' device.
 
-        knobs: values in the units of `settings`, scalars or (n,), by name: those tuned alone; what is not tuned is as
-        in the settings that the examples were prepared with. The result depends on nothing but the arguments.
+        parameters: values in the units of `settings`, scalars or (n,), by name: those tuned alone; what is not tuned is
+        as in the settings that the examples were prepared with. The result depends on nothing but the arguments.
         """
         ...
 
@@ -89,10 +89,10 @@ class Timed(Protocol):
 
 @runtime_checkable
 class Particular(Protocol):
-    """A family whose knobs have a say under some settings alone."""
+    """A family whose parameters have a say under some settings alone."""
 
     def check(self, names: Sequence[str], settings: Settings) -> None:
-        """Raises InputError in one line, with what to set, where one of its knobs would be tuned for nothing."""
+        """Raises InputError in one line, with what to set, where one of its parameters would be tuned for nothing."""
         ...
 
 
@@ -134,6 +134,6 @@ def family_of(name: str) -> Family:
     module = f"{__package__}.{FAMILIES[name]}" if name in FAMILIES else ""
     if not module or find_spec(module) is None:
         known = [known for known, file in FAMILIES.items() if find_spec(f"{__package__}.{file}") is not None]
-        raise InputError(f"'{name}' is no family of knobs that can be tuned; wanted one of {', '.join(known)}")
+        raise InputError(f"'{name}' is no family of parameters that can be tuned; wanted one of {', '.join(known)}")
     found: Family = import_module(module).family()
     return found

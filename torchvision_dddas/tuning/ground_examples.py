@@ -1,7 +1,8 @@
 """What clips tell of places of people seen from the ground, and how surprising their errors are.
 
-`targets.ranging.sight` weighs height and foot row by knobs, and settles where they disagree: it is smooth in its three
-noise knobs, and so quick for a whole table that its slope is taken by differences of the hard function itself.
+`targets.ranging.sight` weighs height and foot row by parameters, and settles where they disagree: it is smooth in its
+three noise parameters, and so quick for a whole table that its slope is taken by differences of the hard function
+itself.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +25,7 @@ from torchvision_dddas.types import Camera, Poses
 KNOBS = ("ground.body_height_sigma_m", "ground.height_sigma", "ground.feet_sigma")
 
 _STEP = 1e-4
-"""Of a difference, as a share of the knob, or of the least that counts."""
+"""Of a difference, as a share of the parameter, or of the least that counts."""
 
 _LEAST = 1e-3
 
@@ -81,9 +82,9 @@ def sighted(camera: Camera, box_px: np.ndarray, cut: np.ndarray, true_m: np.ndar
     return Sighted(camera, box_px, cut, poses, place, true_m)
 
 
-def person_lost(seen: Sighted, settings: Settings, knobs: Mapping[str, Tensor], unplaced: float) -> Tensor:
-    """() nats a person; those whom the knobs leave without a place cost `unplaced`, without a slope."""
-    values = {name: knobs[name] for name in KNOBS if name in knobs}
+def person_lost(seen: Sighted, settings: Settings, parameters: Mapping[str, Tensor], unplaced: float) -> Tensor:
+    """() nats a person; those whom the parameters leave without a place cost `unplaced`, without a slope."""
+    values = {name: parameters[name] for name in KNOBS if name in parameters}
 
     def hard(*given: float) -> np.ndarray:
         changed = dict(zip((name.partition(".")[2] for name in values), given, strict=True))

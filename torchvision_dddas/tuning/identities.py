@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import Settings, TrackKnobs
+from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
@@ -36,7 +36,7 @@ LOOKS = 25
 MISSED = 4.0
 """Margin of a true link by detections. A likelihood alone would rather link nothing than a false alarm, and closes the
 gate; of a track that breaks, all that follows counts as another target. Of 0, 2, 4 and 6, not each with all margins of
-wrong links, pulls and sets of knobs, the best by IDF1 of MOT15 sequences held out: chosen by them, that is."""
+wrong links, pulls and sets of parameters, the best by IDF1 of MOT15 sequences held out: chosen by them, that is."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,12 @@ class Identities:
             )
         return found
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) nats a link, at softness 1. See `family.Family`."""
         settings: Settings = batch[0].content.settings
-        tuned = {name.removeprefix("track."): value for name, value in knobs.items() if name.startswith("track.")}
-        track = TrackKnobs.model_construct(**(dict(settings.track) | tuned))
-        device = next(iter(knobs.values())).device
+        tuned = {name.removeprefix("track."): value for name, value in parameters.items() if name.startswith("track.")}
+        track = TrackParameters.model_construct(**(dict(settings.track) | tuned))
+        device = next(iter(parameters.values())).device
         return unlikeliness(
             track, together([example.content for example in batch], device), softness, self.missed, self.wrong
         )

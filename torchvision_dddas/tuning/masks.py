@@ -1,4 +1,4 @@
-"""The knobs of motion: masks of labelled frames, and how far soft ones are from them."""
+"""The parameters of motion: masks of labelled frames, and how far soft ones are from them."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
@@ -51,7 +51,7 @@ class Labelled:
 
 
 class Masks:
-    """Implements `Family` for the knobs of motion.
+    """Implements `Family` for the parameters of motion.
 
     wrong: the loss, one of `overlap`. passing: masks are hard, their gradient that of soft ones. after: what the hard
     steps after the hulls do near the settings that examples are prepared with is kept (see `Labelled`); without it
@@ -89,19 +89,19 @@ class Masks:
         check_masks(clips, still=True)
         return [example for clip in clips for example in _examples(clip, settings, self.after, tick)]
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) 1 - F of each frame."""
         groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for place, example in enumerate(batch):
             groups[cast(Labelled, example.content).differences.least.shape].append(place)
-        device = next(iter(knobs.values())).device
+        device = next(iter(parameters.values())).device
         losses: list[Tensor] = [torch.empty(0)] * len(batch)
         for places in groups.values():
             frames = together([batch[place].content for place in places], device)
-            mask = masks_of(frames, knobs, softness)
+            mask = masks_of(frames, parameters, softness)
             if self.passing and softness > 0:
                 with torch.no_grad():
-                    hard = masks_of(frames, knobs, 0.0)
+                    hard = masks_of(frames, parameters, 0.0)
                 mask = through(hard, mask)
             for place, wrong in zip(places, self.wrong(mask, frames.truth, frames.known), strict=True):
                 losses[place] = wrong
@@ -147,11 +147,11 @@ def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[E
     wanted, true = _true(clip)
     found = []
     # What would become of more than is drawn now: without it, whatever a lower threshold adds would seem to stay.
-    freer = with_knobs(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
+    freer = with_parameters(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
     probes: Iterable[Recorded | None] = recorded(clip, freer, wanted) if after else repeat(None)
     for one, probe in zip(recorded(clip, settings, wanted), probes, strict=False):
         labels = true(one)
-        # A frame without a window shows nothing, whatever the knobs.
+        # A frame without a window shows nothing, whatever the parameters.
         if one.window is not None and (labels >= 0).any():
             differences = differences_of(one.window, settings)
             frame = _labelled(differences, labels, settings)

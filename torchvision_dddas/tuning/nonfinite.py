@@ -1,4 +1,4 @@
-"""Where a loss is no number: which clip, frame and knob it comes from."""
+"""Where a loss is no number: which clip, frame and parameter it comes from."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,10 +16,10 @@ def blamed(
     softness: float,
     size: int = 8,
 ) -> str:
-    """In words, the first example whose loss or slope is no number, and the knob; empty where all are numbers.
+    """In words, the first example whose loss or slope is no number, and the parameter; empty where all are numbers.
 
-    values: the knobs now; before: as they were at other times, those that are most like now first. A knob is to blame
-    whose value alone, taken back, makes the loss a number, or whose slope is none. size: examples at once.
+    values: the parameters now; before: as they were at other times, those that are most like now first. A parameter is
+    to blame whose value alone, taken back, makes the loss a number, or whose slope is none. size: examples at once.
     """
     if all(_finite(family, batch[i : i + size], values, softness) for i in range(0, len(batch), size)):
         return _by_slope(family, batch, values, softness)

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from torchvision_dddas.config import Settings, with_knobs
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 
 Family = Literal["motion", "registration", "tracking", "paper", "people", "location"]
@@ -22,10 +22,10 @@ _DIGITS = 4
 
 @dataclass(frozen=True)
 class Tunable:
-    """One knob that gradients can move, between low and high of its field in `settings`.
+    """One parameter that gradients can move, between low and high of its field in `settings`.
 
     log: steps are factors, not amounts; with an offset, of the value plus this, so that 0 can be reached.
-    rounding: what the knob is once it is a setting; while it is tuned any number between will do.
+    rounding: what the parameter is once it is a setting; while it is tuned any number between will do.
     """
 
     name: str
@@ -119,7 +119,7 @@ TUNABLE: dict[str, Tunable] = {
 
 
 def chosen(names: Iterable[str]) -> list[str]:
-    """The names of tunable knobs, where `difference.*` stands for all of a group; in the order given, each once.
+    """The names of tunable parameters, where `difference.*` stands for all of a group; in the order given, each once.
 
     Raises InputError for a name that is none, with all that are and their ranges.
     """
@@ -128,15 +128,15 @@ def chosen(names: Iterable[str]) -> list[str]:
         fitting = [known for known in TUNABLE if fnmatchcase(known, name)]
         if not fitting:
             known = ", ".join(f"{tunable.name} ({tunable.range})" for tunable in TUNABLE.values())
-            raise InputError(f"'{name}' is no knob that can be tuned by gradient; wanted of: {known}")
+            raise InputError(f"'{name}' is no parameter that can be tuned by gradient; wanted of: {known}")
         found |= dict.fromkeys(fitting)
     if not found:
-        raise InputError("no knob to tune; name some, such as difference.threshold")
+        raise InputError("no parameter to tune; name some, such as difference.threshold")
     return list(found)
 
 
-class Knobs(nn.Module):
-    """The knobs that are tuned, as parameters without bounds; the others stay as the settings have them."""
+class Parameters(nn.Module):
+    """The parameters that are tuned, as parameters without bounds; the others stay as the settings have them."""
 
     def __init__(self, settings: Settings, names: Iterable[str]) -> None:
         """names: as `chosen` takes them. Raises InputError for one that cannot be tuned."""
@@ -151,7 +151,8 @@ class Knobs(nn.Module):
     def values(self, whole: bool = False) -> dict[str, Tensor]:
         """Each knob's value with its gradient: numbers without axes, float64.
 
-        whole: sizes as the settings round them, without a gradient; where all knobs are sizes they go on as they are.
+        whole: sizes as the settings round them, without a gradient; where all parameters are sizes they go on as they
+        are.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
         if whole and self._held:
@@ -191,7 +192,7 @@ class Knobs(nn.Module):
             for (name, value), free, start in zip(self.values().items(), self.free, self._starts, strict=True)
             if float(free.detach()) != start
         }
-        return with_knobs(self.base, moved, origin="the tuned knobs")
+        return with_parameters(self.base, moved, origin="the tuned knobs")
 
 
 def _of(settings: Settings, name: str) -> float:

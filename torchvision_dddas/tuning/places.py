@@ -54,25 +54,25 @@ class Places:
                 raise InputError(f"{clip.name}: no target was located whose true place is known; nothing can be tuned")
         return found
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) nats a target. See `family.Family`.
 
         Computed on the CPU, where the fits are, whatever the knobs' device.
         """
-        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
-        knobs = {name: value.cpu() for name, value in knobs.items()}
+        device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
+        parameters = {name: value.cpu() for name, value in parameters.items()}
         found: list[Tensor] = [torch.zeros(0)] * len(batch)
         groups: dict[tuple[int, int], list[tuple[int, Look, dict[str, Tensor], Laid]]] = defaultdict(list)
         for row, example in enumerate(batch):
             if not isinstance(example.content, Seen):
                 seen, settings = example.content
-                found[row] = person_lost(seen, settings, knobs, UNPLACED)
+                found[row] = person_lost(seen, settings, parameters, UNPLACED)
                 continue
             look = example.content.look
-            values = {**of_settings(example.content.settings), **knobs}
+            values = {**of_settings(example.content.settings), **parameters}
             here = example.content.fit or hard_laid(look, values)
             if here is None:
-                found[row] = torch.full((), UNPLACED, dtype=torch.float64) + 0 * sum(knobs.values())
+                found[row] = torch.full((), UNPLACED, dtype=torch.float64) + 0 * sum(parameters.values())
             else:
                 groups[len(look.marks), len(look.true_m)].append((row, look, values, here))
         for members in groups.values():
@@ -87,19 +87,19 @@ def family() -> Places:
     return Places()
 
 
-def _lost(looks: Sequence[Look], knobs: dict[str, Tensor], here: Sequence[Laid]) -> Tensor:
+def _lost(looks: Sequence[Look], parameters: dict[str, Tensor], here: Sequence[Laid]) -> Tensor:
     """(B,) of looks with as many landmarks and targets each."""
     parts = ("missing", "slopes", "correction", "by_turn", "known")
     problem = Linear(*(torch.stack([getattr(one.problem, part) for one in here]) for part in parts))
-    places = joined([look.places for look in looks]).variance(knobs).clamp(min=EXACT_M**2)
-    pixels = joined([look.pixels for look in looks]).variance(knobs)
-    prior = joined([look.prior for look in looks]).variance(knobs)
+    places = joined([look.places for look in looks]).variance(parameters).clamp(min=EXACT_M**2)
+    pixels = joined([look.pixels for look in looks]).variance(parameters)
+    prior = joined([look.prior for look in looks]).variance(parameters)
     variance = torch.cat([prior, places.repeat_interleave(2, dim=1)], dim=1)
     step, covariance = stepped(problem, pixels.repeat_interleave(2, dim=1), variance)
     off_m, by_pose, by_pixel = (
         torch.stack([getattr(one, part) for one in here]) for part in ("off_m", "by_pose", "by_pixel")
     )
-    spot = joined([look.spot for look in looks]).variance(knobs)
+    spot = joined([look.spot for look in looks]).variance(parameters)
     off_m, spread = laid(off_m, by_pose, by_pixel, step, covariance, spot)
-    shared = knobs["landmarks.common_sigma_m"] ** 2 * torch.eye(2, dtype=spread.dtype)
+    shared = parameters["landmarks.common_sigma_m"] ** 2 * torch.eye(2, dtype=spread.dtype)
     return surprise(off_m, spread + shared).mean(dim=1)

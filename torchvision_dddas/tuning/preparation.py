@@ -13,7 +13,7 @@ from torchvision_dddas.evaluation.studies.record import Spec
 from torchvision_dddas.evaluation.studies.running import plan
 from torchvision_dddas.evaluation.studies.tried import parted
 from torchvision_dddas.tuning.family import Example, Family, Particular, Tick, Timed, family_of, with_loss
-from torchvision_dddas.tuning.parameters import TUNABLE, Knobs, chosen
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, chosen
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Prepared:
     spec: Spec
     base: Path
     family: Family
-    knobs: Knobs
+    parameters: Parameters
     clips: tuple[Clip, ...]
     tuned: tuple[str, ...]
     held: tuple[str, ...]
@@ -46,16 +46,16 @@ def prepare(
 ) -> Prepared:
     """Read a study's clips, and prepare the examples of those that are not held out.
 
-    names: of knobs, as `tunable.chosen` takes them. holdout, clips: patterns of clips' names. measure: in place of the
-    family's. loss: one of those that the family offers. tick: called once an example. Raises InputError for a knob that
-    cannot be tuned or has no say under the settings, knobs of several families, a loss that the family has not, clips
-    without the truth that is needed, and as `running.plan` does.
+    names: of parameters, as `tunable.chosen` takes them. holdout, clips: patterns of clips' names. measure: in place of
+    the family's. loss: one of those that the family offers. tick: called once an example. Raises InputError for a
+    parameter that cannot be tuned or has no say under the settings, parameters of several families, a loss that the
+    family has not, clips without the truth that is needed, and as `running.plan` does.
     """
     settings = load_config(spec.config, spec.overrides)
     family = _family(names)
-    knobs = Knobs(settings, names)
+    parameters = Parameters(settings, names)
     if isinstance(family, Particular):
-        family.check(knobs.names, settings)
+        family.check(parameters.names, settings)
     goal = goal_of(measure or family.measure)
     if isinstance(family, Timed):
         family = family.at(spec.interval, goal.task)
@@ -66,11 +66,11 @@ def prepare(
     seen = tuple(job.clip for job in plan(spec, base, [glob.escape(name) for name in tuned]).jobs)
     check_possible(goal, seen)
     examples = family.examples(seen, settings, tick)
-    return Prepared(spec, base, family, knobs, seen, tuned, held, goal, examples)
+    return Prepared(spec, base, family, parameters, seen, tuned, held, goal, examples)
 
 
 def _family(names: Sequence[str]) -> Family:
-    """The one family of all knobs. Raises InputError where they have several."""
+    """The one family of all parameters. Raises InputError where they have several."""
     by_family: dict[str, list[str]] = {}
     for name in chosen(names):
         by_family.setdefault(TUNABLE[name].family, []).append(name)

@@ -1,9 +1,9 @@
 """People by their shape: probabilities that are the shares that are right, boxes that fit, a threshold that pays.
 
 The windows of a picture are scored once by the hard recognizer, down to `BELOW` under the threshold. What is right is
-told by the boxes of the settings that the examples were prepared with. Three losses are added, each with knobs of its
-own: the doubt about scores (probability_slope, probability_even), 1 - IoU of the boxes that are right (height_share,
-width_share, feet_share) and 1 - F1 of the picture (threshold).
+told by the boxes of the settings that the examples were prepared with. Three losses are added, each with parameters of
+its own: the doubt about scores (probability_slope, probability_even), 1 - IoU of the boxes that are right
+(height_share, width_share, feet_share) and 1 - F1 of the picture (threshold).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import PeopleKnobs, Settings
+from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import uncounted
@@ -24,7 +24,7 @@ from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
-from torchvision_dddas.people.scorer import Recognizer
+from torchvision_dddas.people.scorer import WindowScorer
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.soft_people import bodies, doubt, soft_f
 
@@ -52,7 +52,7 @@ class Scored:
     window_px: Tensor
     true_px: Tensor
     people: int
-    settings: PeopleKnobs
+    settings: PeopleParameters
 
 
 @dataclass(frozen=True)
@@ -69,20 +69,22 @@ class Recognition:
         """The pictures whose people are labelled, each scored once. See `family.Family`."""
         from torchvision_dddas.people.detector import recognizer_of
 
-        knobs = settings.people
-        if knobs.suppression != "nms":
-            raise InputError(f"people.suppression = {knobs.suppression} cannot be tuned by gradient; set it to nms")
-        recognizer, found = recognizer_of(knobs), list[Example]()
+        parameters = settings.people
+        if parameters.suppression != "nms":
+            raise InputError(
+                f"people.suppression = {parameters.suppression} cannot be tuned by gradient; set it to nms"
+            )
+        recognizer, found = recognizer_of(parameters), list[Example]()
         for clip in clips:
-            for example in _pictures(clip, knobs, recognizer):
+            for example in _pictures(clip, parameters, recognizer):
                 found.append(example)
                 tick()
         return found
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,). See `family.Family`. A picture has too few numbers for another device than the CPU."""
-        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
-        here = {name: value.cpu() for name, value in knobs.items()}
+        device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
+        here = {name: value.cpu() for name, value in parameters.items()}
         return torch.stack([_lost(example.content, here, softness) for example in batch]).to(device)
 
 
@@ -94,8 +96,8 @@ def family() -> Recognition:
 def scored(
     image: np.ndarray,
     truth_px: np.ndarray,
-    knobs: PeopleKnobs,
-    recognizer: Recognizer,
+    parameters: PeopleParameters,
+    recognizer: WindowScorer,
     counted: Callable[[np.ndarray], np.ndarray] = lambda box_px: np.ones(len(box_px), bool),
 ) -> Scored:
     """The detections of one picture, 8 bits grey or BGR, and which are right.
@@ -103,14 +105,14 @@ def scored(
     truth_px: (M, 4). counted: which of boxes (N, 4) are right or wrong; the others are left out.
     """
     size = (image.shape[1], image.shape[0])
-    parts = scan.everywhere(size, knobs)
+    parts = scan.everywhere(size, parameters)
     (maps,) = recognizer.scores([image], [parts])
-    low = knobs.model_copy(update={"threshold": knobs.threshold - BELOW})
+    low = parameters.model_copy(update={"threshold": parameters.threshold - BELOW})
     window_px, margin = scan.windows(parts, maps, size, low)
     every = people_of(window_px, margin, size, low)
-    above = margin >= knobs.threshold
+    above = margin >= parameters.threshold
     # Boxes are means of windows, weighed by how far they are above the threshold: those of the settings' own.
-    shown = people_of(window_px[above], margin[above], size, knobs)
+    shown = people_of(window_px[above], margin[above], size, parameters)
     box_px = np.concatenate([shown.box_px, every.box_px[len(shown) :]])
     kept = counted(box_px)
     sure = int(kept[: len(shown)].sum())
@@ -120,10 +122,10 @@ def scored(
     window_px = shown.window_px[kept[: len(shown)]][whose >= 0]
     columns = margin, right, window_px, truth_px[whose[whose >= 0]].reshape(-1, 4)
     margin_, right_, windows_, true_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
-    return Scored(margin_, right_, sure, windows_, true_, len(truth_px), knobs)
+    return Scored(margin_, right_, sure, windows_, true_, len(truth_px), parameters)
 
 
-def _pictures(clip: Clip, knobs: PeopleKnobs, recognizer: Recognizer) -> Iterator[Example]:
+def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer) -> Iterator[Example]:
     from torchvision_dddas.evaluation.studies.stages import opened
     from torchvision_dddas.people.detector import checked
 
@@ -137,7 +139,7 @@ def _pictures(clip: Clip, knobs: PeopleKnobs, recognizer: Recognizer) -> Iterato
             image = checked(frame.image, f"{clip.name}, frame {frame.number}")
             true_px = np.asarray(truth.boxes[frame.number], float).reshape(-1, 4)
             told = partial(_counted, truth, frame.number)
-            yield Example(clip.name, frame.number, scored(image, true_px, knobs, recognizer, told))
+            yield Example(clip.name, frame.number, scored(image, true_px, parameters, recognizer, told))
 
 
 def _counted(truth: Truth, number: int, box_px: np.ndarray) -> np.ndarray:
@@ -154,8 +156,10 @@ def _whose(box_px: np.ndarray, right: np.ndarray, truth_px: np.ndarray) -> np.nd
     return whose
 
 
-def _lost(content: Scored, knobs: Mapping[str, Tensor], softness: float) -> Tensor:
-    values = {f"people.{name}": torch.tensor(float(getattr(content.settings, name))) for name in KNOBS} | dict(knobs)
+def _lost(content: Scored, parameters: Mapping[str, Tensor], softness: float) -> Tensor:
+    values = {f"people.{name}": torch.tensor(float(getattr(content.settings, name))) for name in KNOBS} | dict(
+        parameters
+    )
     total = 1 - soft_f(content.margin, content.right, content.people, values["people.threshold"], softness)
     if content.sure:
         total = total + doubt(content.margin[: content.sure], content.right[: content.sure], values).mean()

@@ -11,13 +11,13 @@ from torchvision_dddas.detection.detector import Loop
 from torchvision_dddas.detection.engine import (
     EVIDENCE_CAP,
     EVIDENCE_SCALE,
+    Engine,
     Foreground,
     View,
-    Vision,
     Window,
     load_engine,
 )
-from torchvision_dddas.detection.torch_engine import TorchVision
+from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.detection.torch_foreground import TEXTURED, distances, least_of, seen_by_both
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.stages import opened
@@ -39,36 +39,36 @@ class Recorded:
 def recorded(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[Recorded]:
     """The wanted frames of a clip, in order. Raises InputError as `dddas detect` does."""
     source = opened(clip)
-    vision = _Recorder(load_engine("onboard", settings), wanted)
-    loop = Loop(vision, settings, source.rate_hz)
+    engine = _Recorder(load_engine("onboard", settings), wanted)
+    loop = Loop(engine, settings, source.rate_hz)
 
     def scenes() -> Iterator[Scene]:
         for frame in source:
-            vision.number = frame.number
+            engine.number = frame.number
             yield from loop.feed(frame)
         yield from loop.end(source.last)
 
     for scene in scenes():
         number = scene.frame.number
         if number in wanted:
-            yield Recorded(number, vision.windows.pop(number, None), scene.mask > 0)
+            yield Recorded(number, engine.windows.pop(number, None), scene.mask > 0)
 
 
 class _Recorder:
     """A back end that remembers the windows of wanted frames."""
 
-    def __init__(self, vision: Vision, wanted: Set[int]) -> None:
-        self.name, self.number = vision.name, 0
+    def __init__(self, engine: Engine, wanted: Set[int]) -> None:
+        self.name, self.number = engine.name, 0
         self.windows: dict[int, Window] = {}
-        self._vision, self._wanted = vision, wanted
+        self._vision, self._wanted = engine, wanted
 
     @property
-    def knobs(self) -> Settings:
-        return self._vision.knobs
+    def parameters(self) -> Settings:
+        return self._vision.parameters
 
-    @knobs.setter
-    def knobs(self, settings: Settings) -> None:
-        self._vision.knobs = settings
+    @parameters.setter
+    def parameters(self, settings: Settings) -> None:
+        self._vision.parameters = settings
 
     def prepare(self, image: np.ndarray) -> View:
         view = self._vision.prepare(image)
@@ -87,10 +87,10 @@ class _Recorder:
 
 @torch.inference_mode()
 def differences_of(window: Window, settings: Settings) -> Differences:
-    """A window as far as no tunable knob has a say, on the CPU; a batch of one."""
-    grey, warped, seen, texture = TorchVision(settings, "cpu").registered([window])
-    knobs = settings.difference
-    distance = distances(window, grey, warped, knobs)
+    """A window as far as no tunable parameter has a say, on the CPU; a batch of one."""
+    grey, warped, seen, texture = TorchEngine(settings, "cpu").registered([window])
+    parameters = settings.difference
+    distance = distances(window, grey, warped, parameters)
     least = [least_of(pair, distance, warped) for pair in window.near]
     both = [seen_by_both(seen[a], seen[b], grey.shape[-1]) for a, b in window.near]
     return Differences(

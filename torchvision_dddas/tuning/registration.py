@@ -1,4 +1,4 @@
-"""The knobs of registration: how far the background's motion is off where masks say that nothing moves.
+"""The parameters of registration: how far the background's motion is off where masks say that nothing moves.
 
 Examples are points followed from a labelled frame to the next, and the loss is the mean distance, in pixels, by which
 the motion that the pipeline finds misses those on background. What is too wide takes in what moves slowly; what is too
@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import RegistrationKnobs, Settings
-from torchvision_dddas.detection.engine import Vision, load_engine
+from torchvision_dddas.config import RegistrationParameters, Settings
+from torchvision_dddas.detection.engine import Engine, load_engine
 from torchvision_dddas.detection.exposure import in_one_light
 from torchvision_dddas.detection.opencv_registration import LAST_TOLERANCE, fit, keypoints, there_and_back
 from torchvision_dddas.errors import InputError
@@ -27,7 +27,7 @@ from torchvision_dddas.functional import affine, homography
 from torchvision_dddas.functional.threshold import step
 from torchvision_dddas.tuning.clip_masks import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.soft_registration import Followed, refitted
+from torchvision_dddas.tuning.soft_registration import TrackedFrame, refitted
 from torchvision_dddas.types import Frame
 
 RANSAC, CHECK = "registration.ransac_px", "registration.forward_backward_px"
@@ -41,14 +41,14 @@ _FEWEST = 8
 
 @dataclass(frozen=True)
 class Step:
-    """A pair of frames: its points, and the knobs of what is not tuned."""
+    """A pair of frames: its points, and the parameters of what is not tuned."""
 
-    points: Followed
-    knobs: RegistrationKnobs
+    points: TrackedFrame
+    parameters: RegistrationParameters
 
 
 class Registering:
-    """Implements `Family` for the knobs of registration."""
+    """Implements `Family` for the parameters of registration."""
 
     name = "registration"
     task: Task = "motion"
@@ -76,10 +76,10 @@ class Registering:
                 raise InputError(f"{clip.name}: no two frames after each other have background that can be followed")
         return found
 
-    def loss(self, knobs: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) px by which each pair's motion misses the background. On the CPU, where points are few."""
-        device = next(iter(knobs.values())).device if knobs else torch.device("cpu")
-        here = {name: value.cpu() for name, value in knobs.items()}
+        device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
+        here = {name: value.cpu() for name, value in parameters.items()}
         return torch.stack([_lost(example.content, here, softness) for example in batch]).to(device)
 
 
@@ -88,22 +88,22 @@ def family() -> Registering:
     return Registering()
 
 
-def followed(vision: Vision, earlier: np.ndarray, later: np.ndarray, labels: np.ndarray) -> Followed:
+def followed(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels: np.ndarray) -> TrackedFrame:
     """The points of a picture, (H, W, 3) or (H, W) uint8, that are found in the next. labels: (H, W), 0 background."""
-    knobs = vision.knobs.registration
+    parameters = engine.parameters.registration
     # Whatever the way back misses by: how much it may is tuned.
-    freely = knobs.model_copy(update={"forward_backward_px": np.inf})
-    views = vision.prepare(earlier), vision.prepare(later)
-    start = keypoints(views[0].grey, knobs, halved=knobs.redetect_frames > 1)
+    freely = parameters.model_copy(update={"forward_backward_px": np.inf})
+    views = engine.prepare(earlier), engine.prepare(later)
+    start = keypoints(views[0].grey, parameters, halved=parameters.redetect_frames > 1)
     if not len(start):
         end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
     else:
         end, found, missed_px = there_and_back(*in_one_light(*views), start, freely)
     # A point whose search window meets what moves is drawn along by it.
-    near = cv2.dilate((labels != 0).astype(np.uint8), np.ones((knobs.window_px, knobs.window_px), np.uint8))
+    near = cv2.dilate((labels != 0).astype(np.uint8), np.ones((parameters.window_px, parameters.window_px), np.uint8))
     column, row = start[found].astype(int).T
     still = near[row, column] == 0
-    return Followed(
+    return TrackedFrame(
         torch.from_numpy(start[found].astype(float)),
         torch.from_numpy(end[found].astype(float)),
         torch.from_numpy(missed_px[found].astype(float)),
@@ -112,22 +112,22 @@ def followed(vision: Vision, earlier: np.ndarray, later: np.ndarray, labels: np.
 
 
 def _examples(clip: Clip, settings: Settings) -> Iterator[Example]:
-    truth, vision = clip.truth, load_engine("onboard", settings)
+    truth, engine = clip.truth, load_engine("onboard", settings)
     assert truth is not None, "asked for clips with masks alone"
     frames: Iterator[tuple[Frame, Frame]] = pairwise(opened(clip))
     for frame, later in frames:
         if frame.number not in truth.masks or later.number != frame.number + 1:
             continue
         labels = labels_at(truth, frame.number, frame.image.shape)
-        points = followed(vision, frame.image, later.image, labels)
+        points = followed(engine, frame.image, later.image, labels)
         if int(points.still.sum()) >= _FEWEST:
             yield Example(clip.name, frame.number, Step(points, settings.registration))
 
 
-def _lost(pair: Step, knobs: Mapping[str, Tensor], softness: float) -> Tensor:
-    fixed, points = pair.knobs, pair.points
-    tolerance_px = knobs.get(RANSAC, torch.tensor(fixed.ransac_px, dtype=torch.float64))
-    check_px = knobs.get(CHECK, torch.tensor(fixed.forward_backward_px, dtype=torch.float64))
+def _lost(pair: Step, parameters: Mapping[str, Tensor], softness: float) -> Tensor:
+    fixed, points = pair.parameters, pair.points
+    tolerance_px = parameters.get(RANSAC, torch.tensor(fixed.ransac_px, dtype=torch.float64))
+    check_px = parameters.get(CHECK, torch.tensor(fixed.forward_backward_px, dtype=torch.float64))
     kept = (points.missed_px <= check_px).numpy() if fixed.forward_backward_px else np.ones(len(points.still), bool)
     guess = np.eye(3)
     if kept.sum() >= 4:

@@ -18,17 +18,17 @@ SIDES = {"tuned": "Clips tuned on", "held_out": "Clips held out"}
 
 def tuning_report(told: Mapping[str, Any]) -> str:
     """The HTML. told: the content of run.json of `dddas tune`, NaN as None."""
-    knobs = told["knobs"]
-    title = f"Tuning of {len(knobs)} knob{'s' * (len(knobs) != 1)} by gradient"
+    parameters = told["knobs"]
+    title = f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient"
     loss = f", loss {told['loss']}," if told.get("loss") else ""
     about = f"{told['family']}{loss} on {told['study']['name']}; seed {told['plan']['seed']}"
     parts = [f"<h1>{escape(title)} <span>{escape(about)}</span></h1>"]
     if told["failed"]:
-        parts.append(f'<p class="bad">Stopped: {escape(told["failed"])}. The knobs are the last good ones.</p>')
+        parts.append(f'<p class="bad">Stopped: {escape(told["failed"])}. The parameters are the last good ones.</p>')
     verdict = told.get("verdict")
     parts += ['<div class="cards">', *_cards(told, verdict), "</div>"]
     parts += ["<h2>Descent</h2>", _descent_note(told), '<div class="plots">', *_plots(told), "</div>"]
-    parts += ["<h3>Knobs</h3>", _knobs(knobs)]
+    parts += ["<h3>Parameters</h3>", _parameters(parameters)]
     if told.get("cost"):
         parts += _cost(told["cost"])
     if verdict:
@@ -124,7 +124,7 @@ def _plots(told: Mapping[str, Any]) -> list[str]:
         dots = [Dots("kept", steps[mark], values[mark], 2, sign="ring")]
         start = Line("as it was", steps, np.full(len(steps), values[0] if len(values) else math.nan), 6, dashed=True)
         unit = told["knobs"][name]["unit"]
-        # A knob that hardly moves is not to look as if it did.
+        # A parameter that hardly moves is not to look as if it did.
         middle = float(values.mean()) if len(values) else 0.0
         reach = max(float(np.ptp(values)) * 0.55 if len(values) else 0.0, 0.02 * abs(middle), 1e-6)
         axis = Axis(unit if unit not in ("", "-") else "value")
@@ -140,7 +140,7 @@ def _column(steps: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     return np.array([math.nan if step[name] is None else step[name] for step in steps], float)
 
 
-def _knobs(knobs: Mapping[str, Mapping[str, Any]]) -> str:
+def _parameters(parameters: Mapping[str, Mapping[str, Any]]) -> str:
     columns = [
         Column("knob", text=True),
         Column("before"),
@@ -151,10 +151,10 @@ def _knobs(knobs: Mapping[str, Mapping[str, Any]]) -> str:
         Column("meaning", text=True),
     ]
     rows = []
-    for name, knob in knobs.items():
-        before, after = float(knob["before"]), float(knob["after"])
+    for name, parameter in parameters.items():
+        before, after = float(parameter["before"]), float(parameter["after"])
         times = after / before if before else None
-        text = "no slope: the loss did not depend on it. " if knob["idle"] else ""
+        text = "no slope: the loss did not depend on it. " if parameter["idle"] else ""
         value = Cell(f"{after:g}".replace("-", "−"), after)
         first = Cell(f"{before:g}".replace("-", "−"), before)
         rows.append(
@@ -163,21 +163,21 @@ def _knobs(knobs: Mapping[str, Mapping[str, Any]]) -> str:
                 first,
                 value,
                 figure(times, 2),
-                *map(words, (knob["unit"], knob["range"], text + knob["meaning"])),
+                *map(words, (parameter["unit"], parameter["range"], text + parameter["meaning"])),
             ]
         )
     return sorted_table("knobs before and after", columns, rows)
 
 
 def _cost(cost: Mapping[str, Any]) -> list[str]:
-    """What a frame is expected to take, and what was measured of each knob."""
+    """What a frame is expected to take, and what was measured of each parameter."""
     before, after = 1000 * cost["seconds"], 1000 * cost["expected"]
     said = (
         f"A frame of twice the time costs as much as a loss of {cost['weight']:g}. Expected: {number(before, 1)} → "
         f"{number(after, 1)} ms a frame."
     )
     if not cost["curves"]:
-        said += " No knob changed the time by more than repeats differ."
+        said += " No parameter changed the time by more than repeats differ."
     rows = [
         [words(curve["knob"]), *(words(", ".join(f"{v:.3g}" for v in curve[part])) for part in ("values", "times"))]
         for curve in cost["curves"]

@@ -1,7 +1,8 @@
-"""What knobs make of the windows that the recognizer scores: probabilities, bodies' boxes, who counts as found.
+"""What parameters make of the windows that the recognizer scores: probabilities, bodies' boxes, who counts as found.
 
 The formulas are those of `targets.persons`, on tensors. HOG, the classifier and the suppression of neighbours have no
-knob here: a greedy suppression of less than the best keeps the same windows at any threshold, but for those below it.
+parameter here: a greedy suppression of less than the best keeps the same windows at any threshold, but for those below
+it.
 """
 
 from collections.abc import Mapping
@@ -14,21 +15,21 @@ from torch.nn import functional
 from torchvision_dddas.functional.threshold import step
 from torchvision_dddas.people.boxes import body_sides, log_odds
 
-Knobs = Mapping[str, Tensor]
+Parameters = Mapping[str, Tensor]
 
 
-def bodies(window_px: Float[Tensor, "N 4"], knobs: Knobs) -> Float[Tensor, "N 4"]:
-    """The bodies' boxes in windows, x, y, width, height, by the knobs height_share, width_share and feet_share."""
-    shares = (knobs[f"people.{name}_share"] for name in ("height", "width", "feet"))
+def bodies(window_px: Float[Tensor, "N 4"], parameters: Parameters) -> Float[Tensor, "N 4"]:
+    """The bodies' boxes in windows, x, y, width, height, by the parameters height_share, width_share and feet_share."""
+    shares = (parameters[f"people.{name}_share"] for name in ("height", "width", "feet"))
     return torch.stack(body_sides(*window_px.unbind(1), *shares), 1)
 
 
-def doubt(margin: Float[Tensor, " N"], right: Float[Tensor, " N"], knobs: Knobs) -> Float[Tensor, " N"]:
+def doubt(margin: Float[Tensor, " N"], right: Float[Tensor, " N"], parameters: Parameters) -> Float[Tensor, " N"]:
     """Negative log-likelihood, in nats, of detections of these scores being right (1) or wrong (0).
 
-    By the knobs probability_slope and probability_even: least where probabilities are the shares that are right.
+    By the parameters probability_slope and probability_even: least where probabilities are the shares that are right.
     """
-    odds = log_odds(margin, knobs["people.probability_slope"], knobs["people.probability_even"])
+    odds = log_odds(margin, parameters["people.probability_slope"], parameters["people.probability_even"])
     return functional.binary_cross_entropy_with_logits(odds, right, reduction="none")
 
 

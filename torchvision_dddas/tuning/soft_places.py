@@ -1,11 +1,11 @@
-"""Where targets are, as far as the noise knobs have a say: with gradients, about what the hard fit found.
+"""Where targets are, as far as the noise parameters have a say: with gradients, about what the hard fit found.
 
 `targets.pose.fit_pose` finds the likeliest pose and places of landmarks. At that point one more step of its own
-(Gauss and Newton's) is zero, and the step's derivative by the knobs is that of the fit itself, but for the curvature of
-the projection where the picture disagrees with it. So places have the value of the hard fit and the gradient of that
-step: nothing is softened, and nothing but the linear algebra is written twice.
+(Gauss and Newton's) is zero, and the step's derivative by the parameters is that of the fit itself, but for the
+curvature of the projection where the picture disagrees with it. So places have the value of the hard fit and the
+gradient of that step: nothing is softened, and nothing but the linear algebra is written twice.
 
-Every standard deviation that counts is a sum of squares of knobs: `Spread` holds what each of them adds.
+Every standard deviation that counts is a sum of squares of parameters: `Spread` holds what each of them adds.
 """
 
 import math
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-Knobs = Mapping[str, Tensor]
+Parameters = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Spread:
     base: Tensor
     gain: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def variance(self, knobs: Knobs) -> Tensor:
-        """(..., N). knobs: all that there is a gain of."""
+    def variance(self, parameters: Parameters) -> Tensor:
+        """(..., N). parameters: all that there is a gain of."""
         total = self.base
         for name, gain in self.gain.items():
-            total = total + gain * knobs[name].to(gain) ** 2
+            total = total + gain * parameters[name].to(gain) ** 2
         return total
 
 

@@ -1,7 +1,7 @@
 """What the registration's knobs make of points that were followed: a motion refitted on soft inliers, and its error.
 
-The hard registration at the same knobs is the guess (see `ops.relax.inliers`): its own last refit, done once more with
-soft weights, gives the value of the hard one as softness vanishes, and a slope by the tolerances.
+The hard registration at the same parameters is the guess (see `ops.relax.inliers`): its own last refit, done once more
+with soft weights, gives the value of the hard one as softness vanishes, and a slope by the tolerances.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from torchvision_dddas.functional.soft.inliers import Fit, fitted, weights
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedFrame:
     """The points of one frame that were found in the next one, and again on the way back.
 
     earlier_px, later_px: u, v. missed_px: by how much the way back missed its start. still: which lie on background,
@@ -38,7 +38,7 @@ class Refitted(NamedTuple):
 
 
 def refitted(
-    points: Followed,
+    points: TrackedFrame,
     guess: Float[Tensor, "3 3"],
     tolerance_px: Tensor,
     check_px: Tensor | None,
@@ -48,7 +48,7 @@ def refitted(
 ) -> Refitted:
     """The motion of the points that agree with a guess and were followed there and back.
 
-    tolerance_px, check_px: the knobs ransac_px and forward_backward_px, the latter None where there is no check.
+    tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None where there is no check.
     last_share: of the tolerance, which the refit keeps to. fit: as `ops.homography.fit`. softness: a share of each.
     """
     earlier, later = points.earlier_px[None], points.later_px[None]

@@ -1,4 +1,4 @@
-"""How likely the true links are, by the tracker's own scores: a loss with a gradient in the tracker's knobs.
+"""How likely the true links are, by the tracker's own scores: a loss with a gradient in the tracker's parameters.
 
 Targets are followed by who they truly are, look after look, each with the states that the tracker would have; at every
 look the scores of all links are the tracker's (`targets.links`), and the odds of all assignments follow from them
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvision_dddas.config import TrackKnobs
+from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.functional.soft.assignment import log_partition
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.appearance_score import scores_of
@@ -70,16 +70,16 @@ class _Tracks:
 
 
 def unlikeliness(
-    knobs: TrackKnobs, looks: Looks, softness: float, missed: float = 0.0, wrong: float = 0.0
+    parameters: TrackParameters, looks: Looks, softness: float, missed: float = 0.0, wrong: float = 0.0
 ) -> Float[Tensor, "B"]:
     """What the true links lack in likelihood, per box that a link was possible to; at softness 1 in nats.
 
-    knobs: numbers or tensors. softness: temperature of the assignment, above 0. missed, wrong: margins, in the unit of
-    scores: by so much for each true link that it lacks, and for each other link that it has, an assignment is to be
-    worse than the true one. What is that much better already costs next to nothing, so that what is in doubt counts.
-    Source of the margins: Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
+    parameters: numbers or tensors. softness: temperature of the assignment, above 0. missed, wrong: margins, in the
+    unit of scores: by so much for each true link that it lacks, and for each other link that it has, an assignment is
+    to be worse than the true one. What is that much better already costs next to nothing, so that what is in doubt
+    counts. Source of the margins: Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
     """
-    mine = _for_each(knobs, looks.own)
+    mine = _for_each(parameters, looks.own)
     size: Any = (looks.size[:, :1], looks.size[:, 1:])
     moves = not bool(torch.equal(looks.step, torch.eye(3).to(looks.step).expand_as(looks.step)))
     interval: Any = looks.interval[:, None]
@@ -96,7 +96,7 @@ def unlikeliness(
         known: Any = looks.known[:, look, None]
         doubt: Any = looks.doubt[:, look, None]
         births: Any = looks.births[:, look, None, None]
-        speed = speed_of(knobs.speed, usual, known)
+        speed = speed_of(parameters.speed, usual, known)
         sight = Sight(frame, interval, speed, births, doubt, size)
         begun: Any = kalman.started(box, frame, mine.scatter, speed, mine.size_scatter)
         if tracks is None:
@@ -108,7 +108,7 @@ def unlikeliness(
         if tracks.alive.any():
             score: Any = link_scores(tracks.state, tracks.left, box, sight, mine)
             if compares:
-                score = score + scores_of(likeness[:, look], visible[:, look], knobs)
+                score = score + scores_of(likeness[:, look], visible[:, look], parameters)
             true = tracks.alive & there
             margin = wrong - (wrong + missed) * torch.eye(score.shape[-1]).to(score)
             rival = score + margin
@@ -129,32 +129,32 @@ def _dense(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"]:
     return torch.take_along_dim(score, first[..., None], -2)
 
 
-def _after(tracks: _Tracks, begun: Any, looks: Looks, look: int, sight: Sight, knobs: TrackKnobs) -> _Tracks:
+def _after(tracks: _Tracks, begun: Any, looks: Looks, look: int, sight: Sight, parameters: TrackParameters) -> _Tracks:
     """The tracks after a look, each with its own box: `Tracker._commit` on what is true."""
     box: Any = looks.box_px[:, look]
     there, certain = looks.there[:, look], looks.certain[:, look]
     on = there & tracks.alive
-    later: Any = kalman.predicted(tracks.state, sight.frame, sight.agility(knobs))
-    seen: Any = kalman.updated(later, box, sight.frame, knobs.scatter, knobs.size_scatter)
+    later: Any = kalman.predicted(tracks.state, sight.frame, sight.agility(parameters))
+    seen: Any = kalman.updated(later, box, sight.frame, parameters.scatter, parameters.size_scatter)
     new = there & ~tracks.alive & looks.begins[:, look]
     state = torch.where(on[..., None], seen, torch.where(new[..., None], begun, tracks.state))
     hits = torch.where(new, 1, tracks.hits + on.long())
-    sure = (tracks.sure & ~new) | ((on | new) & certain) | (hits >= knobs.hits)
+    sure = (tracks.sure & ~new) | ((on | new) & certain) | (hits >= parameters.hits)
     held: Any = state.detach()
-    kept: Any = remembered(held, sight.frame, sight.interval, sight.size, knobs)
+    kept: Any = remembered(held, sight.frame, sight.interval, sight.size, parameters)
     late = sight.frame - state[..., kalman.SEEN] > (FILLED + 1) * sight.interval
     at_border: Any = near_border(box, sight.size)
     left = torch.where(on | new, at_border, tracks.left)
     return _Tracks(state, (tracks.alive | new) & kept & (sure | ~late), hits, sure, left)
 
 
-def _for_each(knobs: TrackKnobs, own: Bool[Tensor, "B"]) -> TrackKnobs:
+def _for_each(parameters: TrackParameters, own: Bool[Tensor, "B"]) -> TrackParameters:
     """With the scatter and births of own targets where the boxes are such: (B, 1), and (B, 1, 1) of births."""
 
     def picked(name: str) -> Tensor:
-        pair = (getattr(knobs, key) for key in (f"own_{name}", name))
+        pair = (getattr(parameters, key) for key in (f"own_{name}", name))
         other, usual = (torch.as_tensor(value, dtype=torch.float64, device=own.device) for value in pair)
         return torch.where(own[:, None], other, usual)
 
     each = {"scatter": picked("scatter"), "size_scatter": picked("size_scatter"), "births": picked("births")[..., None]}
-    return TrackKnobs.model_construct(**(dict(knobs) | each))
+    return TrackParameters.model_construct(**(dict(parameters) | each))

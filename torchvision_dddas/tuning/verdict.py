@@ -58,19 +58,19 @@ def judge(
     spec: Spec,
     base: Path,
     goal: Goal,
-    knobs: Mapping[str, object],
+    parameters: Mapping[str, object],
     tuned: Sequence[str],
     held: Sequence[str] = (),
     jobs: int | None = None,
     cache: Path | None = None,
     shown: Shown = lambda: nullcontext((lambda planned: None, lambda event: None)),
 ) -> Verdict:
-    """Run a study as it is and with other values of some knobs. tuned, held: names of clips.
+    """Run a study as it is and with other values of some parameters. tuned, held: names of clips.
 
     spec, base, jobs, cache: as `running.run_study` takes them. Raises InputError as it does, and where no clip can
     have the goal's measure.
     """
-    changed = tuple(f"{name}={written(value)}" for name, value in knobs.items())
+    changed = tuple(f"{name}={written(value)}" for name, value in parameters.items())
     specs = [replace(spec, tasks=(goal.task,), overrides=(*spec.overrides, *more)) for more in ((), changed)]
     names = [glob.escape(name) for name in (*tuned, *held)]
     cases = []

@@ -15,16 +15,16 @@ from torchvision_dddas.evaluation.metrics.crowd_frames import (
 )
 from torchvision_dddas.evaluation.metrics.crowds import CAP_M, HOLD_S, CrowdScorer
 from torchvision_dddas.types import (
+    AerialLocations,
     Bodies,
     CameraPose,
-    Confirmed,
+    Confirmation,
     Detections,
     Fix,
-    Followed,
-    Grounded,
-    Marks,
+    FrameResult,
+    LandmarkObservations,
     Positions,
-    Surveyed,
+    TrackedFrame,
     Tracks,
     Truth,
 )
@@ -80,20 +80,28 @@ def found(*targets, frame=1, blobs=None, kinds=None, sigma_m=0.1):
     rows = np.array([k for k, t in enumerate(targets) if t[2] is not None], np.int64)
     place = np.array([targets[k][2] for k in rows], float).reshape(-1, 2)
     blobs = boxes if blobs is None else np.array(blobs, float).reshape(-1, 4)
-    followed = Followed(frame, None, Detections(blobs), Tracks(frame, identity, boxes, np.ones(n), np.arange(n)))
+    followed = TrackedFrame(frame, None, Detections(blobs), Tracks(frame, identity, boxes, np.ones(n), np.arange(n)))
     positions = Positions(
         np.full(len(rows), frame), identity[rows], place, np.tile(np.eye(2) * sigma_m**2, (len(rows), 1, 1))
     )
     none = np.zeros((len(rows), 2))
-    grounded = Grounded(
-        frame, (frame - 1) / 10, positions, rows, positions.covariance_m2, none, boxes, Fix(frame, "pose"), Marks()
+    grounded = AerialLocations(
+        frame,
+        (frame - 1) / 10,
+        positions,
+        rows,
+        positions.covariance_m2,
+        none,
+        boxes,
+        Fix(frame, "pose"),
+        LandmarkObservations(),
     )
     confirmed = None
     if kinds is not None:
         zero = np.zeros(len(rows))
         whole = np.zeros(len(rows), np.int64)
-        confirmed = Confirmed(frame, np.arange(len(rows)), kinds, zero, ((),) * len(rows), whole, zero, zero, zero)
-    return Surveyed(followed, grounded, confirmed=confirmed)
+        confirmed = Confirmation(frame, np.arange(len(rows)), kinds, zero, ((),) * len(rows), whole, zero, zero, zero)
+    return FrameResult(followed, grounded, confirmed=confirmed)
 
 
 def scored(*pairs):

@@ -1,4 +1,4 @@
-"""Where a sweep looks: values and ranges of knobs, checked before anything is measured."""
+"""Where a sweep looks: values and ranges of parameters, checked before anything is measured."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_the_grid_is_every_combination_in_order() -> None:
     assert [tuple(point.values()) for point in points(axes)] == [(10.0, 1), (10.0, 3), (20.0, 1), (20.0, 3)]
 
 
-def test_a_range_is_of_whole_odd_or_any_numbers_as_its_knob_is() -> None:
+def test_a_range_is_of_whole_odd_or_any_numbers_as_its_parameter_is() -> None:
     axes = in_ranges(["difference.threshold=8:30", "difference.blur_px=3:9", "small.gap_frames=2:20:log"], NOW)
     assert axes == [
         Range("difference.threshold", 8.0, 30.0),
@@ -80,7 +80,7 @@ def test_a_bad_range_is_told_in_one_line(text, told) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_knob_has_one_axis() -> None:
+def test_a_parameter_has_one_axis() -> None:
     with pytest.raises(InputError, match="given twice"):
         on_grid(["refine.on=true", "refine.on=false"], NOW)
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
@@ -59,7 +59,7 @@ def settings_of(config: str | None) -> Settings:
     return (
         load_config(config)
         if config != "long intervals"
-        else with_knobs(load_config(), {"interval.frames": 4, "small.on": True})
+        else with_parameters(load_config(), {"interval.frames": 4, "small.on": True})
     )
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from torchvision_dddas.config import Settings, load_config, with_knobs
+from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.axes import in_ranges
 from torchvision_dddas.evaluation.studies.axes import on_grid as grid_axes
@@ -14,11 +14,11 @@ from torchvision_dddas.evaluation.studies.sweep import best as best_of
 NOW = Settings()
 
 
-def hill(knobs) -> tuple[float, str]:
+def hill(parameters) -> tuple[float, str]:
     """The best threshold is 14; a blur of 9 has no value."""
-    if knobs.get("difference.blur_px") == 9:
+    if parameters.get("difference.blur_px") == 9:
         return math.nan, "the clip broke off"
-    return 1 - abs(knobs.get("difference.threshold", 100.0) - 14) / 100, ""
+    return 1 - abs(parameters.get("difference.threshold", 100.0) - 14) / 100, ""
 
 
 def best(trials: list[Trial], least: bool) -> Trial:
@@ -29,7 +29,7 @@ def best(trials: list[Trial], least: bool) -> Trial:
 
 def threshold(trial: Trial) -> float:
     """NaN for the settings as they were."""
-    value = trial.knobs.get("difference.threshold", math.nan)
+    value = trial.parameters.get("difference.threshold", math.nan)
     assert isinstance(value, float)
     return value
 
@@ -45,8 +45,8 @@ def drawn(count: int = 12, seed: int = 0, least: bool = False, texts=("differenc
 
 def test_the_settings_as_they_are_come_first_and_compete() -> None:
     trials = on(["difference.threshold=10,15,20"])
-    assert trials[0].knobs == {} and trials[0].value == pytest.approx(0.14)
-    assert best(trials, least=False).knobs == {"difference.threshold": 15.0}
+    assert trials[0].parameters == {} and trials[0].value == pytest.approx(0.14)
+    assert best(trials, least=False).parameters == {"difference.threshold": 15.0}
     assert best(trials, least=True).number == 0
 
 
@@ -61,7 +61,7 @@ def test_where_nothing_has_a_value_there_is_no_best() -> None:
 
 
 def test_of_equal_points_the_first_is_the_best() -> None:
-    assert best(on(["difference.threshold=13,15"]), least=False).knobs == {"difference.threshold": 13.0}
+    assert best(on(["difference.threshold=13,15"]), least=False).parameters == {"difference.threshold": 13.0}
 
 
 def test_a_point_that_cannot_be_is_told_and_the_others_are_measured() -> None:
@@ -80,7 +80,7 @@ def test_points_are_told_ahead_each_once_and_before_they_are_measured() -> None:
     trials = on_grid(
         grid_axes([f"difference.threshold={','.join(map(str, values))}"], NOW),
         NOW,
-        lambda knobs: (float(knobs in told), ""),
+        lambda parameters: (float(parameters in told), ""),
         told.extend,
     )
     assert all(trial.value for trial in trials)
@@ -100,9 +100,9 @@ def test_proposals_come_near_the_best_of_a_hill() -> None:
 def test_proposals_keep_to_whole_and_odd_numbers_and_to_the_values_named() -> None:
     texts = ("difference.blur_px=3:9", "difference.near_frames=[1],[1,2]", "morphology.erode_px=1:4")
     trials = drawn(30, texts=texts)[1:]
-    assert {trial.knobs["difference.blur_px"] for trial in trials} == {3, 5, 7, 9}
-    assert {trial.knobs["difference.near_frames"] for trial in trials} == {(1,), (1, 2)}
-    assert {type(trial.knobs["morphology.erode_px"]) for trial in trials} == {int}
+    assert {trial.parameters["difference.blur_px"] for trial in trials} == {3, 5, 7, 9}
+    assert {trial.parameters["difference.near_frames"] for trial in trials} == {(1,), (1, 2)}
+    assert {type(trial.parameters["morphology.erode_px"]) for trial in trials} == {int}
 
 
 def test_trials_without_a_value_do_not_end_a_search() -> None:
@@ -111,7 +111,7 @@ def test_trials_without_a_value_do_not_end_a_search() -> None:
 
 
 def test_what_is_written_of_the_best_is_read_as_the_same_settings(tmp_path) -> None:
-    knobs = {"difference.near_frames": (1, 3), "difference.threshold": 0.1 + 0.2, "refine.on": False}
-    wanted = with_knobs(load_config("fast"), knobs)
+    parameters = {"difference.near_frames": (1, 3), "difference.threshold": 0.1 + 0.2, "refine.on": False}
+    wanted = with_parameters(load_config("fast"), parameters)
     (tmp_path / "best.toml").write_text(as_toml(wanted, ["a line", "another"]))
     assert load_config(tmp_path / "best.toml") == wanted

@@ -54,7 +54,7 @@ def test_what_is_kept_is_not_computed_again(folder) -> None:
         ("live.calm_s=9.0", []),
     ],
 )
-def test_a_changed_knob_computes_again_what_depends_on_it_and_nothing_else(folder, change, again) -> None:
+def test_a_changed_parameter_computes_again_what_depends_on_it_and_nothing_else(folder, change, again) -> None:
     assert computed(folder, job_of(folder, change)) == again
 
 

@@ -10,14 +10,14 @@ from torchvision_dddas.evaluation.metrics import detection, segmentation, tracki
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
-from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.results import Result
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels
 from torchvision_dddas.evaluation.metrics.still import Still
 from torchvision_dddas.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.evaluation.metrics.truth import Truth
 
-Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | Located]
+Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | GroundLocations]
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from torchvision_dddas.evaluation.metrics.crowd_frames import (
 )
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.segmentation import ratio
-from torchvision_dddas.types import Surveyed, Truth
+from torchvision_dddas.types import FrameResult, Truth
 
 INSIDE = 5.991
 """Of chi-square with two degrees of freedom, in 95 %."""
@@ -172,9 +172,9 @@ class CrowdScorer:
         self._known: dict[int, _Known] = {}
         self._cost = 0.0
 
-    def feed(self, item: Truth | Shown | Surveyed) -> None:
+    def feed(self, item: Truth | Shown | FrameResult) -> None:
         """The truth of a frame, or what was found in one whose truth was fed before."""
-        if not isinstance(item, Surveyed):
+        if not isinstance(item, FrameResult):
             self._waiting[item.frame] = shown(item) if isinstance(item, Truth) else item
             return
         number = item.followed.number
@@ -313,7 +313,7 @@ class CrowdScorer:
         self._cost += cost
 
 
-def told_of(surveyed: Surveyed, local: Callable[[np.ndarray], np.ndarray] | None = None) -> Told:
+def told_of(surveyed: FrameResult, local: Callable[[np.ndarray], np.ndarray] | None = None) -> Told:
     """What a run says of a frame: its targets that were seen, located or not. local: as in CrowdScorer."""
     tracks = surveyed.followed.tracks
     seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is where nothing was found

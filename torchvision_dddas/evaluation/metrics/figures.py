@@ -9,7 +9,7 @@ import numpy as np
 from torchvision_dddas.evaluation.metrics import detection, metres, segmentation, still, tracking
 from torchvision_dddas.evaluation.metrics.clip import Counts
 from torchvision_dddas.evaluation.metrics.detection import Boxes
-from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels
 from torchvision_dddas.evaluation.metrics.still import Still
 from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
@@ -38,7 +38,7 @@ def of_group(value: Any) -> dict[str, float]:
         return tracking.one_target_measures(value)
     if isinstance(value, Still):
         return still.measures(value)
-    if isinstance(value, Located):
+    if isinstance(value, GroundLocations):
         return metres.located_measures(value)
     return detection.one_target_measures(value)
 

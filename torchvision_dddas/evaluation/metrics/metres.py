@@ -19,19 +19,19 @@ FARTHEST_M = 10.0
 """Where there are no boxes, no place further off than this is taken to be a target's."""
 
 
-class Located(NamedTuple):
+class GroundLocations(NamedTuple):
     """True places in frames that were looked at, those that were told, and told places that are nobody's."""
 
     targets: int = 0
     told: int = 0
     strays: int = 0
 
-    def plus(self, other: "Located") -> "Located":
+    def plus(self, other: "GroundLocations") -> "GroundLocations":
         """The counts of both."""
-        return Located(*(a + b for a, b in zip(self, other, strict=True)))
+        return GroundLocations(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-def located_measures(counts: Located) -> dict[str, float]:
+def located_measures(counts: GroundLocations) -> dict[str, float]:
     """Share of the true places that were told, and of the told ones that are somebody's."""
     return {
         "located": ratio(counts.told, counts.targets),

@@ -1,4 +1,4 @@
-"""Where a sweep looks: the values of each knob on a grid, or the range that they are drawn from."""
+"""Where a sweep looks: the values of each parameter on a grid, or the range that they are drawn from."""
 
 import itertools
 import re
@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from torchvision_dddas.config import Settings, all_knobs, nearest, with_knobs
+from torchvision_dddas.config import Settings, all_parameters, nearest, with_parameters
 from torchvision_dddas.errors import InputError
 
 MOST_POINTS = 10_000
@@ -16,9 +16,9 @@ _RANGE = re.compile(r"\s*([^\s:,\[\]]+)\s*:\s*([^\s:,\[\]]+)\s*(?::\s*(\w+)\s*)?
 
 @dataclass(frozen=True)
 class Choice:
-    """Some values of a knob."""
+    """Some values of a parameter."""
 
-    knob: str
+    parameter: str
     values: tuple[object, ...]
 
 
@@ -26,7 +26,7 @@ class Choice:
 class Range:
     """Values of a knob from low to high, both in it. step: 0 for any number between; log: as many in each decade."""
 
-    knob: str
+    parameter: str
     low: float
     high: float
     step: int = 0
@@ -39,12 +39,12 @@ Axis = Choice | Range
 def on_grid(texts: Sequence[str], settings: Settings) -> list[Choice]:
     """Axes from texts such as `difference.threshold=10,20,30`.
 
-    Raises InputError for an unknown knob, one that is named twice, no values, and a value that will not do.
+    Raises InputError for an unknown parameter, one that is named twice, no values, and a value that will not do.
     """
     axes: list[Choice] = []
     for text in texts:
-        knob, said = _halves(text, "group.knob=value,value", settings, axes)
-        axes.append(_choice(knob, said, text, settings))
+        parameter, said = _halves(text, "group.parameter=value,value", settings, axes)
+        axes.append(_choice(parameter, said, text, settings))
     return axes
 
 
@@ -55,9 +55,9 @@ def in_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
     """
     axes: list[Axis] = []
     for text in texts:
-        knob, said = _halves(text, "group.knob=low:high", settings, axes)
+        parameter, said = _halves(text, "group.parameter=low:high", settings, axes)
         found = _RANGE.fullmatch(said)
-        axes.append(_range(knob, found, text, settings) if found else _choice(knob, said, text, settings))
+        axes.append(_range(parameter, found, text, settings) if found else _choice(parameter, said, text, settings))
     return axes
 
 
@@ -69,37 +69,37 @@ def points(axes: Sequence[Choice]) -> Iterator[dict[str, object]]:
     if count > MOST_POINTS:
         raise InputError(f"the grid has {count} points, at most {MOST_POINTS} will do; give fewer values, or --optuna")
     for values in itertools.product(*(axis.values for axis in axes)):
-        yield {axis.knob: value for axis, value in zip(axes, values, strict=True)}
+        yield {axis.parameter: value for axis, value in zip(axes, values, strict=True)}
 
 
-def possible(settings: Settings, knobs: Mapping[str, object]) -> str:
-    """Why knobs cannot have these values together; empty where they can."""
+def possible(settings: Settings, parameters: Mapping[str, object]) -> str:
+    """Why parameters cannot have these values together; empty where they can."""
     try:
-        with_knobs(settings, knobs)
+        with_parameters(settings, parameters)
     except InputError as error:
         return str(error)
     return ""
 
 
 def _halves(text: str, wanted: str, settings: Settings, axes: Sequence[Axis]) -> tuple[str, str]:
-    knob, equals, said = (part.strip() for part in text.partition("="))
-    if not equals or not knob or not said:
+    parameter, equals, said = (part.strip() for part in text.partition("="))
+    if not equals or not parameter or not said:
         raise InputError(f"'{text}' is no axis of a sweep; wanted {wanted}, such as difference.threshold=10,20")
-    names = [known.name for known in all_knobs()]
-    if knob not in names:
-        raise InputError(f"unknown knob '{knob}'; {nearest(knob, names)}")
-    if any(axis.knob == knob for axis in axes):
-        raise InputError(f"{knob} is given twice; wanted all that it may be in one place")
-    return knob, said
+    names = [known.name for known in all_parameters()]
+    if parameter not in names:
+        raise InputError(f"unknown parameter '{parameter}'; {nearest(parameter, names)}")
+    if any(axis.parameter == parameter for axis in axes):
+        raise InputError(f"{parameter} is given twice; wanted all that it may be in one place")
+    return parameter, said
 
 
-def _choice(knob: str, said: str, text: str, settings: Settings) -> Choice:
+def _choice(parameter: str, said: str, text: str, settings: Settings) -> Choice:
     values = [tuple(value) if isinstance(value, list) else value for value in _listed(said)]
     if not values:
         raise InputError(f"'{text}' has no values; wanted some, such as difference.threshold=10,20")
     for value in values:
-        _check(knob, value, settings)
-    return Choice(knob, tuple(dict.fromkeys(_as_it_is(knob, value, settings) for value in values)))
+        _check(parameter, value, settings)
+    return Choice(parameter, tuple(dict.fromkeys(_as_it_is(parameter, value, settings) for value in values)))
 
 
 def _listed(said: str) -> list[object]:
@@ -116,10 +116,12 @@ def _listed(said: str) -> list[object]:
     return values
 
 
-def _range(knob: str, found: re.Match[str], text: str, settings: Settings) -> Range:
-    now = _value(settings, knob)
+def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Range:
+    now = _value(settings, parameter)
     if isinstance(now, bool) or not isinstance(now, int | float):
-        raise InputError(f"{knob} is no number and has no range; wanted its values, such as {knob}=first,second")
+        raise InputError(
+            f"{parameter} is no number and has no range; wanted its values, such as {parameter}=first,second"
+        )
     low, high = (_number(end, text) for end in found.groups()[:2])
     if not low < high:
         raise InputError(f"'{text}' goes from {low:g} to {high:g}; wanted the lower end first")
@@ -129,16 +131,16 @@ def _range(knob: str, found: re.Match[str], text: str, settings: Settings) -> Ra
         raise InputError(f"'{text}' goes from {low:g} in decades; wanted a lower end above 0")
     if isinstance(now, float):
         for end in (low, high):
-            _check(knob, end, settings)
-        return Range(knob, low, high, 0, log)
+            _check(parameter, end, settings)
+        return Range(parameter, low, high, 0, log)
     if odd_end := next((end for end in (low, high) if end != int(end)), None):
-        raise InputError(f"{knob} takes whole numbers; '{text}' has {odd_end:g}")
+        raise InputError(f"{parameter} takes whole numbers; '{text}' has {odd_end:g}")
     for end in (low, high):
-        _check(knob, int(end), settings)
-    odd = next(known.range for known in all_knobs() if known.name == knob).endswith(", odd")
+        _check(parameter, int(end), settings)
+    odd = next(known.range for known in all_parameters() if known.name == parameter).endswith(", odd")
     if log and odd:
-        raise InputError(f"{knob} takes odd numbers, which cannot be drawn in decades; leave out :log")
-    return Range(knob, int(low), int(high), 2 if odd else 1, log)
+        raise InputError(f"{parameter} takes odd numbers, which cannot be drawn in decades; leave out :log")
+    return Range(parameter, int(low), int(high), 2 if odd else 1, log)
 
 
 def _number(text: str, axis: str) -> float:
@@ -148,18 +150,18 @@ def _number(text: str, axis: str) -> float:
         raise InputError(f"'{axis}': {text} is no number; wanted low:high") from None
 
 
-def _check(knob: str, value: object, settings: Settings) -> None:
+def _check(parameter: str, value: object, settings: Settings) -> None:
     """Raises InputError where a knob cannot have a value; a rule over several knobs is asked at each point."""
-    told = possible(settings, {knob: value})
-    if told.startswith(f"{knob} = "):
+    told = possible(settings, {parameter: value})
+    if told.startswith(f"{parameter} = "):
         raise InputError(told)
 
 
-def _as_it_is(knob: str, value: object, settings: Settings) -> object:
-    """The value as the settings hold it: 20 as 20.0 where a knob is no whole number."""
-    return float(value) if isinstance(_value(settings, knob), float) and isinstance(value, int) else value
+def _as_it_is(parameter: str, value: object, settings: Settings) -> object:
+    """The value as the settings hold it: 20 as 20.0 where a parameter is no whole number."""
+    return float(value) if isinstance(_value(settings, parameter), float) and isinstance(value, int) else value
 
 
-def _value(settings: Settings, knob: str) -> object:
-    group, name = knob.split(".")
+def _value(settings: Settings, parameter: str) -> object:
+    group, name = parameter.split(".")
     return getattr(getattr(settings, group), name)

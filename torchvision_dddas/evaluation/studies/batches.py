@@ -12,7 +12,7 @@ from typing import Any
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.detector import Ask, Steps, running
 from torchvision_dddas.detection.detector import Clip as Frames
-from torchvision_dddas.detection.engine import Vision, load_engine
+from torchvision_dddas.detection.engine import Engine, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.memory import Peak
@@ -62,7 +62,7 @@ def find_motion_together(
 
 def scenes_together(
     clips: Mapping[str, Frames],
-    vision: Vision,
+    engine: Engine,
     settings: Settings,
     telemetry: Mapping[str, Telemetry] | None = None,
     batch: int | None = None,
@@ -75,13 +75,13 @@ def scenes_together(
     """
     logs = telemetry or {}
     each = batch or max(1, -(-BATCH // max(len(clips), 1)))
-    loops = {name: running(clip, vision, settings, logs.get(name), each) for name, clip in clips.items()}
+    loops = {name: running(clip, engine, settings, logs.get(name), each) for name, clip in clips.items()}
     answers: dict[str, list[Any] | None] = dict.fromkeys(loops)
     while answers:
         asked: dict[str, Ask] = {}
         for name, answer in answers.items():
             yield from _until_it_asks(name, loops[name], answer, asked)
-        answers = _answered(asked, vision)
+        answers = _answered(asked, engine)
 
 
 def _until_it_asks(
@@ -104,7 +104,7 @@ def _until_it_asks(
         answer = None
 
 
-def _answered(asked: Mapping[str, Ask], vision: Vision) -> dict[str, list[Any] | None]:
+def _answered(asked: Mapping[str, Ask], engine: Engine) -> dict[str, list[Any] | None]:
     """The answers by name. Each bears the share of the time that its items have in all that were asked with them."""
     answers: dict[str, list[Any] | None] = {}
     for what in ("register", "foreground"):
@@ -112,7 +112,7 @@ def _answered(asked: Mapping[str, Ask], vision: Vision) -> dict[str, list[Any] |
         if not asks:
             continue
         start = time.perf_counter()
-        found = iter(getattr(vision, what)(list(chain.from_iterable(ask.items for ask in asks.values()))))
+        found = iter(getattr(engine, what)(list(chain.from_iterable(ask.items for ask in asks.values()))))
         each = (time.perf_counter() - start) / sum(len(ask.items) for ask in asks.values())
         for name, ask in asks.items():
             ask.seconds = each * len(ask.items)

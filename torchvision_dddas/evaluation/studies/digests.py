@@ -69,7 +69,7 @@ def _add(digest: Any, value: Any) -> None:
 
 @cache
 def code(which: tuple[str, ...], backend: str = "") -> str:
-    """The digest of a part of the package, and of the libraries that it computes with. backend: as `vision.load`."""
+    """The digest of a part of the package, and of the libraries that it computes with. backend: as `engine.load`."""
     content = {}
     for name in which:
         place = PACKAGE / name

@@ -10,7 +10,7 @@ from torchvision_dddas.evaluation.metrics.bootstrap import Statistic, Stratum
 from torchvision_dddas.evaluation.metrics.clear import Clear
 from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.figures import of_group
-from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.ranking import Ranking, ranking
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels, ratio
 from torchvision_dddas.evaluation.metrics.still import Still
@@ -25,7 +25,13 @@ RANKED = "ranking"
 METRES = "metres"
 """The group of errors on the ground."""
 
-_KINDS: dict[str, Any] = {"pixels": Pixels, "boxes": Boxes, "target": OneTarget, "still": Still, "location": Located}
+_KINDS: dict[str, Any] = {
+    "pixels": Pixels,
+    "boxes": Boxes,
+    "target": OneTarget,
+    "still": Still,
+    "location": GroundLocations,
+}
 
 
 class Estimate(NamedTuple):

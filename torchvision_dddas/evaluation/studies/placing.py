@@ -8,7 +8,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.rows import Rows, Tick, written
-from torchvision_dddas.types import Grounded, Positions
+from torchvision_dddas.types import AerialLocations, Positions
 
 if TYPE_CHECKING:
     from torchvision_dddas.cli.aerial import AerialInput
@@ -37,7 +37,7 @@ def _along(clip: Clip, settings: Settings, backend: str, interval: int, tick: Ti
 
     source, rows = opened(clip), Rows()
     ready = prepared(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
-    for surveyed in survey(source, ready.vision, ready.settings, ready.flight, ready.watch, interval, pictures=False):
+    for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, interval, pictures=False):
         tracks, grounded = surveyed.followed.tracks, surveyed.grounded
         seen = tracks.row >= 0
         box_px, identity, score = (column[seen] for column in (tracks.box_px, tracks.identity, tracks.score))
@@ -96,7 +96,7 @@ def _add(
     box_px: np.ndarray,
     identity: np.ndarray,
     score: np.ndarray,
-    grounded: Grounded | None,
+    grounded: AerialLocations | None,
 ) -> None:
     """A frame's targets, those that were located under the names that they have on the ground."""
     count = len(box_px)

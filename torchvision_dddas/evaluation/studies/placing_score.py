@@ -8,7 +8,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import metres
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
 from torchvision_dddas.evaluation.studies.scored import Scored
 
@@ -69,7 +69,7 @@ def score_places(clip: "Clip", found: "Found") -> Scored:
         "east_m": off[:, 0],
         "north_m": off[:, 1],
     }
-    counts = Located(len(wanted), len(mine), int((whose == _NOBODY).sum()))
+    counts = GroundLocations(len(wanted), len(mine), int((whose == _NOBODY).sum()))
     return Scored(frames, {"location": counts}, {"location": each}, {}, samples, tuple(notes))
 
 

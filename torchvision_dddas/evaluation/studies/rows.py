@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.evaluation.studies.record import Found
-from torchvision_dddas.types import Followed, Scene
+from torchvision_dddas.types import Scene, TrackedFrame
 
 Tick = Callable[[], object]
 
@@ -99,7 +99,7 @@ def scenes_kept(scenes: Iterator[Scene], wanted: set[int], tick: Tick) -> Rows:
     return kept.rows()
 
 
-def followed_kept(followed: Iterator[Followed], tick: Tick) -> Rows:
+def followed_kept(followed: Iterator[TrackedFrame], tick: Tick) -> Rows:
     """The tracks of frames in order, as `tracks.txt` has them."""
     rows = Rows()
     for here in followed:

@@ -13,7 +13,7 @@ import numpy as np
 from torchvision_dddas.evaluation.metrics import bootstrap, metres
 from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
-from torchvision_dddas.evaluation.metrics.metres import Located
+from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.ranking import ranking
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels
 from torchvision_dddas.evaluation.metrics.still import Still
@@ -44,7 +44,7 @@ _EMPTY: Mapping[str, Any] = {
     "tracks": TrackCounts(),
     "target_track": TargetTrack(),
     "still": Still(),
-    "location": Located(),
+    "location": GroundLocations(),
 }
 """Groups whose measures come of counts, and no counts at all."""
 

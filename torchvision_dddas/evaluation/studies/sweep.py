@@ -1,4 +1,4 @@
-"""Sweeps: the same study with other knobs, on a grid or as Optuna proposes, and which of them measure best.
+"""Sweeps: the same study with other parameters, on a grid or as Optuna proposes, and which of them measure best.
 
 Nothing random is left open and every study takes from the cache what it has computed before: a sweep that was broken
 off and is asked for again goes the same way, and is soon where it was.
@@ -23,7 +23,7 @@ Measured = tuple[float, str]
 """The measure, NaN where there is none, and then why."""
 
 Measure = Callable[[Mapping[str, object]], Measured]
-"""What a study measures with some knobs changed."""
+"""What a study measures with some parameters changed."""
 
 Ahead = Callable[[Sequence[Mapping[str, object]]], None]
 
@@ -35,7 +35,7 @@ class Trial:
     """One point. number: 0 for the settings as they were. cause: why it has no value."""
 
     number: int
-    knobs: Mapping[str, object]
+    parameters: Mapping[str, object]
     value: float
     cause: str = ""
 
@@ -43,19 +43,21 @@ class Trial:
 def on_grid(axes: Sequence[Choice], settings: Settings, measure: Measure, ahead: Ahead) -> Iterator[Trial]:
     """The settings as they are, then all points of a grid. Raises InputError where it has too many or no possible one.
 
-    A point whose knobs cannot have their values together has a cause and no value. ahead: is told the points that will
-    be measured next.
+    A point whose parameters cannot have their values together has a cause and no value. ahead: is told the points that
+    will be measured next.
     """
     wanted = list(points(axes))
-    causes = [possible(settings, knobs) for knobs in wanted]
+    causes = [possible(settings, parameters) for parameters in wanted]
     if all(causes):
         raise InputError(f"no point of the grid is possible; the first: {causes[0]}")
     todo: list[tuple[Mapping[str, object], str]] = [({}, ""), *zip(wanted, causes, strict=True)]
     for first in range(0, len(todo), AHEAD):
         part = todo[first : first + AHEAD]
-        ahead([knobs for knobs, cause in part if not cause])
-        for number, (knobs, cause) in enumerate(part, first):
-            yield Trial(number, knobs, math.nan, cause) if cause else Trial(number, knobs, *measure(knobs))
+        ahead([parameters for parameters, cause in part if not cause])
+        for number, (parameters, cause) in enumerate(part, first):
+            yield (
+                Trial(number, parameters, math.nan, cause) if cause else Trial(number, parameters, *measure(parameters))
+            )
 
 
 def proposed(
@@ -74,9 +76,9 @@ def proposed(
     yield Trial(0, {}, *measure({}))
     for number in range(1, count + 1):
         proposal = study.ask()
-        knobs = {axis.knob: _suggested(proposal, axis) for axis in axes}
-        cause = possible(settings, knobs)
-        trial = Trial(number, knobs, math.nan, cause) if cause else Trial(number, knobs, *measure(knobs))
+        parameters = {axis.parameter: _suggested(proposal, axis) for axis in axes}
+        cause = possible(settings, parameters)
+        trial = Trial(number, parameters, math.nan, cause) if cause else Trial(number, parameters, *measure(parameters))
         _tell(study, proposal, trial)
         yield trial
 
@@ -110,11 +112,11 @@ def as_toml(settings: Settings, heading: Sequence[str]) -> str:
     """What differs from the defaults, as `--config` takes it, under some lines of comment."""
     groups: dict[str, list[str]] = {}
     for name, value in changes(settings).items():
-        group, knob = name.split(".")
-        groups.setdefault(group, []).append(f"{knob} = {written(value)}")
+        group, parameter = name.split(".")
+        groups.setdefault(group, []).append(f"{parameter} = {written(value)}")
     lines = [f"# {line}" for line in heading]
-    for group, knobs in groups.items():
-        lines += ["", f"[{group}]", *knobs]
+    for group, parameters in groups.items():
+        lines += ["", f"[{group}]", *parameters]
     return "\n".join(lines) + "\n"
 
 
@@ -123,7 +125,7 @@ def told(trials: Sequence[Trial]) -> list[dict[str, Any]]:
     return [
         {
             "number": t.number,
-            "knobs": dict(t.knobs),
+            "knobs": dict(t.parameters),
             "value": None if math.isnan(t.value) else t.value,
             "cause": t.cause,
         }
@@ -134,10 +136,10 @@ def told(trials: Sequence[Trial]) -> list[dict[str, Any]]:
 def _suggested(proposal: "Proposal", axis: Axis) -> object:
     if isinstance(axis, Choice):
         # By their places: a list is no choice that Optuna knows.
-        return axis.values[proposal.suggest_categorical(axis.knob, range(len(axis.values)))]
+        return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
     if axis.step:
-        return proposal.suggest_int(axis.knob, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
-    return proposal.suggest_float(axis.knob, axis.low, axis.high, log=axis.log)
+        return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
+    return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
 
 
 def _tell(study: "Optuna", proposal: "Proposal", trial: Trial) -> None:

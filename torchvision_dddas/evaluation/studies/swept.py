@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import Settings, changes, with_knobs
+from torchvision_dddas.config import Settings, changes, with_parameters
 from torchvision_dddas.evaluation.studies.goals import Goal
 from torchvision_dddas.evaluation.studies.sweep import Trial, as_toml, told
 from torchvision_dddas.io.atomic_files import cannot_write, write_whole
@@ -36,11 +36,11 @@ class Swept:
         self.best, self.on_held = best, on_held
         before = number(self.trials[0].value)
         about = [f"dddas sweep: {self.heading}: {number(best.value)}, with the settings as they were {before}."]
-        about += [f"{knob}: {value}" for knob, value in best.knobs.items()]
+        about += [f"{parameter}: {value}" for parameter, value in best.parameters.items()]
         if on_held is not None:
             about.append(f"On the clips held out: {number(on_held[1][0])}, before {number(on_held[0][0])}.")
         self._write("sweep.json", json.dumps(self._told(), indent=2) + "\n")
-        self._write("best.toml", as_toml(with_knobs(self.settings, best.knobs), about))
+        self._write("best.toml", as_toml(with_parameters(self.settings, best.parameters), about))
 
     @property
     def heading(self) -> str:

@@ -1,4 +1,4 @@
-"""The studies of a sweep: one data set and one goal, other knobs each time."""
+"""The studies of a sweep: one data set and one goal, other parameters each time."""
 
 import glob
 from collections.abc import Callable, Mapping, Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from torchvision_dddas.config import with_knobs
+from torchvision_dddas.config import with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies import digests
 from torchvision_dddas.evaluation.studies.cache import Cache
@@ -30,9 +30,9 @@ class Tried:
     cache: Path | None
     tell: Callable[[int, int], object] = lambda done, of: None
 
-    def measured(self, knobs: Mapping[str, object], clips: Sequence[str]) -> Measured:
+    def measured(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
         """The goal's value over clips of these names, and if it has none why."""
-        changed = tuple(f"{name}={written(value)}" for name, value in knobs.items())
+        changed = tuple(f"{name}={written(value)}" for name, value in parameters.items())
         spec = replace(self.spec, overrides=(*self.spec.overrides, *changed))
         names = [glob.escape(name) for name in clips]
         done = 0
@@ -51,7 +51,11 @@ class Tried:
         planned = plan(self.spec, self.base, [glob.escape(name) for name in clips])
         store = Cache(self.cache or cache_folder())
         files = digests.Files(store.folder / "files", read=False)
-        each = [replace(job, settings=with_knobs(job.settings, knobs)) for knobs in points for job in planned.jobs]
+        each = [
+            replace(job, settings=with_parameters(job.settings, parameters))
+            for parameters in points
+            for job in planned.jobs
+        ]
         jobs = order([replace(job, number=number) for number, job in enumerate(each)])
         waiting, done = [job for job in jobs if kept(job, store, files) is None], 0
         for event in share(waiting, self.jobs or cores(), store.folder):

@@ -78,7 +78,7 @@ class Keys:
 
 
 def _named_by(settings: Settings, task: Task) -> list[Path]:
-    """Files that knobs name."""
+    """Files that parameters name."""
     if "people" not in KNOBS[task]:
         return []
     named: list[Path] = []

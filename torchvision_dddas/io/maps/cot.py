@@ -1,4 +1,4 @@
-"""Located targets as Cursor-on-Target events, the XML that situational-awareness tools exchange."""
+"""GroundLocations targets as Cursor-on-Target events, the XML that situational-awareness tools exchange."""
 
 import math
 

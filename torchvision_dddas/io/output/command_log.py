@@ -6,7 +6,7 @@ from collections.abc import Collection
 import numpy as np
 
 from torchvision_dddas.io.output.run_log import ORDERED, RunLog
-from torchvision_dddas.types import Command, Grounded, Order, Surveyed
+from torchvision_dddas.types import AerialLocations, Command, FrameResult, Order
 
 _FAR_M = 15.0
 """A goal that moved by less is the same: it goes with a crowd."""
@@ -19,7 +19,7 @@ class Orders:
     def __init__(self) -> None:
         self._goal: dict[str, np.ndarray] = {}
 
-    def note(self, surveyed: Surveyed, log: RunLog, explained: Collection[str] = ()) -> None:
+    def note(self, surveyed: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
         """Tell of a frame's orders what is new in them, but for those of `explained`: adjustments tell of them."""
         command, frame = surveyed.command, surveyed.followed.number
         if command is None:
@@ -65,7 +65,7 @@ class _Same(Metres):
         return np.asarray(place, float)
 
 
-def metres(surveyed: Surveyed) -> Metres | None:
+def metres(surveyed: FrameResult) -> Metres | None:
     """What turns the places of orders into local metres; None where this frame does not tell."""
     grounded, degrees = surveyed.grounded, surveyed.mark_lonlat_deg
     if grounded is None:
@@ -92,7 +92,7 @@ def _words(order: Order, scale: Metres | None) -> str:
     return text
 
 
-def in_picture(grounded: Grounded) -> np.ndarray | None:
+def in_picture(grounded: AerialLocations) -> np.ndarray | None:
     """(2, 2) pixels to the right and down of a metre to the east and north about the landmarks; None where unknown."""
     marks = grounded.marks
     both = np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1)

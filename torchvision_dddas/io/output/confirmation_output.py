@@ -14,13 +14,13 @@ from torchvision_dddas.io.output.position_output import COLUMNS as POSITION_COLU
 from torchvision_dddas.io.output.position_output import DEGREES
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.types import Confirmed, Positions, Surveyed
+from torchvision_dddas.types import Confirmation, FrameResult, Positions
 
 COLUMNS = ("kind", "probability", "seen_by", "people", "nearest_m", "nearest_sigmas", "best_score")
 """What is added to the blobs' own columns; a column of theirs with such a name is replaced."""
 
 
-def csv_lines(confirmed: Confirmed, given: Sequence[Sequence[str]]) -> str:
+def csv_lines(confirmed: Confirmation, given: Sequence[Sequence[str]]) -> str:
     """One line a blob: its own cells, then COLUMNS; a cell is empty where a value is unknown.
 
     given: the own cells of all rows of the table. seen_by: names of vehicles, apart by semicolons.
@@ -53,7 +53,7 @@ class ConfirmedTable:
         self._given = given
         self._files = TextFiles({folder / "confirmed.csv": ",".join([*header, *COLUMNS]) + "\n"})
 
-    def write(self, confirmed: Confirmed) -> None:
+    def write(self, confirmed: Confirmation) -> None:
         """Add the blobs of a frame."""
         self._files.write(csv_lines(confirmed, self._given))
 
@@ -76,7 +76,7 @@ class ConfirmedPlaces:
         self._files = TextFiles({self.path: ",".join(header) + "\n"})
         self._written = False
 
-    def write(self, surveyed: Surveyed) -> None:
+    def write(self, surveyed: FrameResult) -> None:
         """Add the targets of a frame."""
         confirmed, grounded = surveyed.confirmed, surveyed.grounded
         if confirmed is None or grounded is None:
@@ -120,7 +120,7 @@ class ConfirmJournal(Record):
         self.looked = 0
         self.counts = {"kinds": {}, "rows_looked_at": 0}
 
-    def write(self, confirmed: Confirmed) -> None:
+    def write(self, confirmed: Confirmation) -> None:
         """Take note of a frame."""
         self.kinds.update(confirmed.kind)
         self.looked += sum(bool(names) for names in confirmed.seen_by)
@@ -128,7 +128,7 @@ class ConfirmJournal(Record):
         self.note(confirmed.frame, len(confirmed.kind), {})
 
 
-class ConfirmOutput(RunFolder[Confirmed]):
+class ConfirmOutput(RunFolder[Confirmation]):
     """Everything that `dddas confirm` writes. Raises InputError as RunFolder does."""
 
     files = ("confirmed.csv", NAME)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.types import Surveyed
+from torchvision_dddas.types import FrameResult
 
 PLACES = {True: ("longitude_deg", "latitude_deg"), False: ("east_m", "north_m")}
 COLUMNS = ("frame", "landmark", "u_px", "v_px")
@@ -23,7 +23,7 @@ class MarkTable:
         columns = (*COLUMNS, *PLACES[geographic], *MORE)
         self._files = TextFiles({folder / "landmarks.csv": ",".join(columns) + "\n"})
 
-    def write(self, surveyed: Surveyed) -> None:
+    def write(self, surveyed: FrameResult) -> None:
         """Add the landmarks of a frame that the picture shows."""
         grounded = surveyed.grounded
         if grounded is None:

@@ -22,7 +22,7 @@ from torchvision_dddas.io.output.location_tables import GroundedTables
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.report.run_report import Story, Table, report, span
 from torchvision_dddas.io.report.timeline import USED, Timeline
-from torchvision_dddas.types import Camera, Fix, Grounded, Ortho, Positions
+from torchvision_dddas.types import AerialLocations, Camera, Fix, Ortho, Positions
 
 SAVED = ("cot", "map", "report")
 """What --save may name. The tables, tracks.geojson, tracks.kml and run.json are always written."""
@@ -87,7 +87,7 @@ class GroundedJournal(Record):
         """The adjustments of the feedback loop."""
         return self._adjustments
 
-    def write(self, grounded: Grounded) -> None:
+    def write(self, grounded: AerialLocations) -> None:
         """Take note of a frame."""
         frame, fix = grounded.frame, grounded.fix
         self.positions += len(grounded.positions)
@@ -156,7 +156,7 @@ class Maps:
         self.written: set[str] = set()
         self.more: More | None = None
 
-    def write(self, grounded: Grounded) -> None:
+    def write(self, grounded: AerialLocations) -> None:
         """Keep what the maps will show of a frame."""
         self._targets.add(grounded.positions, grounded.time_s, grounded.velocity_m_s)
         self._timeline.add(grounded)
@@ -212,7 +212,7 @@ class Maps:
         return cv2.imencode(".png", picture)[1].tobytes()
 
 
-class GroundedOutput(RunFolder[Grounded]):
+class GroundedOutput(RunFolder[AerialLocations]):
     """Everything that `dddas locate aerial` writes. Raises InputError as RunFolder does."""
 
     files = (*GroundedJournal.made, NAME)
@@ -319,5 +319,5 @@ def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png
     ]
     state = "complete" if complete else "interrupted: up to the last whole frame"
     name = Path(str(kept.facts.get("input", ""))).name
-    title = f"Located from the air: {name}" if name else "Located from the air"
+    title = f"GroundLocations from the air: {name}" if name else "GroundLocations from the air"
     return Story(title, state, figures, kept.facts, tables, [*kept.notes, *kept.problems], map_png)

@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas.io.output.position_output import COLUMNS, DEGREES
 from torchvision_dddas.io.report.timeline import USED
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.types import CameraPose, Fix, Grounded
+from torchvision_dddas.types import AerialLocations, CameraPose, Fix
 
 MORE = ("score", "time_s", "relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s", "by", "landmarks")
 """Columns of positions.csv after those that all positions have."""
@@ -21,7 +21,7 @@ FIXES = (
 other; the bearing of the picture's upper edge is steady there. focal: as a share of what the camera's file says."""
 
 
-def position_lines(grounded: Grounded) -> str:
+def position_lines(grounded: AerialLocations) -> str:
     """One line a target in the order of COLUMNS, DEGREES where they are known, and MORE; unknown cells are empty.
 
     relative_sigma_m: relative to the team, the root of the covariance's trace. landmarks: how many were used.
@@ -47,7 +47,7 @@ def position_lines(grounded: Grounded) -> str:
     return "".join(pattern % (frame, target, *row) for frame, target, row in rows).replace(",nan", ",")
 
 
-def fix_line(grounded: Grounded) -> str:
+def fix_line(grounded: AerialLocations) -> str:
     """The line of a frame in the order of FIXES; a cell is empty where a value is unknown."""
     fix = grounded.fix
     pose = [math.nan] * 8
@@ -105,7 +105,7 @@ class GroundedTables:
         content = {folder / "positions.csv": header, folder / "fixes.csv": FIXES}
         self._files = TextFiles({path: ",".join(names) + "\n" for path, names in content.items()})
 
-    def write(self, grounded: Grounded) -> None:
+    def write(self, grounded: AerialLocations) -> None:
         """Add the targets of a frame."""
         self._files.write(position_lines(grounded), fix_line(grounded))
 

@@ -9,7 +9,7 @@ from torchvision_dddas.io.output.people_tables import PeopleTables
 from torchvision_dddas.io.output.run_record import Record
 from torchvision_dddas.io.overlay.detection_overlay import Overlay
 from torchvision_dddas.io.overlay.people_overlay import LIKELY, Still, drawn_people
-from torchvision_dddas.types import Recognized
+from torchvision_dddas.types import PeopleFrame
 
 SAVED = ("overlay",)
 """What --save may name. The tables and run.json are always written."""
@@ -28,7 +28,7 @@ class PeopleJournal(Record):
         self.share = 0.0
         self.overlay = "overlay.mp4"
 
-    def write(self, recognized: Recognized) -> None:
+    def write(self, recognized: PeopleFrame) -> None:
         """Take note of a frame."""
         self.unlikely += int((recognized.people.score < LIKELY).sum())
         self.cut += int(recognized.people.cut.sum())
@@ -58,7 +58,7 @@ class PeopleJournal(Record):
         )
 
 
-class PeopleOutput(RunFolder[Recognized]):
+class PeopleOutput(RunFolder[PeopleFrame]):
     """Everything that `dddas people` writes. Raises InputError as RunFolder does."""
 
     files = ("detections.txt", "detections.csv", "overlay.png", *RunFolder.files)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from torchvision_dddas.io.tables import TextFiles, mot_rows
-from torchvision_dddas.types import Recognized
+from torchvision_dddas.types import PeopleFrame
 
 COLUMNS = (
     *("frame", "target", "x_px", "y_px", "width_px", "height_px", "score", "kind"),
@@ -11,12 +11,12 @@ COLUMNS = (
 )
 
 
-def mot_lines(recognized: Recognized) -> str:
+def mot_lines(recognized: PeopleFrame) -> str:
     """`frame,-1,x,y,width,height,probability,-1,-1,-1`, a line a person: frames from 1, pixels from 0."""
     return mot_rows(recognized.frame.number, recognized.people.box_px, recognized.people.score)
 
 
-def csv_lines(recognized: Recognized) -> str:
+def csv_lines(recognized: PeopleFrame) -> str:
     """One line a person, in the order of COLUMNS.
 
     The box is the body's. margin: the classifier's own score. feet_u_px, feet_v_px: the point between the feet, from
@@ -36,7 +36,7 @@ class PeopleTables:
     def __init__(self, folder: Path) -> None:
         self._files = TextFiles({folder / "detections.txt": "", folder / "detections.csv": ",".join(COLUMNS) + "\n"})
 
-    def write(self, recognized: Recognized) -> None:
+    def write(self, recognized: PeopleFrame) -> None:
         """Add the people of a frame."""
         self._files.write(mot_lines(recognized), csv_lines(recognized))
 

@@ -21,7 +21,7 @@ from torchvision_dddas.io.overlay.detection_overlay import Overlay
 from torchvision_dddas.io.overlay.survey_overlay import Once, SurveyPictures
 from torchvision_dddas.io.report.run_story import REPORT, RunStory
 from torchvision_dddas.io.tables import Tables
-from torchvision_dddas.types import Followed, Scene, Surveyed
+from torchvision_dddas.types import FrameResult, Scene, TrackedFrame
 
 SAVED = ("overlay", *MAPS)
 """What --save may name. The tables and run.json are always written."""
@@ -33,7 +33,7 @@ ALL = (*FOUND, "landmarks.csv", "confirmed.csv", *(name for name in GroundedOutp
 Part = TypeVar("Part")
 
 
-class FoundOutput(RunFolder[Surveyed]):
+class FoundOutput(RunFolder[FrameResult]):
     """What `dddas run` writes where nothing lays the pictures on the ground. Raises InputError as RunFolder does."""
 
     # Those too that only a run that locates makes: of an earlier one here they go, of someone else they stop this one.
@@ -78,7 +78,7 @@ class SurveyOutput(GroundedOutput):
     def __init__(self, folder: Path, save: Sequence[str] = SAVED) -> None:
         """Claim a folder, as in RunFolder."""
         super().__init__(folder, save)
-        self._more: list[Sink[Surveyed]] = []
+        self._more: list[Sink[FrameResult]] = []
 
     def also(self, kept: Record, rate_hz: float, size: tuple[int, int], names: Sequence[str], geographic: bool) -> None:
         """After begin: what to write beside. kept: its record; geographic: whether longitudes are known."""
@@ -104,7 +104,7 @@ class SurveyOutput(GroundedOutput):
         """Say, after the last frame, how good the run was against the truth: values by name, and in words."""
         self._story.scored(measures, said)
 
-    def survey(self, item: Surveyed) -> None:
+    def survey(self, item: FrameResult) -> None:
         """Write a frame to every sink, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
         assert item.grounded is not None
         with uninterrupted(), self._refusals():
@@ -137,9 +137,9 @@ def _found(
     names: Sequence[str],
     kept: Record,
     facts: Mapping[str, Any],
-) -> tuple[RunStory, list[Sink[Surveyed]]]:
+) -> tuple[RunStory, list[Sink[FrameResult]]]:
     """Tables of what was found and who is who, the overlay, and the log."""
-    sinks: list[Sink[Surveyed]] = [_Of(Tables(folder), _scene), _Of(TrackTables(folder), _followed)]
+    sinks: list[Sink[FrameResult]] = [_Of(Tables(folder), _scene), _Of(TrackTables(folder), _followed)]
     pictures = Once(SurveyPictures(size, names))
     if "overlay" in save:
         sinks.append(Overlay(folder, rate_hz, pictures))
@@ -151,11 +151,11 @@ def _found(
 class _Of(Generic[Part]):
     """A sink of a part of what is known of a frame."""
 
-    def __init__(self, sink: Sink[Part], part: Callable[[Surveyed], Part]) -> None:
+    def __init__(self, sink: Sink[Part], part: Callable[[FrameResult], Part]) -> None:
         self._sink, self._part = sink, part
         self.close, self.discard = sink.close, sink.discard
 
-    def write(self, surveyed: Surveyed) -> None:
+    def write(self, surveyed: FrameResult) -> None:
         self._sink.write(self._part(surveyed))
 
 
@@ -167,7 +167,7 @@ class _Identities:
         self._identities = self._bridges = self._untracked = 0
         self._unseen: list[dict[str, Any]] = []
 
-    def write(self, surveyed: Surveyed) -> None:
+    def write(self, surveyed: FrameResult) -> None:
         followed = surveyed.followed
         self._identities = int(followed.tracks.identity.max(initial=self._identities))
         self._bridges += int((followed.tracks.row < 0).sum())
@@ -192,11 +192,11 @@ class _Identities:
         pass
 
 
-def _followed(surveyed: Surveyed) -> Followed:
+def _followed(surveyed: FrameResult) -> TrackedFrame:
     return surveyed.followed
 
 
-def _scene(surveyed: Surveyed) -> Scene:
+def _scene(surveyed: FrameResult) -> Scene:
     """As far as the tables of detections look at it."""
     followed = surveyed.followed
     assert followed.frame is not None

@@ -13,7 +13,7 @@ from torchvision_dddas.io.maps.kml import kml
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.types import Located, Positions
+from torchvision_dddas.types import GroundLocations, Positions
 
 COLUMNS = ("frame", "target", "east_m", "north_m", "var_east_m2", "cov_east_north_m2", "var_north_m2")
 DEGREES = ("longitude_deg", "latitude_deg")
@@ -34,7 +34,7 @@ def csv_lines(positions: Positions, cameras: np.ndarray) -> str:
     return "".join(lines)
 
 
-def sighting_lines(located: Located, names: tuple[str, ...]) -> str:
+def sighting_lines(located: GroundLocations, names: tuple[str, ...]) -> str:
     """One line a box, in the order of SIGHTINGS; a cell is empty where a value is unknown."""
     seen = located.sightings
     covariance = seen.covariance_m2
@@ -76,7 +76,7 @@ class PositionTables:
         content = {folder / "positions.csv": header, folder / "sightings.csv": SIGHTINGS}
         self._files = TextFiles({path: ",".join(names) + "\n" for path, names in content.items()})
 
-    def write(self, located: Located) -> None:
+    def write(self, located: GroundLocations) -> None:
         """Add the people of a frame."""
         count = (located.members >= 0).sum(axis=1)
         self._files.write(csv_lines(located.positions, count), sighting_lines(located, self._cameras))
@@ -99,7 +99,7 @@ class Map:
         self._paths = [folder / name for name in self.files]
         self._gathered = Gathered()
 
-    def write(self, located: Located) -> None:
+    def write(self, located: GroundLocations) -> None:
         """Add the people of a frame."""
         self._gathered.add(located.positions)
 
@@ -127,7 +127,7 @@ class PositionJournal(Record):
         self.by = dict.fromkeys(("both", "height", "feet", "bearing"), 0)
         self.counts = {"people": 0, "sightings": self.by}
 
-    def write(self, located: Located) -> None:
+    def write(self, located: GroundLocations) -> None:
         """Take note of a frame."""
         self.people += len(located.positions)
         for by in located.sightings.by.tolist():
@@ -136,7 +136,7 @@ class PositionJournal(Record):
         self.note(located.frame, len(located.sightings), {})
 
 
-class PositionOutput(RunFolder[Located]):
+class PositionOutput(RunFolder[GroundLocations]):
     """Everything that `dddas locate ground` writes. Raises InputError as RunFolder does."""
 
     files = ("positions.csv", "sightings.csv", *Map.files, NAME)

@@ -54,8 +54,8 @@ class RunLog:
         self.entries.append(Entry(frame, kind, text, time_s=time_s, short=short or text))
 
     def adjusted(self, moved: Adjustment) -> None:
-        """A knob that was moved, and why."""
-        change = f"{moved.knob} {number(moved.old)} -> {number(moved.new)}"
+        """A parameter that was moved, and why."""
+        change = f"{moved.parameter} {number(moved.old)} -> {number(moved.new)}"
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
     def going_on(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:

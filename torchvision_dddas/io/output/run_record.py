@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,9 @@ class Record:
         self.targets += targets
         for stage, spent in seconds.items():
             self._stages.setdefault(stage, Durations()).add(spent)
-        self._adjustments += [asdict(a) for a in adjustments]
+        self._adjustments += [
+            {"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause} for a in adjustments
+        ]
         if cause is not None:
             self.unreliable_frames += 1
             last = self._unreliable[-1] if self._unreliable else None

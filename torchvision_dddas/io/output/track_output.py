@@ -9,7 +9,7 @@ from torchvision_dddas.io.output.run_record import Record
 from torchvision_dddas.io.output.track_tables import TrackTables
 from torchvision_dddas.io.overlay.detection_overlay import Overlay
 from torchvision_dddas.io.overlay.track_overlay import TrackPictures
-from torchvision_dddas.types import Followed
+from torchvision_dddas.types import TrackedFrame
 
 SAVED = ("overlay",)
 """What --save may name. The tables and run.json are always written."""
@@ -25,7 +25,7 @@ class TrackJournal(Record):
         super().__init__(folder, facts)
         self.identities = self.bridges = self.untracked = self.first = 0
 
-    def write(self, followed: Followed) -> None:
+    def write(self, followed: TrackedFrame) -> None:
         """Take note of a frame."""
         tracks, targets = followed.tracks, len(followed.detections)
         seen = int((tracks.row >= 0).sum())
@@ -44,7 +44,7 @@ class TrackJournal(Record):
         self.note(followed.number, targets, followed.seconds, followed.adjustments, followed.cause or None)
 
 
-class TrackOutput(RunFolder[Followed]):
+class TrackOutput(RunFolder[TrackedFrame]):
     """Everything that `dddas track` writes. Raises InputError as RunFolder does."""
 
     files = ("tracks.txt", "tracks.csv", *RunFolder.files)

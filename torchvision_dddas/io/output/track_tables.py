@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.io.overlay.trails import Trails
 from torchvision_dddas.io.tables import TextFiles, compass_deg
-from torchvision_dddas.types import Followed
+from torchvision_dddas.types import TrackedFrame
 
 COLUMNS = (
     *("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score", "kind"),
@@ -15,7 +15,7 @@ COLUMNS = (
 )
 
 
-def mot_lines(followed: Followed) -> str:
+def mot_lines(followed: TrackedFrame) -> str:
     """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line a box that has an identity: frames from 1."""
     tracks = followed.tracks
     return "".join(
@@ -26,7 +26,7 @@ def mot_lines(followed: Followed) -> str:
     )
 
 
-def csv_lines(followed: Followed, motions: dict[int, tuple[float, float]]) -> str:
+def csv_lines(followed: TrackedFrame, motions: dict[int, tuple[float, float]]) -> str:
     """One line a box in the order of COLUMNS, those without identity last; a cell is empty where a value is unknown.
 
     kind: `detection`; `bridge` for a box between two detections; `untracked` for a detection without identity.
@@ -60,7 +60,7 @@ class TrackTables:
         self._files = TextFiles({folder / "tracks.txt": "", folder / "tracks.csv": ",".join(COLUMNS) + "\n"})
         self._trails = Trails(length=2)
 
-    def write(self, followed: Followed) -> None:
+    def write(self, followed: TrackedFrame) -> None:
         """Add the boxes of a frame."""
         self._trails.add(followed)
         self._files.write(mot_lines(followed), csv_lines(followed, self._motions(followed)))
@@ -73,7 +73,7 @@ class TrackTables:
         """Remove what was begun."""
         self._files.discard()
 
-    def _motions(self, followed: Followed) -> dict[int, tuple[float, float]]:
+    def _motions(self, followed: TrackedFrame) -> dict[int, tuple[float, float]]:
         """Heading and speed since the box before, of those identities that have one."""
         found = {}
         for identity in followed.tracks.identity.tolist():

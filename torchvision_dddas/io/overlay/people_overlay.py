@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas.io.atomic_files import remove, temporary
 from torchvision_dddas.io.overlay.detection_overlay import TEXT, WARNING, caption
 from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, label, line_width, rectangle, whole
-from torchvision_dddas.types import Recognized
+from torchvision_dddas.types import PeopleFrame
 
 PERSON = (80, 220, 80)  # BGR
 CUT = (60, 160, 255)
@@ -18,7 +18,7 @@ LIKELY = 0.5
 """Probability from which on a person is drawn as one."""
 
 
-def drawn_people(recognized: Recognized) -> np.ndarray:
+def drawn_people(recognized: PeopleFrame) -> np.ndarray:
     """The frame with everything found in it, (H, W, 3) uint8 BGR.
 
     A person whom the border cuts has another colour and a `?`: box and feet may go on outside. Who is less likely than
@@ -52,7 +52,7 @@ def _colour(cut: bool) -> Colour:
     return CUT if cut else PERSON
 
 
-def _words(recognized: Recognized) -> str:
+def _words(recognized: PeopleFrame) -> str:
     searched = "everywhere" if recognized.regions_px is None else f"in {recognized.share:.0%} of the windows"
     likely = int((recognized.people.score >= LIKELY).sum())
     unlikely = len(recognized.people) - likely
@@ -67,7 +67,7 @@ class Still:
         self._path = folder / "overlay.png"
         self._part = temporary(self._path)
 
-    def write(self, recognized: Recognized) -> None:
+    def write(self, recognized: PeopleFrame) -> None:
         """Draw it. Raises OSError if the disk refuses."""
         _, content = cv2.imencode(".png", drawn_people(recognized))
         self._part.write_bytes(content.tobytes())

@@ -10,7 +10,7 @@ from torchvision_dddas.io.output.command_log import in_picture, metres, summary
 from torchvision_dddas.io.overlay.detection_overlay import TEXT, WARNING
 from torchvision_dddas.io.overlay.drawing import Colour, label, line_width, whole
 from torchvision_dddas.io.overlay.track_overlay import TrackPictures
-from torchvision_dddas.types import Grounded, Surveyed
+from torchvision_dddas.types import AerialLocations, FrameResult
 
 STATES: dict[str, Colour] = {"used": (90, 230, 90), "reassigned": (60, 220, 255), "excluded": WARNING}
 """The colour of a landmark by what became of it."""
@@ -24,11 +24,11 @@ class SurveyPictures:
         """size: (width, height) of the pictures. names: of the landmarks."""
         self._tracks, self._names = TrackPictures(size), tuple(names)
 
-    def skip(self, surveyed: Surveyed) -> None:
+    def skip(self, surveyed: FrameResult) -> None:
         """Take note of a frame that is not drawn."""
         self._tracks.skip(surveyed.followed)
 
-    def __call__(self, surveyed: Surveyed) -> np.ndarray:
+    def __call__(self, surveyed: FrameResult) -> np.ndarray:
         """The frame with tracks and landmarks, what ground vehicles say and are asked, (H, W, 3) uint8 BGR."""
         grounded = surveyed.grounded
         asked = [] if surveyed.command is None else [(words, TEXT) for words in [summary(surveyed.command)] if words]
@@ -50,7 +50,7 @@ class SurveyPictures:
         self._draw_orders(picture, surveyed)
         return picture
 
-    def _draw_orders(self, picture: np.ndarray, surveyed: Surveyed) -> None:
+    def _draw_orders(self, picture: np.ndarray, surveyed: FrameResult) -> None:
         """An arrow from each vehicle towards where it was sent, to that place or as long as a tenth of the picture."""
         grounded, command, scale = surveyed.grounded, surveyed.command, metres(surveyed)
         if grounded is None or command is None or scale is None or not command.orders:
@@ -78,10 +78,10 @@ class Once:
 
     def __init__(self, pictures: SurveyPictures) -> None:
         self._pictures = pictures
-        self._item: Surveyed | None = None
+        self._item: FrameResult | None = None
         self._picture: np.ndarray | None = None
 
-    def show(self, surveyed: Surveyed) -> None:
+    def show(self, surveyed: FrameResult) -> None:
         """The next frame; nothing where it is the same."""
         if surveyed is self._item:
             return
@@ -89,7 +89,7 @@ class Once:
             self._pictures.skip(self._item)
         self._item, self._picture = surveyed, None
 
-    def __call__(self, surveyed: Surveyed) -> np.ndarray:
+    def __call__(self, surveyed: FrameResult) -> np.ndarray:
         """The picture of the frame shown last, (H, W, 3) uint8 BGR, which nobody may draw on."""
         self.show(surveyed)
         if self._picture is None:
@@ -97,7 +97,7 @@ class Once:
         return self._picture
 
 
-def _letters(surveyed: Surveyed) -> dict[int, str]:
+def _letters(surveyed: FrameResult) -> dict[int, str]:
     """The letter of each identity that ground vehicles were asked about."""
     confirmed, grounded = surveyed.confirmed, surveyed.grounded
     if confirmed is None or grounded is None:
@@ -106,7 +106,7 @@ def _letters(surveyed: Surveyed) -> dict[int, str]:
     return {target: LETTERS.get(kind, "?") for target, kind in zip(targets, confirmed.kind, strict=True)}
 
 
-def _line(grounded: Grounded) -> tuple[str, Colour]:
+def _line(grounded: AerialLocations) -> tuple[str, Colour]:
     """How the frame lies on the ground, in words."""
     fix = grounded.fix
     if not fix.by:

@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas.io.overlay.detection_overlay import TEXT, WARNING, caption
 from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, label, line_width, rectangle, whole
 from torchvision_dddas.io.overlay.trails import Trails
-from torchvision_dddas.types import Followed
+from torchvision_dddas.types import TrackedFrame
 
 LENGTH = 12
 """Places that a trail shows."""
@@ -32,13 +32,13 @@ class TrackPictures:
         self.size = size
         self._trails = Trails(LENGTH)
 
-    def skip(self, followed: Followed) -> None:
+    def skip(self, followed: TrackedFrame) -> None:
         """Take note of a frame that is not drawn."""
         self._trails.add(followed)
 
     def __call__(
         self,
-        followed: Followed,
+        followed: TrackedFrame,
         more: Sequence[tuple[str, Colour]] = (),
         kinds: Mapping[int, str] | None = None,
     ) -> np.ndarray:
@@ -66,7 +66,7 @@ class TrackPictures:
         return picture
 
 
-def _picture(followed: Followed, size: tuple[int, int]) -> np.ndarray:
+def _picture(followed: TrackedFrame, size: tuple[int, int]) -> np.ndarray:
     if followed.frame is None:
         return np.zeros((size[1], size[0], 3), np.uint8)
     return colour_picture(followed.frame.image)

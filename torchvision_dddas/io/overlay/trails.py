@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from torchvision_dddas.types import Followed
+from torchvision_dddas.types import TrackedFrame
 
 Place = tuple[int, float, float]
 """Frame number, u_px, v_px."""
@@ -19,7 +19,7 @@ class Trails:
         self.length, self.memory = length, memory_frames
         self.places: dict[int, list[Place]] = {}
 
-    def add(self, followed: Followed) -> None:
+    def add(self, followed: TrackedFrame) -> None:
         """Carry all places to this frame, and add the centres of its boxes."""
         if followed.now_from_before is not None:
             self._carry(followed.now_from_before)

@@ -9,10 +9,10 @@ import numpy as np
 
 from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, TOLD, WORLD, Entry
 from torchvision_dddas.io.report.timeline import Curve, Panel, Ticks, axis
-from torchvision_dddas.types import Adjustment, Confirmed, Surveyed
+from torchvision_dddas.types import Adjustment, Confirmation, FrameResult
 
 KINDS = ("human", "not_human", "unseen")
-"""What a target can be to ground vehicles, as Confirmed has it."""
+"""What a target can be to ground vehicles, as Confirmation has it."""
 
 _ROW = np.dtype([(name, "f8") for name in ("frame", "time_s", "found", "tracked", "placed", *KINDS, "located")])
 _MOST_KNOBS, _MOST_STAGES = 12, 7
@@ -41,7 +41,7 @@ class Course:
         self.entries: Sequence[Entry] = ()
         """What is told of the run, for the ticks."""
 
-    def add(self, surveyed: Surveyed, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
+    def add(self, surveyed: FrameResult, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
         """Take note of a frame, of the time spent on it, and of what was adjusted."""
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros(len(self._rows), _ROW)])
@@ -62,7 +62,7 @@ class Course:
         for stage, spent in self._seconds.items():
             spent.append(seconds.get(stage, 0.0))
         for moved in adjustments:
-            self._moves.setdefault(moved.knob, []).append((moved.frame, moved.old, moved.new))
+            self._moves.setdefault(moved.parameter, []).append((moved.frame, moved.old, moved.new))
         self._count += 1
 
     @property
@@ -70,16 +70,16 @@ class Course:
         """(N,) frame, time_s, targets found, tracked and placed on the ground, of each kind; located."""
         return self._rows[: self._count]
 
-    def values(self, knob: str) -> np.ndarray:
+    def values(self, parameter: str) -> np.ndarray:
         """(N,) of a knob in each frame: as it was before it was moved for the first time, then what it was moved to."""
-        moves = sorted(self._moves[knob], key=lambda move: move[0])
+        moves = sorted(self._moves[parameter], key=lambda move: move[0])
         levels = np.array([moves[0][1], *(new for _, _, new in moves)], float)
         since = np.array([frame for frame, _, _ in moves])
         found = levels[np.searchsorted(since, self.rows["frame"], side="right")]
         return np.where(np.isfinite(found), found, np.nan)
 
     def panels(self) -> list[Panel]:
-        """What happened when; targets; what ground vehicles say of them; knobs that were moved; time spent."""
+        """What happened when; targets; what ground vehicles say of them; parameters that were moved; time spent."""
         rows = self.rows
         told: list[Panel] = [("what happened", self._ticks())]
         targets = [
@@ -96,13 +96,17 @@ class Course:
             )
         )
         # One that was set at the first frame and stayed is a line in the log, and no plot.
-        values = {knob: self.values(knob) for knob in self._moves}
-        moved = [knob for knob, v in values.items() if len(np.unique(v[np.isfinite(v)])) > 1]
+        values = {parameter: self.values(parameter) for parameter in self._moves}
+        moved = [parameter for parameter, v in values.items() if len(np.unique(v[np.isfinite(v)])) > 1]
         plots: dict[str, list[str]] = {}
-        for knob in sorted(moved):
-            who, _, what = knob.partition(".")
-            plots.setdefault(f"{what} of each ground vehicle" if who in self._names else knob, []).append(knob)
-        often = sorted(plots, key=lambda title: -sum(len(self._moves[knob]) for knob in plots[title]))[:_MOST_KNOBS]
+        for parameter in sorted(moved):
+            who, _, what = parameter.partition(".")
+            plots.setdefault(f"{what} of each ground vehicle" if who in self._names else parameter, []).append(
+                parameter
+            )
+        often = sorted(plots, key=lambda title: -sum(len(self._moves[parameter]) for parameter in plots[title]))[
+            :_MOST_KNOBS
+        ]
         for title in sorted(often):
             alone = plots[title] == [title]
             shown = zip(plots[title], cycle(_STAGE_COLOURS), strict=False)
@@ -135,7 +139,7 @@ class Course:
         return [("time spent on a frame, ms, stacked", curves[::-1])] if curves else []
 
 
-def _counts(confirmed: Confirmed | None) -> list[float]:
+def _counts(confirmed: Confirmation | None) -> list[float]:
     if confirmed is None:
         return [math.nan] * len(KINDS)
     return [confirmed.kind.count(kind) for kind in KINDS]

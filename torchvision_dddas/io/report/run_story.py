@@ -32,7 +32,7 @@ from torchvision_dddas.io.overlay.survey_overlay import Once
 from torchvision_dddas.io.report.keyframes import KeyFrames
 from torchvision_dddas.io.report.run_plots import Course
 from torchvision_dddas.io.report.run_report import Story, Table, report, span
-from torchvision_dddas.types import Surveyed
+from torchvision_dddas.types import FrameResult
 
 REPORT = "report.html"
 WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
@@ -67,7 +67,7 @@ class RunStory:
         """How good the run was against the truth: values by name, and the most telling of them in words."""
         self._score, self._in_words = dict(measures), tuple(said)
 
-    def write(self, surveyed: Surveyed) -> None:
+    def write(self, surveyed: FrameResult) -> None:
         """Take note of a frame."""
         followed, grounded = surveyed.followed, surveyed.grounded
         number, source = followed.number, followed if grounded is None else grounded
@@ -79,7 +79,7 @@ class RunStory:
         if grounded is not None:
             self._laid(surveyed, self._step(number))
         self._told(surveyed)
-        self._explained |= {moved.knob.partition(".")[0] for moved in source.adjustments}
+        self._explained |= {moved.parameter.partition(".")[0] for moved in source.adjustments}
         self._orders.note(surveyed, self.log, self._explained)
         if self._pictures is not None:
             self._picture(surveyed, float(self.course.rows["time_s"][-1]), self._pictures)
@@ -151,7 +151,7 @@ class RunStory:
     def _step(self, number: int) -> int:
         return number - self._before
 
-    def _laid(self, surveyed: Surveyed, step: int) -> None:
+    def _laid(self, surveyed: FrameResult, step: int) -> None:
         """How the picture lies on the ground, and which landmarks it does not show."""
         grounded = surveyed.grounded
         assert grounded is not None
@@ -168,7 +168,7 @@ class RunStory:
             if which not in shown:
                 self.log.going_on(frame, step, MARK, f"{name} is not seen in the picture", key=name)
 
-    def _told(self, surveyed: Surveyed) -> None:
+    def _told(self, surveyed: FrameResult) -> None:
         """What ground vehicles say of the targets, where it is new."""
         confirmed, grounded = surveyed.confirmed, surveyed.grounded
         if confirmed is None or grounded is None:
@@ -196,7 +196,7 @@ class RunStory:
     def _verdicts(self) -> Counter[str]:
         return Counter(self._said.values())
 
-    def _picture(self, surveyed: Surveyed, time_s: float, pictures: Once) -> None:
+    def _picture(self, surveyed: FrameResult, time_s: float, pictures: Once) -> None:
         pictures.show(surveyed)
         number = surveyed.followed.number
         self._waiting += self.log.entries[self._read :]

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from torchvision_dddas.io.maps.map_frame import step_of
-from torchvision_dddas.types import Grounded
+from torchvision_dddas.types import AerialLocations
 
 _ROW = np.dtype(
     [(name, "f8") for name in ("frame", "time_s", "seen", "used", "sigma_m", "relative_m", "chi2", "limit", "located")]
@@ -69,7 +69,7 @@ class Timeline:
         self._rows = np.zeros(256, _ROW)
         self._count = 0
 
-    def add(self, grounded: Grounded) -> None:
+    def add(self, grounded: AerialLocations) -> None:
         """Take note of a frame. sigma_m, relative_m: the median of its targets' roots of the covariance's trace."""
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros(len(self._rows), _ROW)])

@@ -1,4 +1,4 @@
-"""Located targets as Cursor-on-Target events while they come, at most one a target and second."""
+"""GroundLocations targets as Cursor-on-Target events while they come, at most one a target and second."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from torchvision_dddas.io.maps.ellipses import semi_axes
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.io.streams.about import About
 from torchvision_dddas.io.streams.json_lines import utc
-from torchvision_dddas.types import Surveyed
+from torchvision_dddas.types import FrameResult
 
 EVERY_S = 1.0
 
@@ -20,7 +20,7 @@ class CotEvents:
         self._told_s: dict[int, float] = {}
         self._begun_utc_s: float | None = None  # once told it stays: a target keeps its name when the clock is set
 
-    def __call__(self, surveyed: Surveyed | None) -> list[bytes]:
+    def __call__(self, surveyed: FrameResult | None) -> list[bytes]:
         """The events of a frame, a message with its line end each; of places without longitude or latitude none."""
         grounded = None if surveyed is None else surveyed.grounded
         degrees = None if grounded is None else grounded.positions.lonlat_deg

@@ -11,13 +11,17 @@ from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.io.report.timeline import USED
 from torchvision_dddas.io.streams.about import About
 from torchvision_dddas.io.tables import compass_deg
-from torchvision_dddas.types import Adjustment, Followed, Grounded, Surveyed
+from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult, TrackedFrame
 
 _LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four digits for a year
 
 
 def json_lines(
-    surveyed: Surveyed | None, people: Followed | None, about: About, age_s: float = math.nan, most_bytes: int = 0
+    surveyed: FrameResult | None,
+    people: TrackedFrame | None,
+    about: About,
+    age_s: float = math.nan,
+    most_bytes: int = 0,
 ) -> list[bytes]:
     """The lines of a frame, ASCII and with their line ends: one, or one each where the two are of different frames.
 
@@ -36,7 +40,7 @@ def json_lines(
     return lines
 
 
-def _frame(surveyed: Surveyed | None, people: Followed | None, about: About, age_s: float) -> dict[str, Any]:
+def _frame(surveyed: FrameResult | None, people: TrackedFrame | None, about: About, age_s: float) -> dict[str, Any]:
     followed = surveyed.followed if surveyed is not None else people
     assert followed is not None
     grounded = surveyed.grounded if surveyed is not None else None
@@ -59,7 +63,7 @@ def _frame(surveyed: Surveyed | None, people: Followed | None, about: About, age
     }
 
 
-def _targets(surveyed: Surveyed) -> list[dict[str, Any]]:
+def _targets(surveyed: FrameResult) -> list[dict[str, Any]]:
     targets = list(_boxes(surveyed.followed))
     places = {} if surveyed.grounded is None else _places(surveyed)
     for target in targets:
@@ -67,7 +71,7 @@ def _targets(surveyed: Surveyed) -> list[dict[str, Any]]:
     return targets
 
 
-def _boxes(followed: Followed) -> Iterator[dict[str, Any]]:
+def _boxes(followed: TrackedFrame) -> Iterator[dict[str, Any]]:
     """The boxes that have an identity, then those that have none."""
     tracks, found = followed.tracks, followed.detections
     tracked = zip(
@@ -88,7 +92,7 @@ def _boxes(followed: Followed) -> Iterator[dict[str, Any]]:
         yield fields
 
 
-def _places(surveyed: Surveyed) -> dict[int, dict[str, Any]]:
+def _places(surveyed: FrameResult) -> dict[int, dict[str, Any]]:
     """Where the targets stand, and what ground vehicles say of them, by identity."""
     grounded, confirmed = surveyed.grounded, surveyed.confirmed
     assert grounded is not None
@@ -112,7 +116,7 @@ def _places(surveyed: Surveyed) -> dict[int, dict[str, Any]]:
     return places
 
 
-def _ground(grounded: Grounded, surveyed: Surveyed | None, about: About) -> dict[str, Any]:
+def _ground(grounded: AerialLocations, surveyed: FrameResult | None, about: About) -> dict[str, Any]:
     fix, marks = grounded.fix, grounded.marks
     degrees = surveyed.mark_lonlat_deg if surveyed is not None else None
     landmarks = []
@@ -138,7 +142,7 @@ def _ground(grounded: Grounded, surveyed: Surveyed | None, about: About) -> dict
 def _adjustment(moved: Adjustment) -> dict[str, Any]:
     return {
         "frame": moved.frame,
-        "knob": moved.knob,
+        "knob": moved.parameter,
         "old": _number(moved.old, 6),
         "new": _number(moved.new, 6),
         "cause": moved.cause,

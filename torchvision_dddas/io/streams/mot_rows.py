@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchvision_dddas.io.output.track_tables import mot_lines
-from torchvision_dddas.types import Followed, Surveyed
+from torchvision_dddas.types import FrameResult, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
 """Added to the identities of people, who are followed apart from targets: the text has no column for a kind."""
@@ -13,7 +13,7 @@ PEOPLE_FROM = 1_000_000
 _FARTHEST_PX = 1e7
 
 
-def mot_rows(surveyed: Surveyed | None, people: Followed | None, most_bytes: int = 0) -> list[bytes]:
+def mot_rows(surveyed: FrameResult | None, people: TrackedFrame | None, most_bytes: int = 0) -> list[bytes]:
     """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line a box that has an identity: targets, then people.
 
     One message a frame, or where that is longer than most_bytes several of whole lines. A box without end is no row.
@@ -28,7 +28,7 @@ def mot_rows(surveyed: Surveyed | None, people: Followed | None, most_bytes: int
     return [message for message in messages if message]
 
 
-def _told(followed: Followed, more: int) -> Followed:
+def _told(followed: TrackedFrame, more: int) -> TrackedFrame:
     tracks = followed.tracks
     told = np.isfinite(tracks.score) & (np.abs(tracks.box_px) < _FARTHEST_PX).all(axis=1)
     rows = replace(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from torchvision_dddas.io.streams.outlet import Outlet
-from torchvision_dddas.types import Followed, Surveyed
+from torchvision_dddas.types import FrameResult, TrackedFrame
 
 Tell = Callable[[str, str], object]
 """Called with a kind, `sink`, and words for a person."""
@@ -22,7 +22,7 @@ class Encoder(Protocol):
     """What makes messages of a frame."""
 
     def __call__(
-        self, surveyed: Surveyed | None, people: Followed | None, age_s: float, most_bytes: int
+        self, surveyed: FrameResult | None, people: TrackedFrame | None, age_s: float, most_bytes: int
     ) -> Sequence[bytes]:
         """Messages with their line ends, of most_bytes at most where that can be; 0: of any length."""
 
@@ -66,7 +66,7 @@ class Stream:
         """Why nothing goes out at the moment; empty where all is well."""
         return self._trouble
 
-    def write(self, surveyed: Surveyed | None, people: Followed | None = None) -> None:
+    def write(self, surveyed: FrameResult | None, people: TrackedFrame | None = None) -> None:
         """Send a frame: its targets, and the people seen in it; None: not told, or not searched for. Never raises."""
         followed = surveyed.followed if surveyed is not None else people
         if followed is None:

@@ -1,36 +1,36 @@
 """Scenarios: what a simulated world holds and what happens in it, as files that are read, changed, checked, written."""
 
 from torchvision_dddas.simulation.scenario.checks import check, settings_of
-from torchvision_dddas.simulation.scenario.knobs import (
-    AircraftKnobs,
-    CameraKnobs,
+from torchvision_dddas.simulation.scenario.parameters import (
+    AircraftParameters,
+    CameraParameters,
     CarPlan,
-    ClipKnobs,
+    ClipParameters,
     CrowdPlan,
     Fault,
-    GpsKnobs,
+    GpsParameters,
     Happening,
     Place,
     Scenario,
-    TeamKnobs,
-    WorldKnobs,
+    TeamParameters,
+    WorldParameters,
 )
 from torchvision_dddas.simulation.scenario.reading import load, names
 from torchvision_dddas.simulation.scenario.writing import as_toml
 
 __all__ = [
-    "AircraftKnobs",
-    "CameraKnobs",
+    "AircraftParameters",
+    "CameraParameters",
     "CarPlan",
-    "ClipKnobs",
+    "ClipParameters",
     "CrowdPlan",
     "Fault",
-    "GpsKnobs",
+    "GpsParameters",
     "Happening",
     "Place",
     "Scenario",
-    "TeamKnobs",
-    "WorldKnobs",
+    "TeamParameters",
+    "WorldParameters",
     "as_toml",
     "check",
     "load",

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from torchvision_dddas.config import Settings, is_file, with_knobs
+from torchvision_dddas.config import Settings, is_file, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation.scenario.knobs import Place, Scenario
+from torchvision_dddas.simulation.scenario.parameters import Place, Scenario
 
 FEWEST = 4
 """Landmarks that lay a picture on the ground."""
@@ -40,11 +40,11 @@ def check(scenario: Scenario) -> None:
     for key in ("elevation", "photo"):
         if (file := getattr(scenario.world, key)) and not is_file(Path(file)):
             raise InputError(f"world.{key}: there is no file {file}")
-    with_knobs(Settings(), settings_of(scenario), "settings")
+    with_parameters(Settings(), settings_of(scenario), "settings")
 
 
 def settings_of(scenario: Scenario) -> dict[str, object]:
-    """The knobs of the system that a scenario sets: `{"group.knob": value}`."""
+    """The parameters of the system that a scenario sets: `{"group.knob": value}`."""
     return {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
 
 

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from torchvision_dddas.config import config_folder, is_file, parse_override, read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation.scenario.checks import check
-from torchvision_dddas.simulation.scenario.knobs import Scenario, WorldKnobs
-from torchvision_dddas.simulation.scenario.wording import example, explained, nearest_knob
+from torchvision_dddas.simulation.scenario.parameters import Scenario, WorldParameters
+from torchvision_dddas.simulation.scenario.wording import example, explained, nearest_parameter
 
 
 def names() -> list[str]:
@@ -19,11 +19,11 @@ def names() -> list[str]:
 
 
 def load(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """A scenario: a shipped one by its name, or a TOML file; changed by `group.knob=value`, `crowd.1.people=20`.
+    """A scenario: a shipped one by its name, or a TOML file; changed by `group.parameter=value`, `crowd.1.people=20`.
 
     seed: in place of its own. Files that it names are looked for beside it, then from where the program was started.
-    Raises InputError with one line: no such scenario (with those there are), no TOML, a knob that there is not (with
-    the nearest), a value out of its range, and what `check` says.
+    Raises InputError with one line: no such scenario (with those there are), no TOML, a parameter that there is not
+    (with the nearest), a value out of its range, and what `check` says.
     """
     path = _file(name_or_path)
     content = read_toml(path)
@@ -59,7 +59,7 @@ def _file(name_or_path: str | Path) -> Path:
     return shipped
 
 
-def _beside(world: WorldKnobs, folder: Path) -> WorldKnobs:
+def _beside(world: WorldParameters, folder: Path) -> WorldParameters:
     """With the files that lie beside the scenario's own by their whole names."""
     found = {key: str(folder / name) for key in ("elevation", "photo") if (name := getattr(world, key))}
     return world.model_copy(update={key: name for key, name in found.items() if is_file(Path(name))})
@@ -75,9 +75,9 @@ def _change(content: dict[str, Any], name: str, value: object) -> None:
         else:
             place = place.setdefault(part, {})
         if not isinstance(place, (dict, list)):
-            raise InputError(f"unknown knob '{name}'; {nearest_knob(name)}")
+            raise InputError(f"unknown parameter '{name}'; {nearest_parameter(name)}")
     if isinstance(place, list):
-        raise InputError(f"'{name}' names no knob; wanted such as {parts[-1]}.1.{example(parts[-1])}=...")
+        raise InputError(f"'{name}' names no parameter; wanted such as {parts[-1]}.1.{example(parts[-1])}=...")
     place[last] = value
 
 

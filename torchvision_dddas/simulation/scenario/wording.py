@@ -1,4 +1,4 @@
-"""What is wrong with the values of a scenario, in words: the knob by its name, what came, what was wanted."""
+"""What is wrong with the values of a scenario, in words: the parameter by its name, what came, what was wanted."""
 
 import json
 from typing import Any, get_args, get_origin
@@ -6,7 +6,7 @@ from typing import Any, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from torchvision_dddas.config import Group, nearest, will_not_do
-from torchvision_dddas.simulation.scenario.knobs import Place, Scenario
+from torchvision_dddas.simulation.scenario.parameters import Place, Scenario
 
 
 def explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) -> str:
@@ -16,7 +16,7 @@ def explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) -
         if listed:
             name, listed = f"{name}.{int(part) + 1}", False
             continue
-        if part not in fields:  # inside a knob: a place in a list
+        if part not in fields:  # inside a parameter: a place in a list
             break
         name = f"{name}.{part}".lstrip(".")
         field = fields[str(part)]
@@ -24,8 +24,8 @@ def explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) -
         fields, listed = (group.model_fields, get_origin(field.annotation) is tuple) if group else ({}, False)
     if kind == "extra_forbidden":
         full = ".".join(str(part + 1) if isinstance(part, int) else part for part in loc)
-        return f"unknown knob '{full}'; {nearest_knob(full)}"
-    if kind == "value_error":  # a rule across knobs
+        return f"unknown parameter '{full}'; {nearest_parameter(full)}"
+    if kind == "value_error":  # a rule across parameters
         return f"{name}: {said.removeprefix('Value error, ')}"
     if name == "settings" and len(loc) > 1 and not isinstance(value, dict):
         name = f"settings.{loc[1]}"
@@ -42,19 +42,19 @@ def explained(loc: tuple[int | str, ...], kind: str, said: str, value: object) -
     return will_not_do(name, _shown(value) if isinstance(value, (tuple, dict)) else value, field)
 
 
-def nearest_knob(name: str) -> str:
+def nearest_parameter(name: str) -> str:
     """Names that look like it, or the tables that there are."""
     known = ["about", "seed"]
     for key, field in Scenario.model_fields.items():
         if group := _group(field):
             inside = f"{key}.1" if get_origin(field.annotation) is tuple else key
-            known += [f"{inside}.{knob_name}" for knob_name in group.model_fields]
+            known += [f"{inside}.{parameter_name}" for parameter_name in group.model_fields]
     tables = ", ".join(key for key in Scenario.model_fields if key not in ("about", "seed"))
     return nearest(name, known, f"its tables are {tables}")
 
 
 def example(kind: str) -> str:
-    """A knob of an entry of a list."""
+    """A parameter of an entry of a list."""
     group = _group(Scenario.model_fields[kind]) if kind in Scenario.model_fields else None
     return next(iter(group.model_fields)) if group else "knob"
 

@@ -2,7 +2,7 @@
 
 import json
 
-from torchvision_dddas.simulation.scenario.knobs import Scenario
+from torchvision_dddas.simulation.scenario.parameters import Scenario
 
 
 def as_toml(scenario: Scenario) -> str:
@@ -17,8 +17,8 @@ def as_toml(scenario: Scenario) -> str:
         for table in tables:
             lines += ["", f"[[{key}]]" if isinstance(value, list) else f"[{key}]"]
             lines += [f"{name} = {_toml(entry)}" for name, entry in table.items()]
-    for group, knobs in content["settings"].items():
-        lines += ["", f"[settings.{group}]", *(f"{name} = {_toml(entry)}" for name, entry in knobs.items())]
+    for group, parameters in content["settings"].items():
+        lines += ["", f"[settings.{group}]", *(f"{name} = {_toml(entry)}" for name, entry in parameters.items())]
     return "\n".join(lines) + "\n"
 
 
