@@ -122,7 +122,7 @@ def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: s
         ("[registration]\nkeypoints = = 3\n", ["line 2", "not valid TOML"]),
         ("[registration]\nkeypoints = [\n", ["line", "not valid TOML"]),
         ("keypoints = 300\n", ["outside a [group]", "registration.keypoints"]),
-        ("[registration]\nkeypoint = 300\n", ["unknown knob", "registration.keypoints"]),
+        ("[registration]\nkeypoint = 300\n", ["unknown parameter", "registration.keypoints"]),
         ("[registration]\nkeypoints = 1\n", ["registration.keypoints = 1", "50 to 5000 points"]),
     ],
 )

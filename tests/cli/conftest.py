@@ -12,7 +12,7 @@ from torchvision_dddas.types import Detections, Scene
 
 
 def stub_engine(found=True, after=None):
-    """Modules `run` and `vision` that find one target in each frame; `after(scene)` runs once each scene is out."""
+    """Modules `detector` and `engine` that find one target in each frame; `after(scene)` runs once each scene is out."""
 
     def run(source, engine, settings, telemetry=None, retune=None):
         for frame in source:
@@ -30,7 +30,7 @@ def stub_engine(found=True, after=None):
     def load(backend, settings):
         return types.SimpleNamespace(name=f"stub {backend}")
 
-    modules = {f"torchvision_dddas.{name}": types.ModuleType(name) for name in ("run", "vision")}
+    modules = {f"torchvision_dddas.detection.{name}": types.ModuleType(name) for name in ("detector", "engine")}
     modules["torchvision_dddas.detection.detector"].__dict__["run"] = run
     modules["torchvision_dddas.detection.engine"].__dict__["load_engine"] = load
     return modules

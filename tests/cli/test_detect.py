@@ -70,7 +70,7 @@ def test_knobs_are_set_and_recorded(dddas, engine, clip, tmp_path):
     ("words", "says"),
     [
         (("--save", "film"), "--save does not know 'film'; there are masks, overlay, all and none"),
-        (("--set", "registration.keypints=5"), "unknown knob"),
+        (("--set", "registration.keypints=5"), "unknown parameter"),
         (("--set", "registration.keypoints=5"), "50 to 5000"),
         (("--config", "nosuch"), "nosuch"),
         (("--telemetry", "nosuch.csv"), "nosuch.csv"),

@@ -98,7 +98,7 @@ def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
         (("--clips", ""), "--clips '' names no clip"),
         (("--together", "2"), "--together is of use with --backend torch alone"),
         (("--interval", "1001"), "wanted a whole number of frames, 1 to 1000"),
-        (("--set", "no.parameter=1"), "unknown knob"),
+        (("--set", "no.parameter=1"), "unknown parameter"),
         (("--first-frame", "0"), "--first-frame is of no use with --dataset"),
         (("--interval", "0"), "interval is 0"),
     ],

@@ -192,7 +192,7 @@ def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, stub, clip, 
 
 MISTAKES = [
     (("--save", "masks"), "--save does not know 'masks'; there are overlay, all and none"),
-    (("--set", "people.serch=regions"), "unknown knob"),
+    (("--set", "people.serch=regions"), "unknown parameter"),
     (("--set", "people.search=somewhere"), "everywhere or regions"),
     (("--config", "nosuch"), "nosuch"),
     (("--around", "nosuch.csv"), "nosuch.csv"),

@@ -149,7 +149,7 @@ def test_settings_choose_the_mode_and_are_recorded(dddas, clip, table, tmp_path)
 
 
 MISTAKES = [
-    (("--set", "track.mod=paper"), "unknown knob"),
+    (("--set", "track.mod=paper"), "unknown parameter"),
     (("--set", "track.mode=best"), "track.mode"),
     (("--config", "nosuch"), "nosuch"),
     (("--save", "masks"), "--save does not know 'masks'; there are overlay, all and none"),

@@ -136,7 +136,7 @@ def test_the_file_tells_its_layout(trained):
 
 
 @pytest.mark.parametrize(
-    "knobs", [SMALL, PeopleParameters(), PeopleParameters(bins=18, signed=True, block_stride_px=4, gamma=False)]
+    "parameters", [SMALL, PeopleParameters(), PeopleParameters(bins=18, signed=True, block_stride_px=4, gamma=False)]
 )
 def test_descriptors_under_the_weights_are_the_recognizers_scores(parameters):
     rng = np.random.default_rng(1)
@@ -193,7 +193,7 @@ def test_a_mistake_gets_one_line(folders, tmp_path, capsys):
     assert "none of 10 pictures is as large as the window" in bad(capsys, people, rest, *out)
     assert "--held-out is 2" in bad(capsys, people, rest, *out, "--held-out", 2)
     assert "--c is -1" in bad(capsys, people, rest, *out, "--c", -1)
-    assert "unknown knob" in bad(capsys, people, rest, *out, "--set", "people.windows=3")
+    assert "unknown parameter" in bad(capsys, people, rest, *out, "--set", "people.windows=3")
     assert "--seed is -1; wanted 0 or more" in bad(capsys, people, rest, *out, "--seed", -1)
     assert "--windows is 1000000000" in bad(capsys, people, rest, *out, "--windows", 10**9)
     assert "is a folder; wanted the name of a file" in bad(capsys, people, rest, "--out", tmp_path)

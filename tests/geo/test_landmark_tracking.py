@@ -43,7 +43,7 @@ def test_greedy_goes_row_by_row_and_so_may_leave_a_landmark_without_a_blob():
     assert separate(colour, blob, EXACT).tolist() == [1, 0]
 
 
-@pytest.mark.parametrize("knobs", [EXACT, GREEDY])
+@pytest.mark.parametrize("parameters", [EXACT, GREEDY])
 def test_a_colour_that_was_not_found_and_a_blob_out_of_reach_are_matched_with_nothing(parameters):
     colour = np.array([[np.nan, np.nan], [0, 0], [50, 50]])
     assert separate(colour, np.array([[1, 0.0], [80, 80]]), parameters).tolist() == [-1, 0, -1]

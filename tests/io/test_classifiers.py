@@ -34,7 +34,7 @@ def test_the_shipped_classifier_is_opencvs_default_people_detector():
 
 
 @pytest.mark.parametrize(
-    ("knobs", "length"),
+    ("parameters", "length"),
     [
         ({"window_width_px": 32, "window_height_px": 64}, 3 * 7 * 36),
         ({"block_stride_px": 16}, 4 * 8 * 36),

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from torchvision_dddas.cli import app
 from torchvision_dddas.simulation.demo import film_into
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = [line.partition("#")[0] for line in README.splitlines() if line.startswith("dddas ")]
 

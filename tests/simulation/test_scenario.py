@@ -161,7 +161,7 @@ def test_a_missing_file_is_named(tmp_path):
         ("[uav]\naltitude_m = 'high'\n", "odd.toml: uav.altitude_m = 'high' will not do; wanted 2 to 2000 m"),
         ("[[uav]]\naltitude_m = 5\n", "will not do; wanted a table"),
         ("[crowd]\npeople = 5\n", "will not do; wanted a list of tables"),
-        ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown knob"),
+        ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown parameter"),
         ("[settings]\ncrowds = 5\n", "wanted a table"),
         ("altitude_m = 5\n", "unknown parameter 'altitude_m'; did you mean uav.altitude_m"),
     ],

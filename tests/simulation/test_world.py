@@ -39,7 +39,7 @@ def test_same_seed_gives_the_same_world_and_another_seed_another(world):
     assert not np.array_equal(world.relief.up_m, other.relief.up_m)
 
 
-@pytest.mark.parametrize("knobs", [KNOBS, BARE])
+@pytest.mark.parametrize("parameters", [KNOBS, BARE])
 def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, parameters):
     whole = build(parameters, seed=3).albedo.astype(int)
     monkeypatch.setattr(worlds, "_AT_ONCE", 72 * 600)

@@ -88,14 +88,14 @@ def test_a_descent_that_is_over_is_not_begun_again(tmp_path: Path) -> None:
         ({"plan": replace(QUICK, steps=13)}, "other steps, 12 and not 13"),
         ({"plan": replace(QUICK, seed=2)}, "other seed, 0 and not 2"),
         ({"examples": pieces(("one",))}, "other examples"),
-        ({"knobs": Parameters(Settings(), [THRESHOLD])}, "other knobs"),
-        ({"knobs": parameters(13.0)}, "other settings"),
+        ({"parameters": Parameters(Settings(), [THRESHOLD])}, "other knobs"),
+        ({"parameters": parameters(13.0)}, "other settings"),
     ],
 )
 def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict, words: str) -> None:
     place = tmp_path / "checkpoint.pt"
     descend(Bowl(), parameters(), pieces(), QUICK, place=place)
-    asked = {"knobs": parameters(), "examples": pieces(), "plan": QUICK} | change
+    asked = {"parameters": parameters(), "examples": pieces(), "plan": QUICK} | change
     with pytest.raises(InputError, match=words):
         descend(Bowl(), place=place, resume=True, **asked)
 

@@ -305,7 +305,10 @@ class _Tuning:
             "taken": found.taken,
             "ended": found.ended,
             "failed": found.failed,
-            "history": [asdict(step) for step in found.history],
+            "history": [
+                {"knobs" if name == "parameters" else name: value for name, value in asdict(step).items()}
+                for step in found.history
+            ],
             "cost": charged,
             "verdict": verdict.told(),
             "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},

@@ -29,7 +29,7 @@ def blamed(
     where = f"the loss of {family.name} is no number for {example.clip}, frame {example.frame}"
     good = next((known for known in before if _finite(family, [example], known, softness)), None)
     if good is None:
-        return f"{where}, whatever the knobs"
+        return f"{where}, whatever the parameters"
     guilty = [name for name in values if _finite(family, [example], {**values, name: good[name]}, softness)]
     told = ", ".join(f"{name} = {float(values[name].detach()):.6g}" for name in guilty or values)
     return f"{where}, with {told}"

@@ -93,6 +93,6 @@ def test_an_option_of_another_type_is_refused(tmp_path: Path, option: dict[str, 
 
 @pytest.mark.parametrize("kind", kinds.KINDS)
 def test_each_kind_is_in_the_documentation(kind: str) -> None:
-    told = (Path(__file__).parents[2] / "docs" / "datasets.md").read_text(encoding="utf-8")
+    told = (Path(__file__).parents[3] / "docs" / "datasets.md").read_text(encoding="utf-8")
     assert f"\n| [`{kind}`](#{kind}" in told
     assert f"\n## `{kind}`" in told

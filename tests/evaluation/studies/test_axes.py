@@ -66,7 +66,7 @@ def test_a_bad_axis_is_told_in_one_line(text, told) -> None:
         ("difference.threshold=8:many", "many is no number"),
         ("difference.threshold=8:300", "0.1 to 255"),
         ("difference.threshold=8:30:linear", "low:high:log"),
-        ("track.speed_weight=0:2:log", "unknown knob"),
+        ("track.speed_weight=0:2:log", "unknown parameter"),
         ("difference.peak=0:2:log", "above 0"),
         ("difference.blur_px=4:9", "odd"),
         ("difference.blur_px=3:9:log", "leave out :log"),
