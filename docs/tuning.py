@@ -16,7 +16,7 @@ from torchvision_dddas.tuning.verdict import judge
 
 def told(step: Step) -> None:
     if step.watched is not None:
-        print(f"step {step.step}: {step.parameters['difference.threshold']:.2f}, loss of watched frames {step.watched:.3f}")
+        print(f"step {step.step}: {step.parameters['difference.threshold']:.2f}, watched {step.watched:.3f}")
 
 
 def main(folder: Path) -> None:

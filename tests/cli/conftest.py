@@ -12,7 +12,7 @@ from torchvision_dddas.types import Detections, Scene
 
 
 def stub_engine(found=True, after=None):
-    """Modules `detector` and `engine` that find one target in each frame; `after(scene)` runs once each scene is out."""
+    """Modules `detector` and `engine` that find one target a frame; `after(scene)` runs after each scene."""
 
     def run(source, engine, settings, telemetry=None, retune=None):
         for frame in source:

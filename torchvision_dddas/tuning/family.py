@@ -21,7 +21,7 @@ Tick = Callable[[], object]
 
 FAMILIES: Mapping[str, str] = {
     "motion": "masks",
-    "registration": "registering",
+    "registration": "registration",
     "tracking": "identities",
     "paper": "affinities",
     "people": "recognition",
