@@ -3,13 +3,18 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test lint onboard peers figures
+.PHONY: demo test test-all lint onboard peers figures
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
 
-test: lint onboard
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+# What a change needs: lint, types and the quick tests.
+test: lint
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
+
+# Everything: the slow tests, those in a browser, and the install without torch too.
+test-all: test onboard
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "slow or browser or gpu"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
