@@ -96,7 +96,6 @@ def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
         (("--scheduler", "nonsense"), "no Dask scheduler answers at nonsense"),
         (("--clips", "nobody"), "nobody fits none; there are other, table"),
         (("--clips", ""), "--clips '' names no clip"),
-        (("--together", "2"), "--together is of use with --backend torch alone"),
         (("--interval", "1001"), "wanted a whole number of frames, 1 to 1000"),
         (("--set", "no.parameter=1"), "unknown parameter"),
         (("--first-frame", "0"), "--first-frame is of no use with --dataset"),

@@ -81,10 +81,6 @@ def evaluate(
     jobs: Annotated[
         int | None, typer.Option(metavar="N", help="Of a study: processes of one thread each. [default: one a core]")
     ] = None,
-    together: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Of a study with torch: clips of one size at once, for a GPU. [default: 1]"),
-    ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a study: a Dask scheduler, such as tcp://host:8786.")
     ] = None,
@@ -120,23 +116,18 @@ def evaluate(
     With --dataset the clips of whole data sets are run and scored; metrics.json, report.html and run.json are written.
     """
     study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
-    study["--together"] = together
     study |= {"--config": config, "--set": set_ or None, "--backend": backend}
     if dataset is not None:
         _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
         from torchvision_dddas.cli import study as whole
 
         check_jobs(jobs, scheduler)
-        if together is not None and (together < 1 or scheduler is not None):
-            raise InputError(f"--together is {together}; wanted 1 or more clips, and no --scheduler")
         if interval is not None and not 1 <= interval <= 1000:
             raise InputError(f"--interval is {interval}; wanted a whole number of frames, 1 to 1000")
         folder = out or Path("dddas-study")
         spec = whole.asked(dataset, config, set_ or [], backend and backend.value, interval)
-        if together is not None and together > 1 and spec.backend != "torch":
-            raise InputError(f"--together is of use with --backend torch alone; the study's is {spec.backend}")
         results, measures = whole.study_into(
-            folder, spec, dataset.parent, jobs, scheduler, cache, whole.patterns(clips, "--clips"), quiet, together or 1
+            folder, spec, dataset.parent, jobs, scheduler, cache, whole.patterns(clips, "--clips"), quiet
         )
         if not quiet:
             whole.show(results, measures, folder)

@@ -52,7 +52,6 @@ def study_into(
     cache: Path | None = None,
     clips: Sequence[str] = (),
     quiet: bool = False,
-    together: int = 1,
 ) -> tuple["Results", dict[str, Any]]:
     """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
     from torchvision_dddas.evaluation.report import report
@@ -74,7 +73,7 @@ def study_into(
 
         try:
             with shown(quiet) as (begun, tell):
-                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin, together)
+                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin)
             measures = summary(results)
             _write(folder, "metrics.json", measures)
             _write_tables(folder, measures, results)

@@ -2,10 +2,10 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.control import rules as control
 from torchvision_dddas.detection import windows
 from torchvision_dddas.detection.blob_motion import DenseFlow
-from torchvision_dddas.detection.engine import Engine, Foreground, View, Window
+from torchvision_dddas.detection.engine import Engine, View, Window
 from torchvision_dddas.detection.motion_history import MotionHistory
 from torchvision_dddas.detection.observation import Found, Observation, admitted, cores, draw_targets, observe, table
 from torchvision_dddas.detection.small_targets import SmallTracks, candidates
@@ -25,21 +25,6 @@ from torchvision_dddas.types import Adjustment, Flight, Frame, Registration, Sce
 Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
 """Asked before a frame is taken: the settings from then on, and the record of what changed."""
 
-
-@dataclass
-class Ask:
-    """What a loop wants of its back end before it goes on: pairs to register, or windows' foregrounds.
-
-    seconds: how long the answer took, told by who gives it; of an answer to several loops, this one's share.
-    """
-
-    what: Literal["register", "foreground"]
-    items: list[Any]
-    seconds: float = 0.0
-
-
-Steps = Generator["Scene | Ask", Any, None]
-"""Scenes as they are settled, and what is asked of the back end, which is to be sent the answer."""
 
 # A picture whose grey levels spread by less than this shows nothing, not even through fog.
 _BLANK_LEVELS = 1.0
@@ -120,35 +105,6 @@ def run(
     A source that can be steered has a method `telemetry` that tells what was reported so far, in place of a whole log.
     Raises InputError for a clip of fewer than three frames and for telemetry that does not overlap it in time.
     """
-    return answered(running(source, engine, settings, telemetry, batch, retune), engine)
-
-
-def answered(steps: Steps, engine: Engine) -> Iterator[Scene]:
-    """The scenes of a loop whose back end answers it alone."""
-    answer: list[Any] | None = None
-    while True:
-        try:
-            said = steps.send(answer)
-        except StopIteration:
-            return
-        if isinstance(said, Scene):
-            answer = None
-            yield said
-        else:
-            start = time.perf_counter()
-            answer = getattr(engine, said.what)(said.items)
-            said.seconds = time.perf_counter() - start
-
-
-def running(
-    source: Clip,
-    engine: Engine,
-    settings: Settings,
-    telemetry: Telemetry | None = None,
-    batch: int | None = None,
-    retune: Retune | None = None,
-) -> Steps:
-    """As `run`, with the back end's answers sent from outside, so that several clips can be answered at once."""
     count = getattr(source, "count", None)
     if telemetry is not None and count:
         check_overlap(telemetry, (count - 1) / source.rate_hz)
@@ -163,10 +119,10 @@ def running(
         if retune is not None:
             settings, adjustments = retune(frame)
             loop.retune(settings)
-        yield from loop.feeding(frame, adjustments)
+        yield from loop.feed(frame, adjustments)
     if telemetry is not None:
         check_overlap(telemetry, last_s)
-    yield from loop.ending(getattr(source, "last", 0))
+    yield from loop.end(getattr(source, "last", 0))
 
 
 class Loop:
@@ -211,14 +167,6 @@ class Loop:
 
     def feed(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """Take one frame; yields the scenes that are settled by it. adjustments: made before it, for its scene."""
-        return answered(self.feeding(frame, adjustments), self.engine)
-
-    def end(self, last: int = 0) -> Iterator[Scene]:
-        """The clip is over: settle everything that is left. last: number of the clip's last frame, read or not."""
-        return answered(self.ending(last), self.engine)
-
-    def feeding(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Steps:
-        """As `feed`, with the back end's answers sent from outside."""
         start = time.perf_counter()
         self.skipped += frame.skipped
         view = self.engine.prepare(frame.image)
@@ -230,15 +178,15 @@ class Loop:
         if self.total - self.registered > self.batch:
             yield from self._advance()
 
-    def ending(self, last: int = 0) -> Steps:
-        """As `end`, with the back end's answers sent from outside."""
+    def end(self, last: int = 0) -> Iterator[Scene]:
+        """The clip is over: settle everything that is left. last: number of the clip's last frame, read or not."""
         check_length(self.total)
         self.ended = True
         yield from self._advance()
         yield from self._gap(last + 1)
 
-    def _advance(self) -> Steps:
-        yield from self._register()
+    def _advance(self) -> Iterator[Scene]:
+        self._register()
         while ready := self._ready():
             yield from self._observe(ready)
 
@@ -247,19 +195,17 @@ class Loop:
 
     # -- registration ------------------------------------------------------------------------------------------------
 
-    def _register(self) -> Steps:
+    def _register(self) -> None:
         """The steps between successive frames, all that can be had now."""
         todo = [self._at(i) for i in range(self.registered, self.total)]
         if len(todo) < 2:
             return
         steps: list[Registration] = []
-        seconds = 0.0
+        start = time.perf_counter()
         for i in range(0, len(todo) - 1, self.batch):
             part = todo[i : i + self.batch + 1]
-            ask = Ask("register", [(a.view, b.view) for a, b in pairwise(part)])
-            steps += yield ask
-            seconds += ask.seconds
-        spent = seconds / len(steps)
+            steps += self.engine.register([(a.view, b.view) for a, b in pairwise(part)])
+        spent = (time.perf_counter() - start) / len(steps)
         for slot, after, step in zip(todo, todo[1:], steps, strict=False):
             # Keypoints can seem to be followed onto a blank picture: they stay where the search began.
             blank = _blank(slot.view) or _blank(after.view)
@@ -331,7 +277,7 @@ class Loop:
         """What the telemetry tells at a frame; None outside its span."""
         return at(self.telemetry, slot.frame.time_s) if self.telemetry is not None else None
 
-    def _observe(self, ready: list[int]) -> Steps:
+    def _observe(self, ready: list[int]) -> Iterator[Scene]:
         start = time.perf_counter()
         made: list[tuple[int, Window]] = []
         for index in ready:
@@ -340,12 +286,8 @@ class Loop:
                 self._at(index).observation = Observation(None, None)
             else:
                 made.append((index, window))
-        spent = time.perf_counter() - start
-        foregrounds: list[Foreground] = []
-        if made:
-            ask = Ask("foreground", [window for _, window in made])
-            foregrounds = yield ask
-            spent = (spent + ask.seconds) / len(made)
+        foregrounds = self.engine.foreground([window for _, window in made]) if made else []
+        spent = (time.perf_counter() - start) / max(len(made), 1)
         for (index, window), foreground in zip(made, foregrounds, strict=True):
             slot = self._at(index)
             start = time.perf_counter()

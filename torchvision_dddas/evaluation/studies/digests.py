@@ -21,7 +21,7 @@ PACKAGE = Path(__file__).resolve().parents[2]
 FINDS = (
     *("types.py", "config.py", "geometry.py", "runtime.py", "pipeline.py", "functional", "detection", "tracking"),
     *("people", "geo", "control", "io", "graphs", "models", "cli/aerial.py", "cli/prepared.py"),
-    *(f"evaluation/studies/{name}.py" for name in ("record", "rows", "stages", "placing", "batches")),
+    *(f"evaluation/studies/{name}.py" for name in ("record", "rows", "stages", "placing")),
 )
 """The files and folders of the package that decide what is found in a clip."""
 

@@ -11,7 +11,7 @@ from typing import Any
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies import digests, lockstep
+from torchvision_dddas.evaluation.studies import digests
 from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.evaluation.studies.jobs import Event, cores, share
 from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results, Spec, Task
@@ -161,13 +161,11 @@ def run_study(
     clips: Sequence[str] = (),
     tell: Tell = lambda event: None,
     begun: Callable[[Plan], object] = lambda planned: None,
-    together: int = 1,
 ) -> Results:
     """Run a study. base: what its folders are relative to; jobs: worker processes, 0 for none but this one.
 
     scheduler: the address of a Dask scheduler, whose workers do the work. cache: the folder where results are kept.
-    clips: patterns of names. begun: is told what will be done. together: clips of one size that this process takes
-    through torch at once, before the others share the rest. The results depend on none of these but the clips.
+    clips: patterns of names. begun: is told what will be done. The results depend on none of these but the clips.
     Raises InputError as `plan` does, and where the scheduler cannot be reached.
     """
     count = cores() if jobs is None else jobs
@@ -179,7 +177,7 @@ def run_study(
     ordered = order(planned.jobs)
     if scheduler is None:
         begun(planned)
-        events = _events(ordered, count, store, together, notes)
+        events = _events(ordered, count, store)
         return _gathered(planned, spec, events, store, tell, notes)
     from torchvision_dddas.evaluation.studies.cluster import connected, spread
 
@@ -191,12 +189,10 @@ def run_study(
         return _gathered(planned, spec, chain(known, spread(waiting, client, store)), store, tell, notes)
 
 
-def _events(jobs: Sequence[Job], count: int, store: Cache, together: int, notes: list[str]) -> Iterator[Event]:
+def _events(jobs: Sequence[Job], count: int, store: Cache) -> Iterator[Event]:
     """What becomes of the jobs on this machine. Files that were never read are read by the workers, which are many."""
     waiting: list[Job] = []
     yield from _known(jobs, store, digests.Files(store.folder / "files", read=False), waiting)
-    if together > 1:
-        lockstep.motion_ahead(waiting, store, together, notes.append)
     if count:
         yield from share(waiting, count, store.folder)
     else:
