@@ -30,11 +30,10 @@ from torchvision_dddas.evaluation.metrics import clear, identity
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import ONE_TARGET_LEAST
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation.scene import LEAST_PX, SIZE, render
 from torchvision_dddas.tracking.sequence import Follower, follow_clip, follow_scenes
-from torchvision_dddas.types import Frame, Scene, TrackedFrame, Tracks
+from torchvision_dddas.types import DetectionTable, Frame, Scene, TrackedFrame, Tracks
 
 Step = np.ndarray | None
 Told = Callable[[Step, tuple[int, int]], Step]

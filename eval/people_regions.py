@@ -24,11 +24,10 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import scenes
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.detector import recognize, recognizer_of
 from torchvision_dddas.people.scorer import WindowScorer
-from torchvision_dddas.types import Frame, PeopleFrame
+from torchvision_dddas.types import DetectionTable, Frame, PeopleFrame
 
 LIKELY = 0.5
 MODES = {

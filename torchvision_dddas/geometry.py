@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Float, Int
 
 
@@ -242,6 +243,27 @@ def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(cost)
+
+
+def best_pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.ndarray, "K 2"]:
+    """One-to-one pairs (row, column) with the largest sum of scores, sorted by row.
+
+    An unpaired row or column scores 0, so only scores above 0, and above `least`, are used; -inf forbids a pair.
+    Raises InputError if the score is no matrix or holds NaN or +inf.
+    """
+    score = np.asarray(score, float)
+    if score.ndim != 2:
+        raise InputError(f"best_pairs needs a matrix of scores (N, M); got shape {score.shape}. Give one row a target.")
+    if np.isnan(score).any() or np.isposinf(score).any():
+        raise InputError("best_pairs needs scores below infinity; got NaN or +inf. Forbid a pair with -inf.")
+    # A forbidden pair counts as unpaired, so that a full matching always exists.
+    gain = np.where(score > max(least, 0.0), score, 0.0)
+    # Rows and columns that fit nothing are left out: this spares SciPy in most calls.
+    rows, columns = np.flatnonzero((gain > 0).any(axis=1)), np.flatnonzero((gain > 0).any(axis=0))
+    row, column = cheapest(-gain[np.ix_(rows, columns)])
+    row, column = rows[row], columns[column]
+    used = gain[row, column] > 0
+    return np.stack([row[used], column[used]], axis=1).astype(np.int64)
 
 
 def namespace(x: Any) -> Any:

@@ -10,7 +10,7 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ground_locator import locate, survey
 from torchvision_dddas.geometry import east_north, lonlat
-from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.types import DetectionTable
 
 SETTINGS = load_config()
 WALKERS = np.array([[-1.0, 10.0], [2.0, 14.0]])

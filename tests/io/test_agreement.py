@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.io.source import looked_at
 from torchvision_dddas.io.table_checks import agreed, beginning
+from torchvision_dddas.types import DetectionTable, is_sampled
 
 
 def rows(frames, box_px=(10, 10, 5, 5), score=1.0):
@@ -42,7 +41,7 @@ def test_a_length_that_is_only_guessed_refuses_nothing(source):
 
 def test_rows_between_the_frames_looked_at_are_counted():
     table = rows([1, 2, 3, 4, 5, 6, 6])
-    assert looked_at(table.frame, 5).tolist() == [True, False, False, False, False, True, True]
+    assert is_sampled(table.frame, 5).tolist() == [True, False, False, False, False, True, True]
     assert agreed(table, 5) == ["4 of 7 rows lie on frames that --interval 5 leaves out"]
 
 

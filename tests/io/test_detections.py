@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import LAST_FRAME, DetectionTable, read_detections
+from torchvision_dddas.io.detection_tables import LAST_FRAME, read_detections
+from torchvision_dddas.types import DetectionTable
 
 
 @pytest.fixture

@@ -8,9 +8,8 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.people.detector import UNREAD, checked, people_in, recognize
-from torchvision_dddas.types import Frame, People
+from torchvision_dddas.types import DetectionTable, Frame, People
 
 SIZE = (320, 240)
 WINDOW = np.array([64, 128])

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking import lagrangian as relaxation
-from torchvision_dddas.tracking.assignment import pairs, triplets_exact
+from torchvision_dddas.tracking.assignment import triplets_exact
 from torchvision_dddas.tracking.dual_prices import best_over, bound, cheap, low_prices, settle, shared_prices
 from torchvision_dddas.tracking.lagrangian import triplets
 from torchvision_dddas.tracking.triplets import best_columns
@@ -21,7 +22,7 @@ def tensor_of(seed, shape, low=0.0, high=1.0):
     return np.random.default_rng(seed).uniform(low, high, shape)
 
 
-def best_pairs(score):
+def best_by_trying(score):
     """The largest sum of scores of one-to-one pairs, by trying all."""
     rows, columns = score.shape
     padded = np.hstack([score, np.zeros((rows, rows))])
@@ -64,30 +65,30 @@ def test_pairs_are_one_to_one_and_score_the_most(rows, columns, data):
     entry = WHOLE | st.just(-np.inf)
     score = np.array(data.draw(st.lists(entry, min_size=rows * columns, max_size=rows * columns)), float)
     score = score.reshape(rows, columns)
-    found = pairs(score)
+    found = best_pairs(score)
     assert found.shape == (len(found), 2) and found.dtype == np.int64
     assert len(set(found[:, 0])) == len(set(found[:, 1])) == len(found)
     assert (score[tuple(found.T)] > 0).all()
-    assert score[tuple(found.T)].sum() == best_pairs(score)
+    assert score[tuple(found.T)].sum() == best_by_trying(score)
 
 
 def test_pairs_must_score_more_than_the_least():
-    assert pairs(np.array([[2.0, 0.0], [0.0, 5.0]]), least=2.0).tolist() == [[1, 1]]
+    assert best_pairs(np.array([[2.0, 0.0], [0.0, 5.0]]), least=2.0).tolist() == [[1, 1]]
 
 
 def test_pairs_below_zero_are_never_worth_it():
-    assert pairs(np.array([[-1.0]]), least=-2.0).shape == (0, 2)
+    assert best_pairs(np.array([[-1.0]]), least=-2.0).shape == (0, 2)
 
 
 def test_a_row_of_forbidden_pairs_stays_alone():
     score = np.array([[-np.inf, -np.inf], [1.0, 3.0], [-np.inf, 2.5]])
-    assert pairs(score).tolist() == [[1, 0], [2, 1]]
+    assert best_pairs(score).tolist() == [[1, 0], [2, 1]]
 
 
 @pytest.mark.parametrize("score", [np.zeros(3), [[np.nan]], [[np.inf]]])
 def test_pairs_name_bad_input(score):
     with pytest.raises(InputError, match="pairs needs"):
-        pairs(np.array(score))
+        best_pairs(np.array(score))
 
 
 shapes = st.tuples(*[st.integers(1, 4)] * 3)

@@ -10,10 +10,9 @@ from scipy.optimize import linear_sum_assignment
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.simulation.scene import LEAST_PX, render
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
-from torchvision_dddas.types import Adjustment, Detections, Frame, Registration, Scene
+from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene
 
 SETTINGS = load_config()
 SIZE = (320, 240)

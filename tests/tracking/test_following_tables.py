@@ -8,12 +8,11 @@ import pytest
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.io.sources import Source
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.tracking.source_tracker import PaperTracker
 from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.types import Detections, Frame, Scene
+from torchvision_dddas.types import Detections, DetectionTable, Frame, Scene
 
 SETTINGS = load_config()
 SIZE = (320, 240)

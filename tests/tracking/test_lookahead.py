@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.tracking.assignment import pairs
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.lookahead import best_links, plausible
 
 
@@ -32,7 +32,7 @@ def test_what_is_far_below_nothing_is_not_followed():
 @given(st.integers(0, 10_000), st.integers(0, 5), st.integers(0, 5))
 def test_without_a_next_look_they_are_the_best_pairs_of_two_looks(seed, tracks, detections):
     links = np.random.default_rng(seed).normal(0, 3, (tracks, detections))
-    assert chosen(links) == sorted(map(tuple, pairs(links).tolist()))
+    assert chosen(links) == sorted(map(tuple, best_pairs(links).tolist()))
 
 
 @settings(max_examples=60, deadline=None)

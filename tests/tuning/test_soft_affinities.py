@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.config import PaperParameters, Settings
-from torchvision_dddas.tracking.assignment import pairs
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.source_tracker import Look, associate
 from torchvision_dddas.tuning.affinities import together, window_of
 from torchvision_dddas.tuning.parameters import Parameters
@@ -47,7 +47,7 @@ def paper(**values: Any) -> PaperParameters:
 
 
 def linked(gain: Tensor) -> set[tuple[int, int]]:
-    return {(int(i), int(j)) for i, j in pairs(gain.detach().numpy())}
+    return {(int(i), int(j)) for i, j in best_pairs(gain.detach().numpy())}
 
 
 @pytest.mark.parametrize("values", [{}, {"rule": "fixed", "weight": 0.6}, {"threshold": 0.05}, {"location_cut": 0.1}])

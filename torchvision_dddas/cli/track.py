@@ -15,10 +15,9 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.detection.engine import Engine
-    from torchvision_dddas.io.detection_tables import DetectionTable
     from torchvision_dddas.io.output.track_output import TrackJournal
     from torchvision_dddas.io.sources import Source
-    from torchvision_dddas.types import TrackedFrame
+    from torchvision_dddas.types import DetectionTable, TrackedFrame
 
 
 @explained
@@ -88,9 +87,9 @@ def track_into(
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.detection.engine import load_engine
         from torchvision_dddas.io.detection_tables import read_detections
-        from torchvision_dddas.io.source import looked_at
         from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.io.table_checks import agreed, beginning
+        from torchvision_dddas.types import is_sampled
 
         table = read_detections(detections) if detections is not None else None
         source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
@@ -104,7 +103,7 @@ def track_into(
             "clip": source and clip_facts(source),
             "rows": None
             if table is None
-            else {"given": len(table), "used": int(looked_at(table.frame, interval).sum())},
+            else {"given": len(table), "used": int(is_sampled(table.frame, interval).sum())},
             "interval_frames": interval,
             "backend": engine and engine.name,
             "settings": settings.model_dump(),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.tracking.assignment import pairs
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Float, Int, Sightings
 
 ROUNDS = 3
@@ -178,7 +178,7 @@ def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) 
         reach = np.minimum(score.max(axis=2).sum(axis=1), score.max(axis=1).sum(axis=1))
         for k in np.flatnonzero(reach > most).tolist():
             if reach[k] > most:  # which may have grown
-                found = pairs(score[k])
+                found = best_pairs(score[k])
                 agreed = score[k][found[:, 0], found[:, 1]].sum()
                 if agreed > most:
                     best, most = found, agreed

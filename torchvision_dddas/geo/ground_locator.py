@@ -11,8 +11,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.fusion import fuse
 from torchvision_dddas.geo.ranging import sight, touches_border
 from torchvision_dddas.io.camera_files import PoseTable, poses_at
-from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.types import Camera, GroundLocations, Poses, Positions, Sightings
+from torchvision_dddas.types import Camera, DetectionTable, GroundLocations, Poses, Positions, Sightings
 
 
 @dataclass(frozen=True)

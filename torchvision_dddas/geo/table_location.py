@@ -7,8 +7,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_locator import Locator, Targets, chosen_rows
 from torchvision_dddas.geo.plane import LEAST, width
-from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.types import AerialLocations, Landmarks
+from torchvision_dddas.types import AerialLocations, DetectionTable, Landmarks
 
 OUTSIDE = 0.25
 """A landmark or a target may show so far beyond the picture's edge, as a share of the picture's side."""

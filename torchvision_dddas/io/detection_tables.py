@@ -2,14 +2,12 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import Detections
+from torchvision_dddas.types import DetectionTable
 
 COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
 """The named columns that a CSV must have; `score` may be there as well, any other is ignored."""
@@ -28,101 +26,6 @@ LEAST_PX = 1e-3
 
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
-
-STRAYS, ENOUGH_ROWS = 3, 30
-"""How many rows that lie anywhere leave the extent as it is, and from how many rows it is told at all."""
-
-
-@dataclass(frozen=True)
-class DetectionTable:
-    """Boxes by frame, sorted by frame; rows of one frame keep the file's order.
-
-    frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
-    line: (N,) int64, where the row stands in the file, from 1. own: whether `dddas detect` says that all were moving.
-    identity: (N,) int64 from 1, -1 for a row without one. cut: (N,) bool, whether the picture's border cuts the target;
-    None where the table does not say. feet_px: (N, 2) u, v of the point between the feet, likewise.
-    ours: whether `dddas detect` or `dddas track` wrote it: its boxes are about whole bodies.
-    """
-
-    path: str
-    frame: np.ndarray
-    box_px: np.ndarray
-    score: np.ndarray
-    line: np.ndarray
-    own: bool = False
-    identity: np.ndarray | None = None
-    cut: np.ndarray | None = None
-    feet_px: np.ndarray | None = None
-    ours: bool = False
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @property
-    def first(self) -> int:
-        """The lowest frame number; 0 for a table without rows."""
-        return int(self.frame[0]) if len(self) else 0
-
-    @property
-    def last(self) -> int:
-        """The highest frame number; 0 for a table without rows."""
-        return int(self.frame[-1]) if len(self) else 0
-
-    @cached_property
-    def probable(self) -> bool:
-        """Whether the scores can be probabilities: all in [0, 1]."""
-        return bool(((self.score >= 0) & (self.score <= 1)).all())
-
-    @property
-    def certain(self) -> bool:
-        """Whether every row is as good as certain: scores are on another scale, or grade the contrast of own targets.
-
-        An own target was confirmed over several frames before it was written, however faint it is.
-        """
-        return self.own or not self.probable
-
-    @cached_property
-    def extent(self) -> tuple[float, float] | None:
-        """(width, height) that holds nearly all boxes, the best guess at the picture's size; None with too few rows.
-
-        The farthest right and bottom edge but STRAYS: one stray row would move the border, and with it what counts as
-        leaving the picture, for all. Rows that are likelier false than true (score below 0.5) have no say.
-        """
-        likely = self.box_px if self.certain else self.box_px[self.score >= 0.5]
-        if len(likely) < ENOUGH_ROWS:
-            return None
-        width, height = np.sort(likely[:, :2] + likely[:, 2:], axis=0)[-1 - STRAYS]
-        return float(width), float(height)
-
-    def rows(self, frame: int) -> slice:
-        """Where the rows of a frame are."""
-        return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
-
-    @cached_property
-    def targets(self) -> np.ndarray:
-        """(N,) int64, the identity of each row; where it has none, its place in the frame, after those of the table.
-
-        Raises InputError where a frame has one identity twice.
-        """
-        identity = self.identity if self.identity is not None else np.full(len(self), -1)
-        order = np.lexsort((self.line, identity, self.frame))
-        before, after = order[:-1], order[1:]
-        twice = (self.frame[before] == self.frame[after]) & (identity[before] == identity[after])
-        if (twice & (identity[after] > 0)).any():
-            row = after[(twice & (identity[after] > 0)).argmax()]
-            raise InputError(
-                f"{self.path}, line {self.line[row]}: identity {identity[row]} is there already in frame "
-                f"{self.frame[row]}; wanted each once a frame, or -1 where there are none"
-            )
-        place = np.arange(len(self)) - np.searchsorted(self.frame, self.frame) + 1
-        return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
-
-    def at(self, frame: int) -> Detections:
-        """The detections of a frame, of kind `given`."""
-        here = self.rows(frame)
-        box_px = self.box_px[here]
-        unknown = np.full(len(box_px), np.nan)
-        return Detections(box_px, self.score[here], box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
 
 
 def read_detections(path: str | Path) -> DetectionTable:

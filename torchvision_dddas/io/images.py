@@ -10,8 +10,8 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.image_bytes import decoded
-from torchvision_dddas.io.source import Problem, looked_at
-from torchvision_dddas.types import Frame
+from torchvision_dddas.io.source import Problem
+from torchvision_dddas.types import Frame, is_sampled
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2", ".gif"}
@@ -66,7 +66,7 @@ class ImageSource:
         saturated = False
         for number, file in enumerate(self.files, start=1):
             self.last = number
-            if not looked_at(number, interval):
+            if not is_sampled(number, interval):
                 continue
             image = read_image(file)
             if image is None:

@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, overload
-
-import numpy as np
+from typing import Protocol
 
 from torchvision_dddas.types import Frame
 
@@ -69,12 +67,3 @@ class Source(Protocol):
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ... alone: the others are not decoded as far as that can be had."""
         ...
-
-
-@overload
-def looked_at(frame: int, interval: int) -> bool: ...
-@overload
-def looked_at(frame: np.ndarray, interval: int) -> np.ndarray: ...
-def looked_at(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
-    """Whether a frame, or which of several, is one of 1, 1 + interval, 1 + 2 interval, ..."""
-    return (frame - 1) % interval == 0

@@ -3,8 +3,8 @@
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.io.source import Source, looked_at
+from torchvision_dddas.io.source import Source
+from torchvision_dddas.types import DetectionTable, is_sampled
 
 
 def agreed(table: DetectionTable, interval: int, source: Source | None = None) -> list[str]:
@@ -19,7 +19,7 @@ def agreed(table: DetectionTable, interval: int, source: Source | None = None) -
     if source is not None:
         within_clip(table, source)
     notes = []
-    left_out = len(table) - int(looked_at(table.frame, interval).sum())
+    left_out = len(table) - int(is_sampled(table.frame, interval).sum())
     if left_out == len(table):
         looks = ", ".join(str(1 + k * interval) for k in range(3))
         raise InputError(

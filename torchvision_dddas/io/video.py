@@ -13,8 +13,8 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.image_bytes import quiet_opencv
-from torchvision_dddas.io.source import Problem, looked_at
-from torchvision_dddas.types import Frame
+from torchvision_dddas.io.source import Problem
+from torchvision_dddas.types import Frame, is_sampled
 
 # FFmpeg draws any text file as an old terminal would; nobody means that.
 _TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}
@@ -99,7 +99,7 @@ class VideoSource:
             if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
                 stamp_s = max((number - 1) / self.rate_hz, time_s)
             time_s = stamp_s
-            if not looked_at(number, interval):
+            if not is_sampled(number, interval):
                 continue
             decoded, image = capture.retrieve()
             if not decoded:

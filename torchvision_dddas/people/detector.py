@@ -8,13 +8,12 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import DetectionTable
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.scorer import WindowScorer, load_scorer
 from torchvision_dddas.people.search_regions import Look, Regions, Search
-from torchvision_dddas.types import Frame, LinearSvm, Part, People, PeopleFrame
+from torchvision_dddas.types import DetectionTable, Frame, LinearSvm, Part, People, PeopleFrame
 
 UNREAD = "the frame could not be read"
 

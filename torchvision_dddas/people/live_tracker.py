@@ -6,14 +6,13 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.geometry import chain
-from torchvision_dddas.io.source import looked_at
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import UNREAD, checked
 from torchvision_dddas.people.scorer import WindowScorer
 from torchvision_dddas.people.search_regions import Search
 from torchvision_dddas.tracking.sequence import Follower
-from torchvision_dddas.types import Adjustment, Detections, Scene, TrackedFrame, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Scene, TrackedFrame, Tracks, is_sampled
 
 KIND = "person"
 
@@ -42,7 +41,7 @@ class Spotter:
         """The next scene."""
         if scene.step is not None and scene.step.reliable:
             self._steps.append(scene.step.later_from_earlier)
-        if not looked_at(scene.frame.number, self._interval):
+        if not is_sampled(scene.frame.number, self._interval):
             return
         found, adjustments, seconds = self._found(scene)
         followed = TrackedFrame(

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
-from torchvision_dddas.io.source import Problem, looked_at
+from torchvision_dddas.io.source import Problem
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, load
 from torchvision_dddas.simulation.simulator import Simulator
@@ -26,6 +26,7 @@ from torchvision_dddas.types import (
     Landmarks,
     Telemetry,
     Truth,
+    is_sampled,
 )
 
 KEPT = 100
@@ -86,7 +87,7 @@ class SimulatorSource:
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are drawn as well, so that what was seen stays the same."""
-        return (frame for frame in self if looked_at(frame.number, interval))
+        return (frame for frame in self if is_sampled(frame.number, interval))
 
     def steer(self, command: Command) -> None:
         """Do as told from the next frame on; places in longitude and latitude. Raises InputError as Simulator does."""

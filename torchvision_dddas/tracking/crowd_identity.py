@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.tracking.assignment import pairs
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Float, Int
 
 # A crowd is this far off where it is expected: at once, by its own radius, and for each second that it was not seen.
@@ -74,7 +74,7 @@ class RollCall:
         rows = np.flatnonzero(np.isfinite(place_m).all(axis=1) & np.isfinite(radius_m))
         radius_m = np.maximum(radius_m, 0.3)
         names = np.zeros(len(followed), np.int64)
-        found = pairs(self._scores(followed[rows], place_m[rows], radius_m[rows]))
+        found = best_pairs(self._scores(followed[rows], place_m[rows], radius_m[rows]))
         matched = {int(rows[column]): self._known[row] for row, column in found}
         self._share(matched, place_m, radius_m)
         for k in rows.tolist():

@@ -14,11 +14,19 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.geometry import chain
-from torchvision_dddas.io.detection_tables import DetectionTable
-from torchvision_dddas.io.source import Source, looked_at
+from torchvision_dddas.io.source import Source
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.types import Adjustment, Detections, Frame, Scene, TrackedFrame, Tracks
+from torchvision_dddas.types import (
+    Adjustment,
+    Detections,
+    DetectionTable,
+    Frame,
+    Scene,
+    TrackedFrame,
+    Tracks,
+    is_sampled,
+)
 
 if TYPE_CHECKING:
     from torchvision_dddas.tracking.source_tracker import PaperTracker
@@ -41,7 +49,7 @@ def follow_scenes(
         adjustments += scene.adjustments
         seconds.update(scene.seconds)
         number = scene.frame.number
-        if not looked_at(number, interval):
+        if not is_sampled(number, interval):
             continue
         # A step that is not known counts as none: the others are nearer to the truth than a camera that stood still.
         known = [step for step in steps if step is not None]
@@ -116,7 +124,7 @@ def _frames(table: DetectionTable, interval: int, forgotten: int) -> Iterator[in
     if not len(table):
         return
     start, last = table.first + -(table.first - 1) % interval, table.last - (table.last - 1) % interval
-    for row in np.union1d(table.frame[looked_at(table.frame, interval)], [last]).tolist():
+    for row in np.union1d(table.frame[is_sampled(table.frame, interval)], [last]).tolist():
         quiet = range(start, min(row, start + forgotten), interval)
         yield from quiet
         yield from range(max(start + len(quiet) * interval, row - interval), row + 1, interval)

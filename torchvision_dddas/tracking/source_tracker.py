@@ -12,6 +12,7 @@ import numpy as np
 
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking import assignment, jaccard
 from torchvision_dddas.tracking import lagrangian as relaxation
 from torchvision_dddas.tracking.dispersion import dispersion, location_weight, of_window
@@ -117,7 +118,7 @@ def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.
 
 def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
     """As `triplets_exact`, for two frames: what a pair gains over leaving both with the dummy is SciPy's matter."""
-    matched = assignment.pairs(pair_gain_over_alone(score)) + 1
+    matched = best_pairs(pair_gain_over_alone(score)) + 1
     rows = [matched]
     for axis, size in enumerate(score.shape):
         alone = np.zeros((size - 1 - len(matched), 2), np.int64)

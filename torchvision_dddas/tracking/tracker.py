@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchvision_dddas.config import Settings
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.appearance_score import blended, in_doubt, likeness_scores, visible_share
-from torchvision_dddas.tracking.assignment import pairs
 from torchvision_dddas.tracking.kalman import SEEN, carried_boxes
 from torchvision_dddas.tracking.lookahead import best_links, plausible
 from torchvision_dddas.tracking.scores import Sight, births_of, link_scores, near_border
@@ -126,7 +126,7 @@ class Tracker:
             parts = np.split(onward, [len(followed), len(followed) + len(born)])
             chosen = best_links(links[tracks, now], tracks, now, *parts)
         else:
-            best = pairs(links)
+            best = best_pairs(links)
             chosen = np.isin(tracks * len(look.row) + now, best[:, 0] * len(look.row) + best[:, 1])
         self._commit(look, tracks[chosen], now[chosen], followed.only(chosen), born)
         self.before = look

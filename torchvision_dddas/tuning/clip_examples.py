@@ -25,7 +25,7 @@ from torchvision_dddas.types import AerialLocations
 
 if TYPE_CHECKING:
     from torchvision_dddas.cli.aerial import AerialInput
-    from torchvision_dddas.io.detection_tables import DetectionTable
+    from torchvision_dddas.types import DetectionTable
 
 PROBE = 2.0
 """What landmarks.sigma_m adds to a variance is told by what the variance is at so many times the parameter."""

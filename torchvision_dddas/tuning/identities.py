@@ -20,7 +20,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.io.detection_tables import DetectionTable, read_detections
+from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking.appearance_score import blended, likeness, visible_share
 from torchvision_dddas.tracking.kalman import carried_boxes
 from torchvision_dddas.tracking.scores import births_of, near_border
@@ -29,6 +29,7 @@ from torchvision_dddas.tuning.clip_boxes import boxed
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.tuning.matching import Owned, owned
 from torchvision_dddas.tuning.soft_scores import Looks, unlikeliness
+from torchvision_dddas.types import DetectionTable
 
 LOOKS = 25
 """Looks of a stretch: with the memory of 125 frames all that counts at an interval of 5."""

@@ -7,7 +7,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.io.detection_tables import DetectionTable
+from torchvision_dddas.types import DetectionTable
 
 
 class Owned(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.functional.soft.assignment import log_partition, shares
-from torchvision_dddas.tracking.assignment import pairs
+from torchvision_dddas.geometry import best_pairs
 
 
 def scores(*shape: int, spread: float = 3.0, seed: int = 0) -> Tensor:
@@ -51,7 +51,7 @@ def test_it_is_near_the_sum_over_all_assignments_and_never_above(softness, seed)
 
 def test_shares_and_score_tend_to_the_best_assignment_as_softness_vanishes():
     score = scores(8, 9)
-    best = pairs(score.numpy())
+    best = best_pairs(score.numpy())
     hard = np.zeros(score.shape)
     hard[best[:, 0], best[:, 1]] = 1
     off = [np.abs(shares(score, softness).numpy() - hard).max() for softness in (1.0, 0.3, 0.1, 0.01)]

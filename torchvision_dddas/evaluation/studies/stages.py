@@ -16,8 +16,8 @@ from torchvision_dddas.evaluation.studies.rows import Rows, Tick, followed_kept,
 from torchvision_dddas.types import Detections, Frame, Registration, Scene
 
 if TYPE_CHECKING:
-    from torchvision_dddas.io.detection_tables import DetectionTable
     from torchvision_dddas.io.sources import Source
+    from torchvision_dddas.types import DetectionTable
 
 _SEES = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
 _FOLLOWS = ("track", "paper")
@@ -177,7 +177,7 @@ def _association(clip: Clip, settings: Settings, backend: str, interval: int, ti
 
 def true_boxes(clip: Clip, interval: int) -> "DetectionTable":
     """The true boxes of each interval-th frame as certain detections. Raises InputError where there are none."""
-    from torchvision_dddas.io.detection_tables import DetectionTable
+    from torchvision_dddas.types import DetectionTable
 
     assert clip.truth is not None and clip.truth.tracks is not None, "allowed() asks for it where there is truth"
     table = clip.truth.tracks.every(interval)
