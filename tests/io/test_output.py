@@ -70,16 +70,16 @@ def test_ctrl_c_keeps_valid_outputs_of_the_frames_seen(tmp_path, scene):
 
 
 def test_ctrl_c_while_a_frame_is_written_waits_for_the_whole_frame(tmp_path, scene, monkeypatch):
-    from torchvision_dddas.io.tables import Tables
+    from torchvision_dddas.io.tables import TableFiles
 
-    honest = Tables.write
+    honest = TableFiles.write
 
     def interrupted(self, made):
         honest(self, made)
         if made.frame.number == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(Tables, "write", interrupted)
+    monkeypatch.setattr(TableFiles, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fill(tmp_path, [scene(1), scene(2), scene(3)])
     assert visible(tmp_path) == ALL_OF_TWO
@@ -116,8 +116,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(tmp_path, scene
         def refuse(*_):
             raise full
 
-        place = {"table": "tables.mot_lines", "overlay": "overlay._H264.write"}[victim]
-        monkeypatch.setattr(f"torchvision_dddas.io.output.{place}", refuse)
+        place = {"table": "tables.mot_rows", "overlay": "overlay.detection_overlay._H264.write"}[victim]
+        monkeypatch.setattr(f"torchvision_dddas.io.{place}", refuse)
     with pytest.raises(InputError, match="No space left on device") as error:
         fill(tmp_path, [scene(1), scene(2)])
     assert "\n" not in str(error.value)

@@ -1,16 +1,98 @@
-import csv
+"""Tables as text: what a schema writes, and what it reads and refuses."""
+
 import math
 
+import numpy as np
 import pytest
 
-from torchvision_dddas.io.tables import COLUMNS, Tables, compass_deg, csv_lines, mot_lines
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.tables import (
+    DETECTIONS,
+    Column,
+    Schema,
+    TableFiles,
+    compass_deg,
+    detection_tables,
+    parse_numbers,
+    read_csv,
+    read_table,
+)
+
+PLACES = Schema(
+    "places",
+    Column("frame", "d", 1, 1000, is_whole=True),
+    Column("name"),
+    Column("east_m", ".2f", -100, 100, may_be_empty=True),
+)
 
 
-def test_mot_lines_have_ten_fields_and_no_identity(scene):
-    assert (
-        mot_lines(scene(7, targets=2))
-        == "7,-1,0.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n7,-1,3.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n"
-    )
+def test_rows_are_read_as_they_were_written(tmp_path):
+    names = ["north, by north-west", 'the "old" one', "two\nlines", "plain"]
+    rows = {"frame": 7, "name": names, "east_m": np.array([1.234, math.nan, math.inf, -0.5])}
+    files = TableFiles({tmp_path / "places.csv": (PLACES, lambda item: item)})
+    files.write(rows)
+    files.close()
+    read = read_table(tmp_path / "places.csv", PLACES)
+    assert read["frame"].tolist() == [7] * 4 and read.columns["name"] == names
+    np.testing.assert_array_equal(read["east_m"], [1.23, math.nan, math.nan, -0.5])
+
+
+def test_a_row_of_single_values_is_one_line_and_no_rows_are_none():
+    assert PLACES.format_rows({"frame": 1, "name": None, "east_m": 0.126}) == "1,,0.13\n"
+    assert PLACES.format_rows({"frame": 1, "name": "a", "east_m": np.zeros(0)}) == ""
+
+
+def test_columns_in_any_order_with_others_between_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text('\ufeffeast_m, note,"frame"\r\n\r\n1e1,x,2\r\n,y,3\r\n', encoding="utf-8")
+    read = read_table(path, PLACES, ("frame",))
+    assert read["frame"].tolist() == [2, 3] and read.line.tolist() == [3, 4] and "name" not in read
+    np.testing.assert_array_equal(read["east_m"], [10, math.nan])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,east_m\na,1\n", "lacks frame; its columns are name, east_m, wanted frame,east_m"),
+        ("", "lacks frame, east_m; its columns are none"),
+        ("frame,frame,east_m\n1,1,2\n", "column frame is named twice"),
+        ("frame,east_m\n1,2\n2\n", "line 3: 1 column; the first line names 2"),
+        ("frame,east_m\n1,2,3\n", "line 2: 3 columns; the first line names 2"),
+        ("frame,east_m\n\n1.5,2\n", "line 3: frame is '1.5'; wanted a whole number from 1 to 1000"),
+        ("frame,east_m\n1,0\n1001,2\n", "line 3: frame is '1001'; wanted a whole number from 1 to 1000"),
+        ("frame,east_m\n,2\n", "line 2: frame is ''; wanted a whole number"),
+        ("frame,east_m\n1,1_0\n", "line 2: east_m is '1_0'; wanted a number from -100 to 100, or nothing"),
+        ("frame,east_m\n1,inf\n", "east_m is 'inf'"),
+    ],
+)
+def test_each_mistake_is_one_line_with_file_and_line(tmp_path, text, message):
+    path = tmp_path / "places.csv"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_table(path, PLACES, ("frame", "east_m"))
+    assert message in str(caught.value) and "places.csv" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_ragged_lines_are_read_as_far_as_the_wanted_columns_go(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("frame,east_m,note\n1,2\n3,4,a,b\n")
+    assert read_table(path, PLACES, is_ragged=True)["east_m"].tolist() == [2, 4]
+    path.write_text("frame,east_m\n1,2\n3\n")
+    with pytest.raises(InputError, match="line 3: east_m is missing: the line ends before it"):
+        read_table(path, PLACES, is_ragged=True)
+
+
+@pytest.mark.parametrize(("content", "message"), [(None, "No such file"), (b"a,b\n\xff\xfe\n", "is no CSV text")])
+def test_a_file_that_cannot_be_read_is_said(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_csv(tmp_path / "t.csv", "places")
+
+
+def test_numbers_are_told_from_what_is_none():
+    np.testing.assert_array_equal(parse_numbers(["1", "", "nan", "-2e3"]), [1, math.nan, math.nan, -2000])
+    np.testing.assert_array_equal(parse_numbers(["1", "", "x", "1_0"]), [1, math.nan, math.inf, math.inf])
 
 
 @pytest.mark.parametrize(
@@ -21,24 +103,27 @@ def test_heading_is_clockwise_from_image_up_and_below_360(heading_rad, degrees):
     assert compass_deg(heading_rad) == degrees
 
 
-def test_what_is_unknown_is_an_empty_cell(scene):
-    rows = list(csv.DictReader(csv_lines(scene(1, targets=2)).splitlines(), fieldnames=COLUMNS))
-    assert (rows[0]["heading_deg"], rows[0]["speed_px_per_frame"]) == ("0.0", "1.500")
-    assert (rows[1]["heading_deg"], rows[1]["speed_px_per_frame"]) == ("", "")
-    assert (rows[1]["target"], rows[1]["kind"], rows[1]["area_px"]) == ("2", "moving", "4")
+def test_detections_of_a_scene_as_motchallenge_text_and_csv(tmp_path, scene):
+    tables = detection_tables(tmp_path)
+    tables.write(scene(7, targets=2))
+    assert not list(tmp_path.glob("detections*"))  # none before the end
+    tables.close()
+    mot = (tmp_path / "detections.txt").read_text()
+    assert mot == "7,-1,0.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n7,-1,3.00,0.00,2.00,2.00,0.8750,-1,-1,-1\n"
+    header, first, second = (tmp_path / "detections.csv").read_text().splitlines()
+    assert header.startswith("frame,target,x_px,y_px,width_px,height_px,score,kind,area_px,heading_deg,speed_px")
+    assert first == "7,1,0.00,0.00,2.00,2.00,0.8750,moving,4,0.0,1.500"
+    assert second == "7,2,3.00,0.00,2.00,2.00,0.8750,moving,4,,"
 
 
-def test_a_clip_without_targets_gives_empty_tables_with_a_heading_line(tmp_path, scene):
-    tables = Tables(tmp_path)
+def test_a_clip_without_targets_gives_empty_tables_and_a_discard_leaves_none(tmp_path, scene):
+    tables = detection_tables(tmp_path)
     tables.write(scene(1, targets=0))
-    tables.close(complete=True)
+    tables.close()
     assert (tmp_path / "detections.txt").read_text() == ""
-    assert (tmp_path / "detections.csv").read_text() == ",".join(COLUMNS) + "\n"
-
-
-def test_no_table_is_there_before_the_end_and_none_after_a_discard(tmp_path, scene):
-    tables = Tables(tmp_path)
-    tables.write(scene(1))
-    assert not list(tmp_path.glob("detections*"))
-    tables.discard()
-    assert not list(tmp_path.iterdir())
+    assert (tmp_path / "detections.csv").read_text() == DETECTIONS.header
+    again = detection_tables(tmp_path / "again")
+    (tmp_path / "again").mkdir()
+    again.write(scene(1))
+    again.discard()
+    assert not list((tmp_path / "again").iterdir())

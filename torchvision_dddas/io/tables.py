@@ -1,71 +1,120 @@
-"""The detections as tables: MOTChallenge text for other tools, and CSV with named columns and the rest."""
+"""Tables as text files, CSV and MOTChallenge: a schema names the columns once, for the reader and for the writer."""
 
+import csv
+import io
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TextIO
+from typing import Any, Generic, NamedTuple, TextIO, TypeVar
 
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import remove, temporary
 from torchvision_dddas.types import Scene
 
-COLUMNS = (
-    *("frame", "target", "x_px", "y_px", "width_px", "height_px", "score", "kind"),
-    *("area_px", "heading_deg", "speed_px_per_frame"),
-)
+Item = TypeVar("Item")
+
+LAST_FRAME = 10_000_000
+"""A higher frame number is taken for a mistake, such as a time stamp."""
+
+FARTHEST = 1e9
+"""No place in pixels or metres, no variance and no score is larger."""
 
 
-def mot_lines(scene: Scene) -> str:
-    """`frame,-1,x,y,width,height,score,-1,-1,-1`, a line a target: frames from 1, pixels from 0, -1 for no identity."""
-    return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
 
-
-def mot_rows(number: int, box_px: np.ndarray, score: np.ndarray) -> str:
-    """The same for the boxes of any frame."""
-    return "".join(
-        f"{number},-1,{x:.2f},{y:.2f},{w:.2f},{h:.2f},{score:.4f},-1,-1,-1\n"
-        for (x, y, w, h), score in zip(box_px, score, strict=True)
-    )
-
-
-def csv_lines(scene: Scene) -> str:
-    """One line a target, in the order of COLUMNS; a cell is empty where the value is unknown.
-
-    heading_deg is clockwise from the picture's upward direction, over the ground; speed is relative to the background.
+    name: with its unit, as `x_px`. format: of its numbers, as `format(value, ".2f")` takes it; "" for text.
+    low, high: the range that a reader accepts, ends included. is_whole: whether its numbers are whole.
+    may_be_empty: whether a reader accepts empty cells, which become NaN. wanted: the range in words, for messages.
     """
-    d = scene.detections
-    lines = []
-    for i in range(len(d)):
-        box = ",".join(_cell(v, 2) for v in d.box_px[i])
-        heading = _cell(compass_deg(float(d.heading_rad[i])), 1)
-        rest = f"{_cell(d.score[i], 4)},{d.kind},{_cell(d.area_px[i], 0)},{heading},{_cell(d.speed_px[i], 3)}"
-        lines.append(f"{scene.frame.number},{i + 1},{box},{rest}\n")
-    return "".join(lines)
+
+    name: str
+    format: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    is_whole: bool = False
+    may_be_empty: bool = False
+    wanted: str = ""
+
+    @property
+    def range_text(self) -> str:
+        """What a cell may hold, in words."""
+        if self.wanted:
+            return self.wanted
+        kind = "a whole number" if self.is_whole else "a number"
+        text = f"{kind} from {self.low:g} to {self.high:g}" if math.isfinite(self.high - self.low) else f"finite {kind}"
+        if self.is_whole and math.isfinite(self.high):
+            text = f"a whole number from {self.low:.0f} to {self.high:.0f}"
+        return text.replace("finite a", "a finite") + (", or nothing" if self.may_be_empty else "")
 
 
-def compass_deg(heading_rad: float) -> float:
-    """Degrees clockwise from image up, in tenths below 360, of a heading in image axes (0 right, pi/2 down)."""
-    return round(math.degrees(heading_rad) + 90, 1) % 360
+class Schema:
+    """The columns of one kind of table.
+
+    what: what the table holds, for messages. has_header: whether the first line names the columns.
+    """
+
+    def __init__(self, what: str, *columns: Column, has_header: bool = True) -> None:
+        self.what = what
+        self.columns = columns
+        self.names = tuple(column.name for column in columns)
+        self.header = ",".join(self.names) + "\n" if has_header else ""
+
+    def format_rows(self, values: Mapping[str, Any]) -> str:
+        """Lines of text with the cells of some rows, in the order of the columns; "" for no rows.
+
+        values: column name -> one value a row; a single number, word or None stands in every row. Unknown
+        numbers (NaN, infinite, None) become empty cells, and words are quoted where CSV needs it. Raises KeyError for
+        a missing column.
+        """
+        given = [values[name] for name in self.names]
+        count = next((len(value) for value in given if not _is_single(value)), 1)
+        cells = [_format_cells(value, column.format, count) for column, value in zip(self.columns, given, strict=True)]
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(zip(*cells, strict=True))
+        return text.getvalue()
 
 
-def _cell(value: float, digits: int) -> str:
-    return "" if math.isnan(value) else f"{value:.{digits}f}"
+def _is_single(value: Any) -> bool:
+    return value is None or isinstance(value, str) or np.ndim(value) == 0
 
 
-class Tables:
-    """detections.txt and detections.csv, written as the clip goes by."""
+def _format_cells(values: Any, form: str, count: int) -> list[str]:
+    if _is_single(values):
+        return _format_cells([values], form, 1) * count
+    items = values.tolist() if isinstance(values, np.ndarray) else values
+    if not form:
+        return ["" if item is None else str(item) for item in items]
+    return ["" if item is None or not math.isfinite(item) else format(item, form) for item in items]
 
-    def __init__(self, folder: Path) -> None:
-        self._files = TextFiles({folder / "detections.txt": "", folder / "detections.csv": ",".join(COLUMNS) + "\n"})
 
-    def write(self, scene: Scene) -> None:
-        """Add the targets of a frame."""
-        self._files.write(mot_lines(scene), csv_lines(scene))
+Rows = Mapping[str, Any]
+"""Column name -> one value a row, or a single one for all rows; as Schema.format_rows takes it."""
 
-    def close(self, complete: bool) -> None:
-        """Put the tables in their places. Raises OSError if the last lines cannot be written."""
+
+class TableFiles(Generic[Item]):
+    """Tables that grow together, item by item, and appear whole at the end.
+
+    tables: path -> the table's schema, and the function that makes its rows of an item:
+
+        TableFiles({folder / "sizes.csv": (SIZES, lambda frame: {"frame": frame.number, "width_px": frame.widths})})
+    """
+
+    def __init__(self, tables: Mapping[Path, tuple[Schema, Callable[[Item], Rows]]]) -> None:
+        self._tables = tuple(tables.values())
+        self._files = TextFiles({path: schema.header for path, (schema, _) in tables.items()})
+
+    def write(self, item: Item) -> None:
+        """Add the rows of an item to each table. Raises OSError if the disk refuses."""
+        self._files.write(*(schema.format_rows(rows(item)) for schema, rows in self._tables))
+
+    def close(self, complete: bool = True) -> None:
+        """Put the tables in their places, also those without rows. Raises OSError if they cannot be written."""
         self._files.close()
 
     def discard(self) -> None:
@@ -106,3 +155,213 @@ class TextFiles:
                 self._files.append(temporary(path).open("w", encoding="utf-8", newline=""))
                 self._files[-1].write(first)
         return self._files
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Reading.
+
+
+class CsvText(NamedTuple):
+    """The cells of a CSV without the blanks around them; blank lines are left out.
+
+    header: the cells of the first line, none in an empty file. line: of each further row, from 1. rows: their cells.
+    """
+
+    header: list[str]
+    line: list[int]
+    rows: list[list[str]]
+
+
+def read_csv(path: str | Path, what: str = "") -> CsvText:
+    """Read the cells of a CSV. what: what the file holds, for messages. Raises InputError: unreadable, no CSV text."""
+    name = f"{what} {path}".strip()
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, skipinitialspace=True)
+            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{name} is no CSV text: {error}") from None
+    header = lines[0][1] if lines else []
+    kept = [(number, row) for number, row in lines[1:] if any(row)]
+    return CsvText(header, [number for number, _ in kept], [row for _, row in kept])
+
+
+class Table:
+    """A table that was read. columns: name -> (N,) float64, or a list of text. line: (N,) int64, in the file from 1."""
+
+    def __init__(self, path: str | Path, what: str, header: Sequence[str], line: Sequence[int]) -> None:
+        self.path, self.what, self.header = str(path), what, tuple(header)
+        self.line = np.array(line, np.int64)
+        self.columns: dict[str, Any] = {}
+        self.text: dict[str, list[str]] = {}
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column; NaN in every row where the table does not have it."""
+        values: np.ndarray = self.columns.get(name, np.full(len(self), np.nan))
+        return values
+
+    def stack(self, *names: str) -> np.ndarray:
+        """Several columns side by side, (N, K)."""
+        return np.stack([self[name] for name in names], axis=1)
+
+    def error(self, message: str, row: int | None = None) -> InputError:
+        """The error to raise, with the file and the line of a row."""
+        place = "" if row is None else f", line {self.line[row]}"
+        return InputError(f"{self.what} {self.path}{place}: {message}")
+
+    def refuse(self, is_wrong: np.ndarray, message: str) -> None:
+        """Raises InputError at the first of the rows that are wrong, (N,) bool."""
+        if is_wrong.any():
+            raise self.error(message, int(is_wrong.argmax()))
+
+
+def read_table(
+    path: str | Path, schema: Schema, required: Sequence[str] = (), is_ragged: bool = False, text: CsvText | None = None
+) -> Table:
+    """Read the columns of a schema that a CSV has; further columns are ignored.
+
+    required: names without which the table is refused. is_ragged: whether lines may have more or fewer cells than the
+    first, as long as the schema's columns are there. text: the file's cells where they are known.
+    Raises InputError with file and line: unreadable, a column missing or named twice, too many or too few cells, not a
+    number, out of range.
+    """
+    header, lines, rows = text or read_csv(path, schema.what)
+    table = Table(path, schema.what, header, lines)
+    columns = ", ".join(filter(None, header)) or "none"
+    if missing := [name for name in required if name not in header]:
+        raise InputError(
+            f"{schema.what} {path} lacks {', '.join(missing)}; its columns are {columns}, wanted {','.join(required)}"
+        )
+    if twice := [name for name in schema.names if header.count(name) > 1]:
+        raise table.error(f"column {twice[0]} is named twice; wanted each name once")
+    for row, cells in enumerate(rows):
+        if len(cells) != len(header) and not is_ragged:
+            count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
+            raise table.error(f"{count}; the first line names {len(header)}", row)
+    for column in schema.columns:
+        if column.name in header:
+            place = header.index(column.name)
+            short = next((row for row, cells in enumerate(rows) if len(cells) <= place), None)
+            if short is not None:
+                raise table.error(f"{column.name} is missing: the line ends before it", short)
+            table.text[column.name] = cells = [cells[place] for cells in rows]
+            table.columns[column.name] = _numbers(table, column, cells) if column.format else cells
+    return table
+
+
+def _numbers(table: Table, column: Column, cells: list[str]) -> np.ndarray:
+    """(N,) float64, NaN for an empty cell or `nan`. Raises InputError for a cell that is no number or out of range."""
+    values = parse_numbers(cells)
+    is_wrong = np.isinf(values) | (values < column.low) | (values > column.high)
+    if not column.may_be_empty:
+        is_wrong |= np.isnan(values)
+    if column.is_whole:
+        is_wrong |= np.isfinite(values) & (values != np.round(values))
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
+        raise table.error(f"{column.name} is '{cells[row]}'; wanted {column.range_text}", row)
+    return values
+
+
+def parse_numbers(cells: Sequence[str]) -> np.ndarray:
+    """(N,) float64: NaN for an empty cell or `nan`, infinity for what is no number."""
+    try:
+        if "_" in "".join(cells):  # 1_0 is a number to Python alone
+            raise ValueError
+        return np.array([float(cell) if cell else math.nan for cell in cells], float)
+    except ValueError:
+        return np.array([_parse_number(cell) for cell in cells], float)
+
+
+def _parse_number(cell: str) -> float:
+    try:
+        return math.inf if "_" in cell else float(cell) if cell else math.nan
+    except ValueError:
+        return math.inf
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Columns and tables that several modules read or write.
+
+FRAME = Column("frame", "d", 1, LAST_FRAME, is_whole=True)
+IDENTITY = Column("identity", "d")
+BOX = tuple(
+    Column(name, ".2f", low, FARTHEST, wanted=f"pixels, {words}")
+    for name, low, words in (
+        ("x_px", -FARTHEST, f"{FARTHEST:g} at most"),
+        ("y_px", -FARTHEST, f"{FARTHEST:g} at most"),
+        ("width_px", 1e-3, "0.001 to 1e+09"),
+        ("height_px", 1e-3, "0.001 to 1e+09"),
+    )
+)
+SCORE = Column("score", ".4f")
+PRECISE_SCORE = replace(SCORE, format=".6g")
+KIND = Column("kind")
+MOTION = (Column("heading_deg", ".1f"), Column("speed_px_per_frame", ".3f"))
+EAST_NORTH = tuple(Column(name, ".4f", -FARTHEST, FARTHEST) for name in ("east_m", "north_m"))
+# A centimetre squared is 0.0001 m2: fixed digits would lose what is known well.
+COVARIANCE = tuple(
+    Column(name, ".6g", -FARTHEST, FARTHEST, may_be_empty=True)
+    for name in ("var_east_m2", "cov_east_north_m2", "var_north_m2")
+)
+DEGREES = tuple(
+    Column(name, ".9f", -most, most, may_be_empty=True) for name, most in (("longitude_deg", 180), ("latitude_deg", 90))
+)
+TARGET = Column("target", "d", 1, 2**53, is_whole=True)
+
+MOT = Schema("boxes", FRAME, IDENTITY, *BOX, SCORE, *(Column(n, "d") for n in ("x", "y", "z")), has_header=False)
+"""MOTChallenge text: `frame,identity,x,y,width,height,score,-1,-1,-1`, frames from 1, pixels from 0.
+
+An identity of -1 is none.
+"""
+
+MOT_TRACKS = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, *MOT.columns[-3:], has_header=False)
+"""The same with scores as they were given."""
+
+DETECTIONS = Schema("detections", FRAME, TARGET, *BOX, SCORE, KIND, Column("area_px", ".0f"), *MOTION)
+"""detections.csv of `dddas detect`. heading_deg: clockwise from the picture's upward direction, over the ground.
+
+speed_px_per_frame: relative to the background.
+"""
+
+
+def mot_rows(frame: int, box_px: np.ndarray, score: np.ndarray, identity: np.ndarray | int = -1) -> dict[str, Any]:
+    """What MOT and MOT_TRACKS write of the boxes (N, 4) of a frame."""
+    box = dict(zip(("x_px", "y_px", "width_px", "height_px"), np.reshape(box_px, (-1, 4)).T, strict=True))
+    return {"frame": frame, "identity": identity, **box, "score": score, "x": -1, "y": -1, "z": -1}
+
+
+def compass_deg(heading_rad: float) -> float:
+    """Degrees clockwise from image up, in tenths below 360, of a heading in image axes (0 right, pi/2 down)."""
+    return round(math.degrees(heading_rad) + 90, 1) % 360
+
+
+def detection_tables(folder: Path) -> TableFiles[Scene]:
+    """detections.txt and detections.csv of a clip's frames."""
+    return TableFiles(
+        {folder / "detections.txt": (MOT, _mot_of_scene), folder / "detections.csv": (DETECTIONS, _of_scene)}
+    )
+
+
+def _mot_of_scene(scene: Scene) -> Rows:
+    return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)
+
+
+def _of_scene(scene: Scene) -> Rows:
+    found = scene.detections
+    return {
+        **mot_rows(scene.frame.number, found.box_px, found.score),
+        "target": np.arange(1, len(found) + 1),
+        "kind": found.kind,
+        "area_px": found.area_px,
+        "heading_deg": [compass_deg(heading) for heading in found.heading_rad.tolist()],
+        "speed_px_per_frame": found.speed_px,
+    }

@@ -15,7 +15,7 @@ from torchvision_dddas.io.masks import Masks
 from torchvision_dddas.io.output import run_record as journal
 from torchvision_dddas.io.output.run_record import Journal, Record
 from torchvision_dddas.io.overlay.detection_overlay import Overlay, drawn
-from torchvision_dddas.io.tables import Tables
+from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import Scene
 
 SAVED = ("masks", "overlay")
@@ -126,7 +126,7 @@ class Output(RunFolder[Scene]):
     def begin(self, facts: dict[str, Any], rate_hz: float) -> Journal:
         """Say what the run is, for run.json, and how fast the overlay plays. Returns the journal that keeps count."""
         self.journal = kept = Journal(self.folder, {**facts, "outputs": ["tables", *self._save]})
-        self._sinks = [kept, Tables(self.folder)]
+        self._sinks = [kept, detection_tables(self.folder)]
         if "masks" in self._save:
             self._sinks.append(Masks(self.folder))
         if "overlay" in self._save:

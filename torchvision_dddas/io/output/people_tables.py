@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from torchvision_dddas.io.tables import TextFiles, mot_rows
+from torchvision_dddas.io.tables import MOT, TextFiles, mot_rows
 from torchvision_dddas.types import PeopleFrame
 
 COLUMNS = (
@@ -13,7 +13,7 @@ COLUMNS = (
 
 def mot_lines(recognized: PeopleFrame) -> str:
     """`frame,-1,x,y,width,height,probability,-1,-1,-1`, a line a person: frames from 1, pixels from 0."""
-    return mot_rows(recognized.frame.number, recognized.people.box_px, recognized.people.score)
+    return MOT.format_rows(mot_rows(recognized.frame.number, recognized.people.box_px, recognized.people.score))
 
 
 def csv_lines(recognized: PeopleFrame) -> str:

@@ -20,7 +20,7 @@ from torchvision_dddas.io.output.track_tables import TrackTables
 from torchvision_dddas.io.overlay.detection_overlay import Overlay
 from torchvision_dddas.io.overlay.survey_overlay import Once, SurveyPictures
 from torchvision_dddas.io.report.run_story import REPORT, RunStory
-from torchvision_dddas.io.tables import Tables
+from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import FrameResult, Scene, TrackedFrame
 
 SAVED = ("overlay", *MAPS)
@@ -139,7 +139,7 @@ def _found(
     facts: Mapping[str, Any],
 ) -> tuple[RunStory, list[Sink[FrameResult]]]:
     """Tables of what was found and who is who, the overlay, and the log."""
-    sinks: list[Sink[FrameResult]] = [_Of(Tables(folder), _scene), _Of(TrackTables(folder), _followed)]
+    sinks: list[Sink[FrameResult]] = [_Of(detection_tables(folder), _scene), _Of(TrackTables(folder), _followed)]
     pictures = Once(SurveyPictures(size, names))
     if "overlay" in save:
         sinks.append(Overlay(folder, rate_hz, pictures))
