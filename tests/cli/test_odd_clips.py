@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.scene import render
+from tests.synthetic_clip import render
 
 CONFIGS = ("default", "fast", "source")
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from tests.cli.mistakes import bad
+from tests.synthetic_clip import render
 from torchvision_dddas.cli.prepared import prepared
 from torchvision_dddas.io.stream_capture import without_secrets
-from torchvision_dddas.simulation.scene import render
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.

@@ -11,11 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.cli.mistakes import bad
+from tests.synthetic_clip import render
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.studies import tried
 from torchvision_dddas.evaluation.studies.tried import Tried
-from torchvision_dddas.simulation.scene import render
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
 from torchvision_dddas.detection.engine import View, Window, load_engine
 from torchvision_dddas.detection.exposure import exposure, in_one_light, to_light_of
 from torchvision_dddas.geometry import corner_error
-from torchvision_dddas.simulation.scene import render
 
 SIZE = (320, 240)
 GAIN = [1.0, 1.15, 0.85, 0.85, 1.0, 1.15]

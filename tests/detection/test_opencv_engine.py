@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import flight, render
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import opencv_foreground as onboard_pixels
 from torchvision_dddas.detection import opencv_registration as onboard_registration
@@ -13,8 +14,6 @@ from torchvision_dddas.detection.keypoint_grid import cell_side
 from torchvision_dddas.detection.mask_cleaning import closed
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.geometry import corner_error, transfer
-from torchvision_dddas.simulation.camera import flight
-from torchvision_dddas.simulation.scene import render
 
 SIZE = (320, 240)
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import flight, render
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection import opencv_engine as onboard_vision
 from torchvision_dddas.detection import opencv_half as onboard_half
@@ -13,8 +14,6 @@ from torchvision_dddas.detection.detector import scenes
 from torchvision_dddas.detection.engine import Foreground, View
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.geometry import corner_error
-from torchvision_dddas.simulation.camera import flight
-from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.types import Frame
 
 SIZE = (320, 240)

@@ -8,11 +8,10 @@ import pytest
 
 pytest.importorskip("torch")
 
+from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
 from torchvision_dddas.detection.engine import Engine, View, Window, load_engine
 from torchvision_dddas.geometry import chain, corner_error
-from torchvision_dddas.simulation.camera import flight
-from torchvision_dddas.simulation.scene import RATE_HZ, render
 
 SIZES = [(320, 240), (251, 187)]
 FRAMES = 7

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import Loop, run, scenes
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.detection.windows import delay, reach
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.types import Frame, Scene, Telemetry
 
 SIZE = (240, 180)

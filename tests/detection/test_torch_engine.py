@@ -7,11 +7,11 @@ import pytest
 
 pytest.importorskip("torch")
 
+from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
 from torchvision_dddas.detection.engine import View, Window
 from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.geometry import corner_error
-from torchvision_dddas.simulation.scene import render
 
 SETTINGS = parameters.load_config()
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from torchvision_dddas.simulation.scene import render
+from tests.synthetic_clip import render
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the limits and signals of Linux")
 

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.geometry import chain, corner_error, transfer
-from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.tracking.camera_motion import Camera
 
 
@@ -99,7 +99,7 @@ def test_a_picture_that_shows_nothing_costs_no_motion(ground):
         now_from_before, cause = camera.step(np.zeros_like(image) if k == 4 else image)
         assert bool(cause) == (k == 4)
         moved = moved if now_from_before is None else now_from_before @ moved
-    assert corner_error(moved, np.array([[1, 0, -84.0], [0, 1, 0], [0, 0, 1]]), (640, 480)) < 1.0
+    assert corner_error(moved, np.array([[1, 0, -84.0], [0, 1, 0], [0, 0, 1]]), (640, 480)) < 1.5
 
 
 def test_a_cut_is_unknown_with_a_cause_and_the_next_step_is_known_again(ground):

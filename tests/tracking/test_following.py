@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
+from tests.synthetic_clip import LEAST_PX, render
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.simulation.scene import LEAST_PX, render
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene
 

@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.synthetic_clip import film_into
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
@@ -11,7 +12,6 @@ from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
-from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
 from torchvision_dddas.tuning.masks import Masks, masks_of, together
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.synthetic_clip import film_into
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
@@ -15,7 +16,6 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.geometry import transfer
-from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, Registering
