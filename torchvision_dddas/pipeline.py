@@ -4,14 +4,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import detector as run
 from torchvision_dddas.detection.engine import Engine
-from torchvision_dddas.geo import Locator, Targets, Watch, Watched, gathered, named
+from torchvision_dddas.geo import Locator, Targets, Watch, Watched, gathered
 from torchvision_dddas.tracking import sequence as following
-from torchvision_dddas.tracking.crowd_identity import RollCall
-from torchvision_dddas.types import FrameResult, Scene, Telemetry, TrackedFrame
+from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
+from torchvision_dddas.types import Fix, FrameResult, Scene, Telemetry, TrackedFrame
 
 if TYPE_CHECKING:
     from torchvision_dddas.control.mission_api import Mission
@@ -45,7 +47,7 @@ def survey(
     retune: as in run.run. pictures: as `following.Follower` has it.
     """
     waiting: dict[int, Watched] = {}
-    roll = RollCall() if settings.crowds.join_m else None
+    crowds = CrowdIdentities() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
         for scene in run.run(source, engine, settings, telemetry, retune=retune):
@@ -67,10 +69,20 @@ def survey(
             yield FrameResult(followed)
             continue
         past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
-        if roll is not None:
-            followed = named(followed, past[-1].look.fix, watch.locator, roll)
+        if crowds is not None:
+            followed = _with_crowd_identities(followed, past[-1].look.fix, watch.locator, crowds)
         surveyed = _located(followed, past, watch.locator)
         yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
+
+
+def _with_crowd_identities(followed: TrackedFrame, fix: Fix, locator: Locator, crowds: CrowdIdentities) -> TrackedFrame:
+    """A tracked frame with the identities that its crowds have on the ground. fix: how its picture lies there."""
+    tracks = followed.tracks
+    seen = tracks.row >= 0
+    box, middle = tracks.box_px[seen], followed.detections.middle_px[tracks.row[seen]]
+    middle = np.where(np.isfinite(middle), middle, box[:, :2] + (box[:, 2:] - 1) / 2)
+    place, radius = locator.places(fix, middle), locator.radii(fix, box)
+    return replace(followed, tracks=crowds.rename(tracks, locator.time_s(followed.number), place, radius))
 
 
 def _unpictured(watched: Watched) -> Watched:

@@ -2,7 +2,6 @@
 
 from torchvision_dddas.geo.aerial_locator import Locator, Targets
 from torchvision_dddas.geo.crowd_grouping import gathered
-from torchvision_dddas.geo.crowd_naming import named
 from torchvision_dddas.geo.landmark_watch import Watch, Watched, check_colours, unpictured
 from torchvision_dddas.geo.site import Site, camera_of, check_span, local, site_of, unknown_heights
 from torchvision_dddas.geo.table_location import check_table, locate
@@ -20,7 +19,6 @@ __all__ = [
     "gathered",
     "local",
     "locate",
-    "named",
     "site_of",
     "unknown_heights",
     "unpictured",

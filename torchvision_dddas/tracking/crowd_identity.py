@@ -1,190 +1,197 @@
-"""Who is who among crowds on the ground: where they meet and part again, each goes on as the one that it was.
+"""Identities of crowds on the ground, which last through meetings: when crowds meet and part, each keeps its identity.
 
-In the picture two crowds that meet are one blob, which is followed as one of them, and what is left when they part is a
-matter of chance. On the ground each is expected where it was going, and as large as it was: so those that share a blob
-are carried on, moved together with it, until there are as many blobs again.
+In the picture, two crowds that meet are one blob with one identity, and which of them keeps it when they part is a
+matter of chance. On the ground each crowd is predicted by its position, velocity and radius. Crowds that share a blob
+move with it until there are as many blobs again.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.types import Float, Int
+from torchvision_dddas.types import Float, Int, Tracks
 
-# A crowd is this far off where it is expected: at once, by its own radius, and for each second that it was not seen.
-_OFF_M, _OFF_SHARE, _OFF_M_S = 0.8, 0.2, 0.7
-# Further off than so many of these it is another one. What an e-fold of its size costs, and half a step up, at most.
-_GATE, _SIZE, _SIZE_MOST = 3.0, 0.8, 1.2
-# What it is worth to be followed in the picture as before.
-_FOLLOWED = 1.0
-# What is not seen is expected so long, and moves on for so long.
+# Standard deviation of a crowd's place: a constant, a share of its radius, and a part that grows while it is unseen.
+_SIGMA_M, _SIGMA_SHARE, _SIGMA_M_S = 0.8, 0.2, 0.7
+# Gate in these standard deviations; score lost for an e-fold change of radius, and at most.
+_GATE, _SIZE_PENALTY, _LARGEST_SIZE_PENALTY = 3.0, 0.8, 1.2
+# Score for the same identity in the picture as before.
+_SAME_TRACK_SCORE = 1.0
+# How long an unseen crowd is kept, and how long it is predicted to move on.
 _KEPT_S, _MOVES_S = 8.0, 3.0
-# What shares a blob is expected so long; and what was there for less when it came into the blob was a part of it.
+# How long a crowd may share a blob. One that was seen for less time before that was a part of the blob.
 _SHARED_S, _SHORT_S = 10.0, 1.5
-# What is as small, and no further from the rim of a crowd, is one of it for so long: it goes by no name.
-_PART_M, _BEHIND_M, _PART_S = 1.1, 4.5, 3.0
-# Of what is seen of a place, a velocity and a radius so much is believed: blobs swing about as parts are seen or not.
-_PLACE, _VELOCITY, _RADIUS = 0.5, 0.15, 0.2
-# And so much where several share it.
-_SHARED = 0.3
+# A blob of a smaller radius, this near to a larger crowd's edge, counts as a part of it for so long.
+_PART_RADIUS_M, _PART_GAP_M, _PART_S = 1.1, 4.5, 3.0
+# Gains of the filter. They are small because a blob's centre moves as parts of the crowd are hidden.
+_PLACE_GAIN, _VELOCITY_GAIN, _RADIUS_GAIN, _SHARED_GAIN = 0.5, 0.15, 0.2, 0.3
 _PART = -1
 
 
 @dataclass
-class _Known:
-    """A crowd. followed: the number under which it is followed in the picture. host: whose blob it shares, 0: none."""
+class _Crowd:
+    """track: its identity in the picture. host: the crowd whose blob it shares, 0 for none."""
 
-    number: int
-    place: np.ndarray
-    velocity: np.ndarray
-    radius: float
-    followed: int
+    identity: int
+    place_m: np.ndarray
+    velocity_m_s: np.ndarray
+    radius_m: float
+    track: int
     first_s: float
     seen_s: float
     host: int = 0
     shared_s: float = -np.inf
-    hosting: bool = False
+    is_host: bool = False
+
+    @property
+    def last_s(self) -> float:
+        """When it was last seen, alone or in a shared blob."""
+        return max(self.seen_s, self.shared_s)
 
 
-class RollCall:
-    """The crowds so far. Feed it frames in order."""
+class CrowdIdentities:
+    """The crowds of a run. Feed it frames in order."""
 
     def __init__(self) -> None:
-        self._known: list[_Known] = []
-        self._names: dict[int, int] = {}  # of what is followed in the picture
-        self._parts: dict[int, float] = {}  # since when those are seen who may have fallen behind
+        self._crowds: list[_Crowd] = []
+        self._identities: dict[int, int] = {}  # by identity in the picture
+        self._parts_since: dict[int, float] = {}  # when a possible part of a crowd was first seen, by track
         self._count = 0
         self._time_s = 0.0
 
-    def step(
+    def rename(
+        self, tracks: Tracks, time_s: float, place_m: Float[np.ndarray, "N 2"], radius_m: Float[np.ndarray, " N"]
+    ) -> Tracks:
+        """The tracks of a frame under their crowds' identities, sorted by them; parts of crowds are left out.
+
+        place_m, radius_m: of the N tracks with a detection, as for `update`. A box that bridges a gap keeps the
+        identity of its track.
+        """
+        seen = np.flatnonzero(tracks.row >= 0)
+        identity = np.zeros(len(tracks), np.int64)
+        identity[seen] = self.update(time_s, tracks.identity[seen], place_m, radius_m)
+        taken = set(identity[seen].tolist())
+        for row in np.flatnonzero(tracks.row < 0).tolist():
+            known = self._identities.get(int(tracks.identity[row]), 0)
+            if known not in taken:
+                identity[row] = known
+                taken.add(known)
+        rows = np.flatnonzero(identity > 0)
+        rows = rows[np.argsort(identity[rows], kind="stable")]
+        return replace(
+            tracks, identity=identity[rows], box_px=tracks.box_px[rows], score=tracks.score[rows], row=tracks.row[rows]
+        )
+
+    def update(
         self,
         time_s: float,
-        followed: Int[np.ndarray, " N"],
+        track: Int[np.ndarray, " N"],
         place_m: Float[np.ndarray, "N 2"],
         radius_m: Float[np.ndarray, " N"],
     ) -> Int[np.ndarray, " N"]:
-        """The identities of the targets of a frame, from 1, none twice; 0: as yet a part of another.
+        """Identities of a frame's blobs, from 1, each at most once; 0 for a blob that counts as a part of a crowd.
 
-        followed: as whom each is followed in the picture. place_m, radius_m: NaN where the picture lies nowhere; such a
-        one keeps the name that it had.
+        track: identity of each blob in the picture. place_m, radius_m: NaN where the picture could not be located;
+        such a blob keeps the identity of its track.
         """
-        lapse_s, self._time_s = time_s - self._time_s, time_s
-        self._move(lapse_s)
-        rows = np.flatnonzero(np.isfinite(place_m).all(axis=1) & np.isfinite(radius_m))
+        elapsed_s, self._time_s = time_s - self._time_s, time_s
+        for crowd in self._crowds:
+            if time_s - elapsed_s - crowd.last_s < _MOVES_S:
+                crowd.place_m = crowd.place_m + elapsed_s * crowd.velocity_m_s
+        located = np.flatnonzero(np.isfinite(place_m).all(axis=1) & np.isfinite(radius_m))
         radius_m = np.maximum(radius_m, 0.3)
-        names = np.zeros(len(followed), np.int64)
-        found = best_pairs(self._scores(followed[rows], place_m[rows], radius_m[rows]))
-        matched = {int(rows[column]): self._known[row] for row, column in found}
-        self._share(matched, place_m, radius_m)
-        for k in rows.tolist():
-            known = matched.get(k)
-            if known is None and self._part(int(followed[k]), place_m[k], float(radius_m[k])):
-                names[k] = _PART
+        pairs = best_pairs(self._scores(track[located], place_m[located], radius_m[located]))
+        matched = {int(located[column]): self._crowds[row] for row, column in pairs}
+        self._share_blobs(matched, place_m, radius_m)
+        identity = np.zeros(len(track), np.int64)
+        for k in located.tolist():
+            crowd, radius = matched.get(k), float(radius_m[k])
+            if crowd is not None:
+                self._correct(crowd, place_m[k], radius, int(track[k]), elapsed_s)
+            elif self._is_part(int(track[k]), place_m[k], radius):
+                identity[k] = _PART
                 continue
-            if known is None:
-                known = self._begin(place_m[k], float(radius_m[k]), int(followed[k]), time_s)
             else:
-                self._see(known, place_m[k], float(radius_m[k]), int(followed[k]), time_s, lapse_s)
-            names[k] = known.number
-        for k in np.flatnonzero(names == 0).tolist():
-            name = self._names.get(int(followed[k]), 0)
-            if not name or name in names:
-                name = self._next()
-            names[k] = name
-        names = np.maximum(names, 0)
-        self._names.update(zip(followed.tolist(), names.tolist(), strict=True))
-        self._forget()
-        return names
+                crowd = _Crowd(
+                    self._new_identity(), place_m[k].copy(), np.zeros(2), radius, int(track[k]), time_s, time_s
+                )
+                self._crowds.append(crowd)
+            identity[k] = crowd.identity
+        for k in np.flatnonzero(identity == 0).tolist():
+            known = self._identities.get(int(track[k]), 0)
+            identity[k] = known if known and known not in identity else self._new_identity()
+        identity = np.maximum(identity, 0)
+        self._identities.update(zip(track.tolist(), identity.tolist(), strict=True))
+        self._crowds = [crowd for crowd in self._crowds if time_s - crowd.last_s <= _KEPT_S]
+        return identity
 
-    def name(self, followed: int) -> int:
-        """The identity of what is followed in the picture, as it was last; 0: none."""
-        return self._names.get(followed, 0)
-
-    def _next(self) -> int:
+    def _new_identity(self) -> int:
         self._count += 1
         return self._count
 
-    def _begin(self, place: np.ndarray, radius: float, followed: int, time_s: float) -> _Known:
-        known = _Known(self._next(), place.copy(), np.zeros(2), radius, followed, time_s, time_s)
-        self._known.append(known)
-        return known
-
-    def _part(self, followed: int, place: np.ndarray, radius: float) -> bool:
-        """Whether what is seen for the first time may be somebody who has fallen behind a crowd."""
-        if self._time_s - self._parts.setdefault(followed, self._time_s) > _PART_S:
+    def _is_part(self, track: int, place_m: np.ndarray, radius_m: float) -> bool:
+        """Whether a new blob may be people who have fallen behind a crowd."""
+        if self._time_s - self._parts_since.setdefault(track, self._time_s) > _PART_S:
             return False
-        return radius < _PART_M and any(
-            known.radius > radius
-            and np.linalg.norm(known.place - place) - known.radius - radius < _BEHIND_M
-            and known.seen_s - known.first_s > _SHORT_S
-            for known in self._known
+        return radius_m < _PART_RADIUS_M and any(
+            crowd.radius_m > radius_m
+            and np.linalg.norm(crowd.place_m - place_m) - crowd.radius_m - radius_m < _PART_GAP_M
+            and crowd.seen_s - crowd.first_s > _SHORT_S
+            for crowd in self._crowds
         )
 
-    def _move(self, lapse_s: float) -> None:
-        """To where all are expected now."""
-        for known in self._known:
-            if self._time_s - lapse_s - max(known.seen_s, known.shared_s) < _MOVES_S:
-                known.place = known.place + lapse_s * known.velocity
-
-    def _scores(self, followed: np.ndarray, place_m: np.ndarray, radius_m: np.ndarray) -> np.ndarray:
-        """(K, N) how well each blob goes for each crowd; -inf: not at all."""
-        scores = np.full((len(self._known), len(place_m)), -np.inf)
-        for row, known in enumerate(self._known):
-            lost_s = self._time_s - max(known.seen_s, known.shared_s)
-            # The middle of a blob that holds more is off by as much as it is larger.
-            more = np.maximum(radius_m - known.radius, 0)
-            off = np.maximum(np.linalg.norm(place_m - known.place, axis=1) - more, 0)
-            off = off / (_OFF_M + _OFF_SHARE * known.radius + _OFF_M_S * min(lost_s, _MOVES_S))
-            size = np.minimum(_SIZE * np.abs(np.log(radius_m / known.radius)), _SIZE_MOST)
-            score = _GATE + _SIZE_MOST - off - size
-            if not known.host:
-                score = score + _FOLLOWED * (followed == known.followed)
+    def _scores(self, track: np.ndarray, place_m: np.ndarray, radius_m: np.ndarray) -> np.ndarray:
+        """(K, N) association scores of crowds and blobs; -inf outside the gate."""
+        scores = np.full((len(self._crowds), len(place_m)), -np.inf)
+        for row, crowd in enumerate(self._crowds):
+            unseen_s = self._time_s - crowd.last_s
+            # The centre of a blob that holds more than this crowd is off by as much as the blob is larger.
+            excess = np.maximum(radius_m - crowd.radius_m, 0)
+            off = np.maximum(np.linalg.norm(place_m - crowd.place_m, axis=1) - excess, 0)
+            off = off / (_SIGMA_M + _SIGMA_SHARE * crowd.radius_m + _SIGMA_M_S * min(unseen_s, _MOVES_S))
+            size = np.minimum(_SIZE_PENALTY * np.abs(np.log(radius_m / crowd.radius_m)), _LARGEST_SIZE_PENALTY)
+            score = _GATE + _LARGEST_SIZE_PENALTY - off - size
+            if not crowd.host:
+                score = score + _SAME_TRACK_SCORE * (track == crowd.track)
             scores[row] = np.where(off <= _GATE, score, -np.inf)
         return scores
 
-    def _share(self, matched: dict[int, _Known], place_m: np.ndarray, radius_m: np.ndarray) -> None:
-        """Find who is in whose blob, and move those who share one along with it."""
-        free = [known for known in self._known if all(known is not other for other in matched.values())]
-        for known in matched.values():
-            known.host, known.hosting = 0, False
-        for known in free:
+    def _share_blobs(self, matched: dict[int, _Crowd], place_m: np.ndarray, radius_m: np.ndarray) -> None:
+        """Find the crowds that share another's blob, and move them along with it."""
+        free = [crowd for crowd in self._crowds if all(crowd is not other for other in matched.values())]
+        for crowd in matched.values():
+            crowd.host, crowd.is_host = 0, False
+        for crowd in free:
             inside = [
-                (float(np.linalg.norm(place_m[k] - known.place)) - radius_m[k], k)
+                (float(np.linalg.norm(place_m[k] - crowd.place_m)) - radius_m[k], k)
                 for k in matched
-                if np.linalg.norm(place_m[k] - known.place) <= radius_m[k] + 0.5 * known.radius
+                if np.linalg.norm(place_m[k] - crowd.place_m) <= radius_m[k] + 0.5 * crowd.radius_m
             ]
-            fresh = self._time_s - max(known.seen_s, known.shared_s) < 1.0
-            if not inside or not fresh or self._time_s - known.seen_s > _SHARED_S:
-                known.host = 0
-                continue
-            _, k = min(inside)
-            if known.seen_s - known.first_s < _SHORT_S:
-                known.seen_s = known.shared_s = -np.inf  # a part of it
-                continue
-            known.host, known.shared_s = matched[k].number, self._time_s
-            matched[k].hosting = True
+            is_fresh = self._time_s - crowd.last_s < 1.0
+            if not inside or not is_fresh or self._time_s - crowd.seen_s > _SHARED_S:
+                crowd.host = 0
+            elif crowd.seen_s - crowd.first_s < _SHORT_S:
+                crowd.seen_s = crowd.shared_s = -np.inf  # it was a part of the blob: forget it
+            else:
+                host = matched[min(inside)[1]]
+                crowd.host, crowd.shared_s, host.is_host = host.identity, self._time_s, True
         for k, host in matched.items():
-            if not host.hosting:
+            if not host.is_host:
                 continue
-            group = [host, *(known for known in free if known.host == host.number)]
-            weight = np.array([known.radius**2 for known in group])
-            middle = np.average([known.place for known in group], axis=0, weights=weight)
-            for known in group:
-                known.place = known.place + _SHARED * (place_m[k] - middle)
+            group = [host, *(crowd for crowd in free if crowd.host == host.identity)]
+            weight = np.array([crowd.radius_m**2 for crowd in group])
+            middle = np.average([crowd.place_m for crowd in group], axis=0, weights=weight)
+            for crowd in group:
+                crowd.place_m = crowd.place_m + _SHARED_GAIN * (place_m[k] - middle)
 
-    def _see(
-        self, known: _Known, place: np.ndarray, radius: float, followed: int, time_s: float, lapse_s: float
-    ) -> None:
-        gap_s = max(time_s - known.seen_s, lapse_s, 1e-6)
-        known.seen_s, known.followed = time_s, followed
-        if known.hosting:
+    def _correct(self, crowd: _Crowd, place_m: np.ndarray, radius_m: float, track: int, elapsed_s: float) -> None:
+        gap_s = max(self._time_s - crowd.seen_s, elapsed_s, 1e-6)
+        crowd.seen_s, crowd.track = self._time_s, track
+        if crowd.is_host:
             return
-        off = place - known.place
-        known.place = known.place + _PLACE * off
-        young = time_s - known.first_s < _SHORT_S
-        known.velocity = known.velocity + (2 if young else 1) * _VELOCITY * off / max(gap_s, 0.2)
-        known.radius += _RADIUS * (radius - known.radius)
-
-    def _forget(self) -> None:
-        self._known = [known for known in self._known if self._time_s - max(known.seen_s, known.shared_s) <= _KEPT_S]
+        innovation = place_m - crowd.place_m
+        crowd.place_m = crowd.place_m + _PLACE_GAIN * innovation
+        is_young = self._time_s - crowd.first_s < _SHORT_S
+        crowd.velocity_m_s = crowd.velocity_m_s + (2 if is_young else 1) * _VELOCITY_GAIN * innovation / max(gap_s, 0.2)
+        crowd.radius_m += _RADIUS_GAIN * (radius_m - crowd.radius_m)
