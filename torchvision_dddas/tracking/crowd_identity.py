@@ -106,21 +106,19 @@ class CrowdIdentities:
         self._share_blobs(matched, place_m, radius_m)
         identity = np.zeros(len(track), np.int64)
         for k in located.tolist():
-            crowd, radius = matched.get(k), float(radius_m[k])
-            if crowd is not None:
-                self._correct(crowd, place_m[k], radius, int(track[k]), elapsed_s)
+            known, radius = matched.get(k), float(radius_m[k])
+            if known is not None:
+                self._correct(known, place_m[k], radius, int(track[k]), elapsed_s)
+                identity[k] = known.identity
             elif self._is_part(int(track[k]), place_m[k], radius):
                 identity[k] = _PART
-                continue
             else:
-                crowd = _Crowd(
-                    self._new_identity(), place_m[k].copy(), np.zeros(2), radius, int(track[k]), time_s, time_s
-                )
-                self._crowds.append(crowd)
-            identity[k] = crowd.identity
+                identity[k] = self._new_identity()
+                place, still = place_m[k].copy(), np.zeros(2)
+                self._crowds.append(_Crowd(int(identity[k]), place, still, radius, int(track[k]), time_s, time_s))
         for k in np.flatnonzero(identity == 0).tolist():
-            known = self._identities.get(int(track[k]), 0)
-            identity[k] = known if known and known not in identity else self._new_identity()
+            earlier = self._identities.get(int(track[k]), 0)
+            identity[k] = earlier if earlier and earlier not in identity else self._new_identity()
         identity = np.maximum(identity, 0)
         self._identities.update(zip(track.tolist(), identity.tolist(), strict=True))
         self._crowds = [crowd for crowd in self._crowds if time_s - crowd.last_s <= _KEPT_S]
