@@ -14,7 +14,7 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.synthetic_clip import render
-from torchvision_dddas.cli.prepared import prepared
+from torchvision_dddas.io.run_inputs import prepare_run
 from torchvision_dddas.io.stream_capture import without_secrets
 
 FRAMES = 14
@@ -60,9 +60,9 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
 
 def test_what_the_user_should_know_of_his_files_is_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
     def noting(*given):
-        return replace(prepared(*given), notes=["bravo has no colour"])
+        return replace(prepare_run(*given), notes=["bravo has no colour"])
 
-    monkeypatch.setattr("torchvision_dddas.cli.live.prepared", noting)
+    monkeypatch.setattr("torchvision_dddas.cli.live.prepare_run", noting)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert "dddas: note: bravo has no colour\n" in done.stderr

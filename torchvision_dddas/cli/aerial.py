@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,14 +10,13 @@ import typer
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate, check_rate
 from torchvision_dddas.cli.progress import progress
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.run_inputs import AerialInput, read_locator
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.geo import Locator
     from torchvision_dddas.io.output.location_output import GroundedJournal
     from torchvision_dddas.io.output.run_record import Record
-    from torchvision_dddas.types import Camera, Colours
 
 Marked = Annotated[
     Path, typer.Option("--landmarks", metavar="FILE", help="A CSV of landmarks: where they were, and where they show.")
@@ -75,36 +73,6 @@ def aerial(
             typer.echo(line)
 
 
-@dataclass(frozen=True)
-class AerialInput:
-    """The files beside the clip or the table."""
-
-    landmarks: Path
-    telemetry: Path | None = None
-    camera: Path | None = None
-    dem: Path | None = None
-    background: Path | None = None
-    colours: Path | None = None
-
-    @property
-    def files(self) -> list[Path]:
-        """All that are given."""
-        named = (self.landmarks, self.telemetry, self.camera, self.dem, self.background, self.colours)
-        return [file for file in named if file is not None]
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What run.json says of them."""
-        return {
-            "landmarks_file": self.landmarks,
-            "telemetry": self.telemetry,
-            "camera": self.camera,
-            "dem": self.dem,
-            "background": self.background,
-            "colours": self.colours,
-        }
-
-
 def aerial_into(
     folder: Path,
     table: Path,
@@ -135,7 +103,7 @@ def aerial_into(
         if source is not None:
             within_clip(read, source)
         size = source.size if source is not None else None
-        locator, notes = locator_for(
+        locator, notes = read_locator(
             given, settings, size, rate, backend, (read.first, read.last), "table", clip, extent=read.extent
         )
         check_table(read, locator)
@@ -159,63 +127,6 @@ def aerial_into(
                 output.write(grounded)
                 tick()
     return journal
-
-
-def locator_for(
-    given: AerialInput,
-    settings: "Settings",
-    size: tuple[int, int] | None,
-    rate_hz: float | None,
-    backend: str,
-    frames: tuple[int, int] | None,
-    what: str,
-    clip: str | None,
-    colours: "Colours | None" = None,
-    extent: tuple[float, float] | None = None,
-) -> "tuple[Locator, list[str]]":
-    """What lays pictures on the ground, from the files; and what the user should know of it.
-
-    size: (width, height) of the pictures, rate_hz, frames: numbers of the first and last; None where unknown.
-    what: whose frames these are. clip: the video, as for read_telemetry.
-    colours: where they tell where pictures show the landmarks, whatever the table says. extent: as for camera_of.
-    Raises InputError for bad input.
-    """
-    from dataclasses import replace
-
-    from torchvision_dddas.geo import Locator, camera_of, check_span, site_of, unknown_heights, unpictured
-    from torchvision_dddas.geo.solvers import load_solver
-    from torchvision_dddas.io.landmark_tables import read_landmarks
-    from torchvision_dddas.io.telemetry import read_telemetry
-
-    offset = settings.aerial.clock_offset_s
-    notes: list[str] = []
-    landmarks = read_landmarks(given.landmarks, rate_hz, offset)
-    telemetry = read_telemetry(given.telemetry, offset, clip) if given.telemetry is not None else None
-    if telemetry is not None:
-        if rate_hz is None:
-            raise InputError(
-                "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
-            )
-        if frames is not None and frames[1] > 0:
-            check_span(telemetry, (frames[0] - 1) / rate_hz, (frames[1] - 1) / rate_hz, what)
-        notes += telemetry.notes
-    if rate_hz is None:
-        notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
-    site = site_of(landmarks if colours is None else unpictured(landmarks), telemetry)
-    if given.dem is not None:
-        from torchvision_dddas.io.elevation import read_elevation
-
-        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
-    notes += unknown_heights(site)
-    camera, focal_known, more = camera_of(_camera(given), size, site.telemetry, settings, extent)
-    locator = Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
-    return locator, [*notes, *more]
-
-
-def _camera(given: AerialInput) -> "Camera | None":
-    from torchvision_dddas.io.camera_files import read_camera
-
-    return read_camera(given.camera) if given.camera is not None else None
 
 
 def about(locator: "Locator") -> dict[str, Any]:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from torchvision_dddas import __version__
 from torchvision_dddas.cli import live_words
-from torchvision_dddas.cli.aerial import AerialInput, about
+from torchvision_dddas.cli.aerial import about
 from torchvision_dddas.cli.live_path import path
 from torchvision_dddas.cli.mistakes import INTERRUPTED
-from torchvision_dddas.cli.prepared import Prepared, prepared
+from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, prepare_run
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import LiveParameters, Settings
@@ -60,7 +60,7 @@ def run_live(
         source = stack.enter_context(closing(LiveSource(clip, live, health, rate_hz=rate_hz)))
         if source.recorded is not None:
             check_length(source.recorded)
-        ready = prepared(given, telemetry, settings, source, backend, clip)
+        ready = prepare_run(given, telemetry, settings, source, backend, clip)
         begin = path(ready, source, people, interval, backend, health)
         said, opened = _about(ready), stack.enter_context(ExitStack())
         streams = _opened(opened, emit, said, health, live, "--emit")
@@ -111,7 +111,7 @@ def _health() -> "Health":
     return health
 
 
-def _about(ready: Prepared) -> "About":
+def _about(ready: PreparedRun) -> "About":
     """What streams need to know; the clock's time follows the source."""
     from torchvision_dddas.io.streams import About
 
@@ -160,7 +160,7 @@ def _kept(
 
 def _facts(
     clip: str,
-    ready: Prepared,
+    ready: PreparedRun,
     given: AerialInput | None,
     telemetry: Path | None,
     source: "LiveSource",

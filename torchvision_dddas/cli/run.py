@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.aerial import (
-    AerialInput,
     Background,
     Flown,
     Heights,
@@ -20,9 +19,9 @@ from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mission import SIMULATED, fly
 from torchvision_dddas.cli.mistakes import explained
 from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
-from torchvision_dddas.cli.prepared import prepared
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.run_inputs import AerialInput, prepare_run
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
@@ -163,7 +162,7 @@ def run_into(
         from torchvision_dddas.pipeline import survey
 
         source = open_source(clip, rate_hz=rate_hz)
-        ready = prepared(given, telemetry, settings, source, backend, clip)
+        ready = prepare_run(given, telemetry, settings, source, backend, clip)
         settings, engine, watch, notes = ready.settings, ready.engine, ready.watch, ready.notes
         facts: dict[str, Any] = {
             "input": clip,

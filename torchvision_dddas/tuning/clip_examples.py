@@ -24,7 +24,7 @@ from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.types import AerialLocations
 
 if TYPE_CHECKING:
-    from torchvision_dddas.cli.aerial import AerialInput
+    from torchvision_dddas.io.run_inputs import AerialInput
     from torchvision_dddas.types import DetectionTable
 
 PROBE = 2.0
@@ -119,19 +119,19 @@ def _true_m(clip: Clip, places: Positions, origin: tuple[float, float] | None) -
 
 
 def _given(clip: Clip) -> "AerialInput":
-    from torchvision_dddas.cli.aerial import AerialInput
+    from torchvision_dddas.io.run_inputs import AerialInput
 
     assert clip.landmarks is not None, "asked for clips with landmarks alone"
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
 def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
-    from torchvision_dddas.cli.prepared import prepared
     from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.io.run_inputs import prepare_run
     from torchvision_dddas.pipeline import survey
 
     source = opened(clip)
-    ready = prepared(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
+    ready = prepare_run(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
     assert ready.watch is not None, "there are landmarks"
     for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, pictures=False):
         grounded = surveyed.grounded
@@ -143,15 +143,15 @@ def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locat
 
 
 def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
-    from torchvision_dddas.cli.aerial import locator_for
     from torchvision_dddas.geo import check_table, locate
     from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.run_inputs import read_locator
 
     if clip.given is None:
         raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
     table: DetectionTable = read_detections(clip.given)
     span = (table.first, table.last)
-    locator, _ = locator_for(
+    locator, _ = read_locator(
         _given(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
     )
     check_table(table, locator)

@@ -11,7 +11,7 @@ from torchvision_dddas.evaluation.studies.rows import Rows, Tick, written
 from torchvision_dddas.types import AerialLocations, Positions
 
 if TYPE_CHECKING:
-    from torchvision_dddas.cli.aerial import AerialInput
+    from torchvision_dddas.io.run_inputs import AerialInput
 
 
 def location(clip: Clip, settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
@@ -24,19 +24,19 @@ def location(clip: Clip, settings: Settings, backend: str, interval: int, tick: 
 
 
 def _given(clip: Clip) -> "AerialInput":
-    from torchvision_dddas.cli.aerial import AerialInput
+    from torchvision_dddas.io.run_inputs import AerialInput
 
     assert clip.landmarks is not None, "location() asks for it"
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
 def _along(clip: Clip, settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
-    from torchvision_dddas.cli.prepared import prepared
     from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.io.run_inputs import prepare_run
     from torchvision_dddas.pipeline import survey
 
     source, rows = opened(clip), Rows()
-    ready = prepared(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
+    ready = prepare_run(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
     for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, interval, pictures=False):
         tracks, grounded = surveyed.followed.tracks, surveyed.grounded
         seen = tracks.row >= 0
@@ -49,15 +49,15 @@ def _along(clip: Clip, settings: Settings, backend: str, interval: int, tick: Ti
 
 
 def _of_table(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
-    from torchvision_dddas.cli.aerial import locator_for
     from torchvision_dddas.geo import check_table, locate
     from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.run_inputs import read_locator
 
     if clip.given is None:
         raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
     rows, table = Rows(), read_detections(clip.given)
     span = (table.first, table.last)
-    locator, notes = locator_for(
+    locator, notes = read_locator(
         _given(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
     )
     check_table(table, locator)

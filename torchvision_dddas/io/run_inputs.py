@@ -1,0 +1,148 @@
+"""The files that `dddas run` and `dddas locate` take beside the pictures, read and checked before the first picture."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.detection.engine import Engine, load_engine
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import (
+    Locator,
+    Watch,
+    camera_of,
+    check_colours,
+    check_span,
+    site_of,
+    unknown_heights,
+    unpictured,
+)
+from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.io.elevation import read_elevation
+from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.sources import Source
+from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.types import Colours, Telemetry
+
+
+@dataclass(frozen=True)
+class AerialInput:
+    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as the options of `dddas locate`."""
+
+    landmarks: Path
+    telemetry: Path | None = None
+    camera: Path | None = None
+    dem: Path | None = None
+    background: Path | None = None
+    colours: Path | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """All that are given."""
+        return [file for file in vars(self).values() if file is not None]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What run.json says of them."""
+        facts = dict(vars(self))
+        return {"landmarks_file": facts.pop("landmarks"), **facts}
+
+
+@dataclass(frozen=True)
+class PreparedRun:
+    """What a run needs beside the pictures.
+
+    settings: with the camera's focal length, where that is known. watch: None if nothing is located. flight: None
+    without telemetry. notes: what the user should know.
+    """
+
+    settings: Settings
+    engine: Engine
+    watch: Watch | None
+    flight: Telemetry | None
+    notes: list[str]
+
+
+def prepare_run(
+    given: AerialInput | None,
+    telemetry: Path | None,
+    settings: Settings,
+    source: Source,
+    backend: str,
+    clip: str,
+) -> PreparedRun:
+    """Read the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
+    watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
+    flight = None
+    if watch is not None:
+        flight = watch.locator.site.telemetry
+        settings, more = _with_focal_length(settings, watch.locator)
+        notes += more
+    elif telemetry is not None:
+        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
+    return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
+
+
+def read_locator(
+    given: AerialInput,
+    settings: Settings,
+    size: tuple[int, int] | None,
+    rate_hz: float | None,
+    backend: str,
+    frames: tuple[int, int] | None,
+    what: str,
+    clip: str | None,
+    colours: Colours | None = None,
+    extent: tuple[float, float] | None = None,
+) -> tuple[Locator, list[str]]:
+    """Make the aerial locator from the files; also the notes that the user should read.
+
+    size: (width, height) of the pictures; rate_hz; frames: numbers of the first and last; each None if unknown.
+    what: whose frames these are, for messages. clip: the video, as for `read_telemetry`. colours: if given, they find
+    the landmarks in the pictures, whatever the table says. extent: as for `camera_of`. Raises InputError for bad input.
+    """
+    offset = settings.aerial.clock_offset_s
+    notes: list[str] = []
+    landmarks = read_landmarks(given.landmarks, rate_hz, offset)
+    telemetry = read_telemetry(given.telemetry, offset, clip) if given.telemetry is not None else None
+    if telemetry is not None:
+        if rate_hz is None:
+            raise InputError(
+                "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
+            )
+        if frames is not None and frames[1] > 0:
+            check_span(telemetry, (frames[0] - 1) / rate_hz, (frames[1] - 1) / rate_hz, what)
+        notes += telemetry.notes
+    if rate_hz is None:
+        notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
+    site = site_of(landmarks if colours is None else unpictured(landmarks), telemetry)
+    if given.dem is not None:
+        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
+    notes += unknown_heights(site)
+    known = read_camera(given.camera) if given.camera is not None else None
+    camera, focal_known, more = camera_of(known, size, site.telemetry, settings, extent)
+    return Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known), [*notes, *more]
+
+
+def _watch(given: AerialInput, settings: Settings, source: Source, backend: str) -> tuple[Watch, list[str]]:
+    colours = read_colours(given.colours) if given.colours is not None else None
+    frames = None if source.count is None else (1, source.count)
+    locator, notes = read_locator(
+        given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
+    )
+    helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
+    check_colours(locator.site.landmarks, colours, helped)
+    if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
+        notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
+    return Watch(locator, colours, load_colours(backend) if colours is not None else None), notes
+
+
+def _with_focal_length(settings: Settings, locator: Locator) -> tuple[Settings, list[str]]:
+    """Take the camera's own focal length if telemetry gives the size of targets, unless another is set."""
+    focal = locator.camera.focal_px[0]
+    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
+        return settings, []
+    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]
