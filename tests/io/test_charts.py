@@ -1,4 +1,4 @@
-"""Plots as SVG, and tables: what is drawn is where it belongs, whatever the values."""
+"""Charts and tables of the report kit."""
 
 import math
 import re
@@ -6,10 +6,22 @@ import re
 import numpy as np
 import pytest
 
-from tests.io.test_report import Page
-from torchvision_dddas.io.report.charts import MOST_POINTS, WIDE, Axis, Dots, Line, chart
-from torchvision_dddas.io.report.interval_plot import MOST_ROWS, Interval, interval_plot
-from torchvision_dddas.io.report.page_tables import Column, figure, number, sorted_table, words
+from tests.pages import Page, points_inside
+from torchvision_dddas.io.report import (
+    MOST_ROWS,
+    Axis,
+    Column,
+    Dots,
+    Interval,
+    Line,
+    chart,
+    format_number,
+    interval_chart,
+    number_cell,
+    table,
+    text_cell,
+)
+from torchvision_dddas.io.report.charts import MOST_POINTS, WIDTH
 
 NAN = math.nan
 KINDS = {
@@ -26,27 +38,16 @@ KINDS = {
 }
 
 
-def inside(drawn):
-    """All places of a plot, which must lie in its frame."""
-    page = Page(drawn)
-    assert page.found.count("svg") == 1 and "nan" not in drawn and "inf" not in drawn
-    (box,) = [value for tag, name, value in page.attributes if (tag, name) == ("svg", "viewbox")]
-    wide, high = (float(v) for v in box.split()[2:])
-    places = re.findall(r"[ML](-?[\d.]+)[ ,](-?[\d.]+)", drawn)
-    places += re.findall(r'cx="(-?[\d.]+)" cy="(-?[\d.]+)"', drawn)
-    for x, y in places:
-        assert 0 <= float(x) <= wide and 0 <= float(y) <= high
-    return [(float(x), float(y)) for x, y in places]
-
-
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize("equal", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_whatever_the_values_a_plot_is_whole_and_inside_its_frame(kind, log, equal):
     x, y = (np.array(values, float) for values in KINDS[kind])
     across = Axis("x <m>", log=log and not equal)
-    inside(chart("a & b", across, Axis("y"), [Line("l", x, y), Line("s", x, y, 2, steps=True)], equal=equal))
-    inside(chart("dots", across, Axis("y"), dots=[Dots("<d>", x, y, sign="cross"), Dots("e", x, y)], equal=equal))
+    points_inside(chart("a & b", across, Axis("y"), [Line("l", x, y), Line("s", x, y, 2, steps=True)], equal=equal))
+    points_inside(
+        chart("dots", across, Axis("y"), dots=[Dots("<d>", x, y, sign="cross"), Dots("e", x, y)], equal=equal)
+    )
 
 
 def test_a_curve_goes_up_where_its_values_do_and_breaks_where_they_are_unknown():
@@ -62,7 +63,7 @@ def test_a_long_curve_keeps_its_ends_and_few_points():
     x = np.arange(100_000.0)
     drawn = chart("t", Axis("x"), Axis("y"), [Line("", x, x)])
     assert len(drawn) < 30 * MOST_POINTS
-    places = [place for place in inside(drawn) if place[0] > 60]
+    places = [place for place in points_inside(drawn) if place[0] > 60]
     assert max(places)[0] == pytest.approx(max(x for x, _ in places))
 
 
@@ -77,8 +78,8 @@ def test_on_a_map_a_metre_is_as_long_in_both_directions():
 
 def test_each_clip_of_an_interval_plot_stands_with_its_ends_and_its_words():
     rows = [Interval("low <b>", 0.2, 0.1, 0.4), Interval("high", 0.9), Interval("unknown", NAN)]
-    drawn = interval_plot("F", rows, Interval("pooled", 0.5, 0.4, 0.6))
-    inside(drawn)
+    drawn = interval_chart("F", rows, Interval("pooled", 0.5, 0.4, 0.6))
+    points_inside(drawn)
     assert "low &lt;b&gt; 0.200, 95 %: 0.100 to 0.400" in drawn and "high 0.900</title>" in drawn
     assert "unknown" not in drawn and "pooled 0.500" in drawn
     lefts = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', drawn)]
@@ -88,12 +89,12 @@ def test_each_clip_of_an_interval_plot_stands_with_its_ends_and_its_words():
 @pytest.mark.parametrize("values", [[0.0], [5.5, 1e6], [-0.7, 0.2], [1e-7]])
 def test_an_interval_plot_holds_values_beyond_its_span(values):
     rows = [Interval(f"clip {k}", value, value - 1, value + 1) for k, value in enumerate(values)]
-    assert all(x <= WIDE for x, _ in inside(interval_plot("m", rows, rows[0], (0.0, 0.0))))
+    assert all(x <= WIDTH for x, _ in points_inside(interval_chart("m", rows, rows[0], (0.0, 0.0))))
 
 
 def test_an_interval_plot_of_many_clips_is_bounded():
     rows = [Interval(f"clip {k}", 0.5) for k in range(500)]
-    assert interval_plot("F", rows).count("<circle") == MOST_ROWS
+    assert interval_chart("F", rows).count("<circle") == MOST_ROWS
 
 
 @pytest.mark.parametrize(
@@ -110,13 +111,15 @@ def test_an_interval_plot_of_many_clips_is_bounded():
     ],
 )
 def test_a_number_is_written_for_a_reader(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 def test_a_table_keeps_what_it_sorts_by_to_the_last_digit_and_escapes_its_words():
     value = 0.1 + 0.2
     columns = [Column("<clip>", text=True), Column("F", 'a "mean"')]
-    text = sorted_table("c", columns, [[words("<i>x</i>"), figure(value, 3, (0.2, 0.4))], [words("y"), figure(NAN)]])
+    text = table(
+        "c", columns, [[text_cell("<i>x</i>"), number_cell(value, 3, (0.2, 0.4))], [text_cell("y"), number_cell(NAN)]]
+    )
     page = Page(text)
     kept = [value for tag, name, value in page.attributes if (tag, name) == ("td", "data-v")]
     assert kept == [repr(value), ""] and "i" not in page.found
@@ -124,5 +127,5 @@ def test_a_table_keeps_what_it_sorts_by_to_the_last_digit_and_escapes_its_words(
 
 
 def test_a_table_of_one_row_offers_no_sorting():
-    text = sorted_table("c", [Column("clip"), Column("F")], [[words("x"), figure(1.0)]])
+    text = table("c", [Column("clip"), Column("F")], [[text_cell("x"), number_cell(1.0)]])
     assert "button" not in Page(text).found

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.browser import Browser, chromium
-from tests.io.test_report import Page
+from tests.browser import evaluate, needs_browser
+from tests.pages import Page
 from torchvision_dddas.evaluation.comparison_report import comparison_report
 
 
@@ -59,16 +59,12 @@ def test_studies_that_are_the_same_have_a_page():
     assert "1 the same" in said(comparison_report(comparison({})))
 
 
-@pytest.mark.skipif(chromium() is None, reason="no Chromium on this machine: apt-get install chromium")
+@pytest.mark.browser
+@needs_browser
 def test_in_a_browser_it_fits_a_phone_and_its_rows_sort(tmp_path):
-    path = tmp_path / "compare.html"
-    path.write_text(comparison_report(comparison(CLIPS)), encoding="utf-8")
-    with Browser(tmp_path / "profile") as browser:
-        browser.open(path, 390, 844, dark=True)
-        assert browser.value("document.documentElement.scrollWidth") <= 390
-        browser.click("[aria-label='clip by clip'] thead th:nth-child(5) button")
-        rows = (
-            "Array.from(document.querySelectorAll(\"table[aria-label='clip by clip'] tbody th\")).map(e=>e.textContent)"
-        )
-        assert browser.value(rows) == ["down", "quiet", "up <i>"]
-        assert [what for what in browser.told if what[0] in ("console", "thrown", "log")] == []
+    script = """var table=page.querySelector("table[aria-label='clip by clip']");
+      table.querySelectorAll("thead button")[4].click();
+      var names=Array.from(table.querySelectorAll("tbody th")).map(e=>e.textContent);
+      return [page.documentElement.scrollWidth, names];"""
+    width, rows = evaluate(comparison_report(comparison(CLIPS)), script, tmp_path, 390, dark=True)
+    assert width <= 390 and rows == ["down", "quiet", "up <i>"]

@@ -39,7 +39,7 @@ def test_few_are_kept_however_long_the_run_and_they_are_spread_over_it(count):
 
 def test_frames_at_which_something_happened_are_among_them():
     kept, _ = run(1000, {137: "join", 611: "split"})
-    chosen = {taken.number: taken.words for taken in kept.chosen()}
+    chosen = {taken.number: taken.text for taken in kept.chosen()}
     assert chosen[137] == "join" and chosen[611] == "split"
     assert len(chosen) == MOST
 
@@ -53,7 +53,7 @@ def test_where_too_much_happened_what_matters_is_shown():
     little = {number: {f"k{number}": 1.0} for number in range(10, 400, 10)}
     kept, _ = run(400, {**little, 205: {"join": 50.0}})
     chosen = kept.chosen()
-    assert len(chosen) <= MOST and "join" in [taken.words for taken in chosen]
+    assert len(chosen) <= MOST and "join" in [taken.text for taken in chosen]
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (480, 4000), (31, 17)])

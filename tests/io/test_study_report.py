@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.io.studied import FRAMES, HOSTILE, SIZE, boxed_truth, found, masked_clip, scored, study, tracked_clip
-from tests.io.test_report import Page
+from tests.pages import Page
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.report import report

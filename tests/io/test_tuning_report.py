@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from tests.browser import Browser, chromium
+from tests.browser import evaluate, needs_browser
 from tests.io.test_comparison_report import CLIPS, comparison
-from tests.io.test_report import Page
+from tests.pages import Page
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.tuning.report import tuning_report
 
@@ -122,13 +122,10 @@ def test_words_of_the_user_are_no_markup_and_no_host_is_asked():
     assert "http" not in text
 
 
-@pytest.mark.skipif(chromium() is None, reason="no Chromium on this machine")
+@pytest.mark.browser
+@needs_browser
 def test_on_a_phone_nothing_hangs_over_the_edge(tmp_path):
-    path = tmp_path / "report.html"
-    path.write_text(tuning_report(record()), encoding="utf-8")
-    with Browser(tmp_path / "profile") as browser:
-        browser.open(path, 390, 844)
-        assert browser.value("document.documentElement.scrollWidth") <= 390
+    assert evaluate(tuning_report(record()), "return page.documentElement.scrollWidth;", tmp_path, 390) <= 390
 
 
 def test_the_page_says_what_was_watched() -> None:

@@ -6,9 +6,18 @@ from html import escape
 from typing import Any
 
 from torchvision_dddas.evaluation.report.words import GROUPS, TITLES, measure
-from torchvision_dddas.io.report.interval_plot import MOST_ROWS, Interval, interval_plot
-from torchvision_dddas.io.report.page import SCRIPT, page
-from torchvision_dddas.io.report.page_tables import Cell, Column, figure, number, sorted_table, words
+from torchvision_dddas.io.report import (
+    MOST_ROWS,
+    Cell,
+    Column,
+    Interval,
+    format_number,
+    interval_chart,
+    number_cell,
+    render_page,
+    table,
+    text_cell,
+)
 
 MEANING = (
     "Better and worse are beyond noise: p below 0.05 after Holm's correction for all that is asked here. "
@@ -30,7 +39,7 @@ def comparison_report(found: Mapping[str, Any]) -> str:
         parts.append(f"<details open><summary>Not compared ({len(found['notes'])})</summary><ul>{items}</ul></details>")
     for task, mine in found["tasks"].items():
         parts += compared(task, TITLES.get(task, task), mine, first, second)
-    return page(title, parts, script=SCRIPT)
+    return render_page("page.html", title=title, parts=parts)
 
 
 def _card(task: str, mine: Mapping[str, Any]) -> str:
@@ -62,9 +71,9 @@ def compared(anchor: str, title: str, mine: Mapping[str, Any], first: str, secon
         for group, name, entry in _rows(mine["pooled"])
     ]
     columns = [*_columns("measure", first, second), Column("p, clips"), Column("p, frames"), Column("says", text=True)]
-    parts += ["<h3>All clips together</h3>", sorted_table("all clips together", columns, rows)]
+    parts += ["<h3>All clips together</h3>", table("all clips together", columns, rows)]
     of_clips = [
-        [words(clip), *_row(_title(group, name), name, entry, ("over_frames",))]
+        [text_cell(clip), *_row(_title(group, name), name, entry, ("over_frames",))]
         for clip, groups in mine["clips"].items()
         for group, name, entry in _rows(groups)
     ]
@@ -75,7 +84,7 @@ def compared(anchor: str, title: str, mine: Mapping[str, Any], first: str, secon
             Column("p"),
             Column("says", text=True),
         ]
-        parts += ["<h3>Clip by clip</h3>", sorted_table("clip by clip", columns, of_clips)]
+        parts += ["<h3>Clip by clip</h3>", table("clip by clip", columns, of_clips)]
     if mine["same"]:
         parts.append(f'<p class="note">The same in both to the last digit: {escape(", ".join(mine["same"]))}.</p>')
     return parts
@@ -94,7 +103,7 @@ def _plots(clips: Mapping[str, Mapping[str, Any]], same: Sequence[str]) -> list[
         left = len(rows) - MOST_ROWS
         ends = [abs(v) for row in rows for v in (row.value, row.low, row.high) if math.isfinite(v)]
         reach = max(ends) or 1.0
-        svg = interval_plot(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
+        svg = interval_chart(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
         note = f"<figcaption>{left} more in the table</figcaption>" if left > 0 else ""
         plots.append(f"<figure>{svg}{note}</figure>")
     return plots
@@ -107,13 +116,13 @@ def _columns(what: str, first: str, second: str) -> list[Column]:
 def _row(title: str, name: str, entry: Entry, ways: Sequence[str]) -> list[Cell]:
     digits = measure(name).digits
     low, high = _change(entry)[1:]
-    cells = [words(title), figure(entry["first"], digits), figure(entry["second"], digits)]
-    small = f"{number(low, digits)} to {number(high, digits)}" if math.isfinite(low) and math.isfinite(high) else ""
+    cells = [text_cell(title), number_cell(entry["first"], digits), number_cell(entry["second"], digits)]
+    small = number_cell(entry["change"], digits, (low, high)).small
     cells.append(Cell(_signed(entry, name), entry["change"], small))
     for way in ways:
         told = entry.get(way)
-        cells.append(figure(None if told is None else told["p_holm"]))
-    return [*cells, words(str(entry["says"]))]
+        cells.append(number_cell(None if told is None else told["p_holm"]))
+    return [*cells, text_cell(str(entry["says"]))]
 
 
 def _rows(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
@@ -131,12 +140,12 @@ def _change(entry: Entry) -> tuple[float, float, float]:
 
 def _signed(entry: Entry, name: str) -> str:
     change = entry["change"]
-    text = number(math.nan if change is None else change, measure(name).digits)
+    text = format_number(math.nan if change is None else change, measure(name).digits)
     return f"+{text}" if change and change > 0 else text
 
 
 def _value(value: float | None, name: str) -> str:
-    return number(math.nan if value is None else value, measure(name).digits)
+    return format_number(math.nan if value is None else value, measure(name).digits)
 
 
 def _title(group: str, name: str) -> str:

@@ -9,9 +9,19 @@ import numpy as np
 
 from torchvision_dddas.evaluation.comparison_report import MEANING, compared
 from torchvision_dddas.evaluation.report.words import GROUPS, measure
-from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
-from torchvision_dddas.io.report.page import SCRIPT, page
-from torchvision_dddas.io.report.page_tables import Cell, Column, figure, number, sorted_table, words
+from torchvision_dddas.io.report import (
+    Axis,
+    Cell,
+    Column,
+    Dots,
+    Line,
+    chart,
+    format_number,
+    number_cell,
+    render_page,
+    table,
+    text_cell,
+)
 
 SIDES = {"tuned": "Clips tuned on", "held_out": "Clips held out"}
 
@@ -35,7 +45,7 @@ def tuning_report(told: Mapping[str, Any]) -> str:
         for side, heading in SIDES.items():
             parts += _side(side, heading, verdict)
         parts.append(f'<p class="soft">{MEANING} All figures here are of hard operations.</p>')
-    return page(title, parts, script=SCRIPT)
+    return render_page("page.html", title=title, parts=parts)
 
 
 def _cards(told: Mapping[str, Any], verdict: Mapping[str, Any] | None) -> list[str]:
@@ -50,7 +60,7 @@ def _cards(told: Mapping[str, Any], verdict: Mapping[str, Any] | None) -> list[s
         cards.append(f'<section class="card"><h3><a href="#{side}">{heading}</a></h3>{inner}</section>')
     steps = told["history"][-1]["step"] if told["history"] else 0
     # Of a run that was taken up, the steps that it took itself.
-    pace = f"{number(told['seconds']['descent'] / told['taken'], 2)} s a step, " if told["taken"] else ""
+    pace = f"{format_number(told['seconds']['descent'] / told['taken'], 2)} s a step, " if told["taken"] else ""
     cards.append(
         '<section class="card"><h3>Descent</h3>'
         f'<div class="big">{steps} <span>steps, the best state after step {told["best"]}</span></div>'
@@ -68,8 +78,8 @@ def _gain(name: str, side: Mapping[str, Any]) -> str:
     if before is None or after is None:
         return f"<p>no {escape(measure(short).name)} before and after</p>"
     parts.append(
-        f'<div class="big">{number(after, digits)} <span>{escape(measure(short).name)}, '
-        f"{escape(GROUPS.get(group, group))}, all together; before {number(before, digits)}</span></div>"
+        f'<div class="big">{format_number(after, digits)} <span>{escape(measure(short).name)}, '
+        f"{escape(GROUPS.get(group, group))}, all together; before {format_number(before, digits)}</span></div>"
     )
     tasks = list(((side["changes"] or {}).get("tasks") or {}).values())
     entry = tasks[0]["pooled"].get(group, {}).get(short) if tasks else None
@@ -79,11 +89,11 @@ def _gain(name: str, side: Mapping[str, Any]) -> str:
     parts.append(f"<p>{_signed(after - before, digits)}{interval}: <b>{escape(side['says'])}</b></p>")
     mean = side["mean"]
     if mean["before"] is not None and mean["after"] is not None and len(side["clips"]) > 1:
-        means = [number(mean[when], digits) for when in ("before", "after")]
+        means = [format_number(mean[when], digits) for when in ("before", "after")]
         parts.append(f"<p>mean of {len(side['clips'])} clips: {means[0]} → {means[1]}</p>")
     took = side["frame_ms"]
     if took["before"] is not None and took["after"] is not None:
-        parts.append(f"<p>{number(took['before'], 1)} → {number(took['after'], 1)} ms a frame</p>")
+        parts.append(f"<p>{format_number(took['before'], 1)} → {format_number(took['after'], 1)} ms a frame</p>")
     return "".join(parts)
 
 
@@ -159,32 +169,33 @@ def _parameters(parameters: Mapping[str, Mapping[str, Any]]) -> str:
         first = Cell(f"{before:g}".replace("-", "−"), before)
         rows.append(
             [
-                words(name),
+                text_cell(name),
                 first,
                 value,
-                figure(times, 2),
-                *map(words, (parameter["unit"], parameter["range"], text + parameter["meaning"])),
+                number_cell(times, 2),
+                *map(text_cell, (parameter["unit"], parameter["range"], text + parameter["meaning"])),
             ]
         )
-    return sorted_table("knobs before and after", columns, rows)
+    return table("knobs before and after", columns, rows)
 
 
 def _cost(cost: Mapping[str, Any]) -> list[str]:
     """What a frame is expected to take, and what was measured of each parameter."""
     before, after = 1000 * cost["seconds"], 1000 * cost["expected"]
     said = (
-        f"A frame of twice the time costs as much as a loss of {cost['weight']:g}. Expected: {number(before, 1)} → "
-        f"{number(after, 1)} ms a frame."
+        f"A frame of twice the time costs as much as a loss of {cost['weight']:g}. Expected: "
+        f"{format_number(before, 1)} → {format_number(after, 1)} ms a frame."
     )
     if not cost["curves"]:
         said += " No parameter changed the time by more than repeats differ."
-    rows = [
-        [words(curve["knob"]), *(words(", ".join(f"{v:.3g}" for v in curve[part])) for part in ("values", "times"))]
+    listed = [
+        (curve["knob"], *(", ".join(f"{v:.3g}" for v in curve[part]) for part in ("values", "times")))
         for curve in cost["curves"]
     ]
+    rows = [[text_cell(text) for text in row] for row in listed]
     parts = ["<h3>What time costs</h3>", f"<p>{said}</p>"]
     columns = [Column("knob", text=True), Column("values", text=True), Column("times as long", text=True)]
-    return [*parts, sorted_table("time by knob", columns, rows)] if rows else parts
+    return [*parts, table("time by knob", columns, rows)] if rows else parts
 
 
 def _side(side: str, heading: str, verdict: Mapping[str, Any]) -> list[str]:
@@ -207,5 +218,5 @@ def _side(side: str, heading: str, verdict: Mapping[str, Any]) -> list[str]:
 
 
 def _signed(value: float, digits: int) -> str:
-    text = number(value, digits)
+    text = format_number(value, digits)
     return f"+{text}" if value > 0 and not text.startswith("−") else text

@@ -9,7 +9,7 @@ from torchvision_dddas.evaluation.report.figures import Told
 from torchvision_dddas.evaluation.report.measures import groups_of, shown
 from torchvision_dddas.evaluation.report.words import GROUPS, HEADLINES, TITLES, measure
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.io.report.page_tables import number
+from torchvision_dddas.io.report import format_number
 
 
 def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
@@ -30,10 +30,10 @@ def card(task: Task, told: Told, costs: Sequence[Cost], left_out: int) -> str:
                 if metres
                 else f"{known.name}, {GROUPS.get(group, group)}"
             )
-            big = f"{number(whole.value, known.digits)} <span{meaning}>{escape(what)}</span>"
+            big = f"{format_number(whole.value, known.digits)} <span{meaning}>{escape(what)}</span>"
             parts.append(f'<div class="big">{big}</div>')
             if math.isfinite(whole.low) and math.isfinite(whole.high):
-                ends = f"{number(whole.low, known.digits)} to {number(whole.high, known.digits)}"
+                ends = f"{format_number(whole.low, known.digits)} to {format_number(whole.high, known.digits)}"
                 over = "clips" if told.over.get(group) == "clips" else "blocks of frames"
                 parts.append(f"<p>95 % interval over {over}: {ends}</p>")
             else:
@@ -68,4 +68,4 @@ def _over(told: Told, group: str, name: str) -> str:
         return f"one clip: {escape(next(iter(values), 'none'))}"
     known = measure(name)
     worst = (max if known.better < 0 else min)(values, key=lambda clip: values[clip])
-    return f"pooled over {len(values)} clips; worst: {escape(worst)}, {number(values[worst], known.digits)}"
+    return f"pooled over {len(values)} clips; worst: {escape(worst)}, {format_number(values[worst], known.digits)}"

@@ -9,8 +9,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.report.words import TITLES
 from torchvision_dddas.evaluation.studies.record import Case, Task
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
-from torchvision_dddas.io.report.charts import Axis, Dots, chart
-from torchvision_dddas.io.report.page_tables import Cell, Column, figure, number, sorted_table, words
+from torchvision_dddas.io.report import Axis, Cell, Column, Dots, chart, format_number, number_cell, table, text_cell
 from torchvision_dddas.io.sources import open_source
 
 MOST_STAGES = 8
@@ -49,8 +48,8 @@ def summed(costs: Sequence[Cost], task: Task | None = None) -> str:
     if not seconds or not images:
         return ""
     peaks = [cost.peak_mb for cost in mine if np.isfinite(cost.peak_mb)]
-    memory = f", at most {number(round(max(peaks)))} MB" if peaks else ""
-    return f"{_rate(images / seconds)} frames/s ({number(seconds, 1)} s){memory}"
+    memory = f", at most {format_number(round(max(peaks)))} MB" if peaks else ""
+    return f"{_rate(images / seconds)} frames/s ({format_number(seconds, 1)} s){memory}"
 
 
 def cost_table(costs: Sequence[Cost]) -> str:
@@ -75,17 +74,17 @@ def cost_table(costs: Sequence[Cost]) -> str:
         each = max(cost.images, 1)
         rows.append(
             [
-                words(cost.case.clip.name),
-                words(TITLES[cost.case.task]),
-                figure(cost.images),
-                figure(cost.megapixels, 2),
-                figure(cost.seconds, 2),
+                text_cell(cost.case.clip.name),
+                text_cell(TITLES[cost.case.task]),
+                number_cell(cost.images),
+                number_cell(cost.megapixels, 2),
+                number_cell(cost.seconds, 2),
                 Cell(_rate(cost.images / cost.seconds), cost.images / cost.seconds) if cost.seconds else Cell("–"),
-                figure(cost.peak_mb, 0),
-                *(figure(1000 * cost.stages[s] / each if s in cost.stages else None, 2) for s in stages),
+                number_cell(cost.peak_mb, 0),
+                *(number_cell(1000 * cost.stages[s] / each if s in cost.stages else None, 2) for s in stages),
             ]
         )
-    return sorted_table("what each clip cost", columns, rows)
+    return table("what each clip cost", columns, rows)
 
 
 def cost_charts(costs: Sequence[Cost]) -> list[str]:
@@ -96,7 +95,7 @@ def cost_charts(costs: Sequence[Cost]) -> list[str]:
         if mine:
             each_ms = [1000 * c.seconds / c.images for c in mine]
             said = [
-                f"{c.case.clip.name}: {number(c.megapixels, 2)} Mpx, {number(ms, 1)} ms"
+                f"{c.case.clip.name}: {format_number(c.megapixels, 2)} Mpx, {format_number(ms, 1)} ms"
                 for c, ms in zip(mine, each_ms, strict=True)
             ]
             dots.append(Dots(TITLES[task], np.array([c.megapixels for c in mine]), np.array(each_ms), k % 6 + 1, said))
@@ -106,7 +105,7 @@ def cost_charts(costs: Sequence[Cost]) -> list[str]:
 
 
 def _rate(each_second: float) -> str:
-    return number(each_second, 0 if each_second >= 100 else 1)
+    return format_number(each_second, 0 if each_second >= 100 else 1)
 
 
 def _megapixels(case: Case) -> float:

@@ -8,7 +8,7 @@ from torchvision_dddas.evaluation.metrics.ranking import precision_recall, ranki
 from torchvision_dddas.evaluation.report.tallies import main_group, tally
 from torchvision_dddas.evaluation.studies.record import Case
 from torchvision_dddas.evaluation.studies.scored import Scored
-from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
+from torchvision_dddas.io.report import Axis, Dots, Line, chart
 
 MOST_CLIPS = 6
 """Clips whose course is drawn."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchvision_dddas.evaluation.studies.record import Case
-from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
+from torchvision_dddas.io.report import Axis, Dots, Line, chart
 
 MOST_CLIPS = 6
 _MOST_TARGETS = 60

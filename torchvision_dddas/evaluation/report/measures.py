@@ -4,8 +4,7 @@ import math
 
 from torchvision_dddas.evaluation.report.figures import Figure, Told
 from torchvision_dddas.evaluation.report.words import GROUPS, SHOWN, measure
-from torchvision_dddas.io.report.interval_plot import MOST_ROWS, Interval, interval_plot
-from torchvision_dddas.io.report.page_tables import Cell, Column, figure, sorted_table, words
+from torchvision_dddas.io.report import MOST_ROWS, Cell, Column, Interval, interval_chart, number_cell, table, text_cell
 
 UNDRAWN = ("location",)
 """Groups whose plot says no more than their table."""
@@ -33,7 +32,7 @@ def measure_table(told: Told, group: str, frames: dict[str, int]) -> str:
     columns = [Column("clip", text=True), Column("frames", "frames scored")]
     columns += [Column(measure(name).name, measure(name).meaning) for name in names]
     rows = [
-        [words(clip), figure(frames.get(clip)), *(_cell(groups[group].get(name), name) for name in names)]
+        [text_cell(clip), number_cell(frames.get(clip)), *(_cell(groups[group].get(name), name) for name in names)]
         for clip, groups in told.clips.items()
         if group in groups
     ]
@@ -41,8 +40,8 @@ def measure_table(told: Told, group: str, frames: dict[str, int]) -> str:
     if len(rows) > 1:
         for title, groups in (("pooled", told.pooled), ("mean over clips", told.mean)):
             if group in groups:
-                foot.append([words(title), Cell(""), *(_cell(groups[group].get(name), name) for name in names)])
-    return sorted_table(f"{GROUPS.get(group, group)}, clip by clip", columns, rows, foot)
+                foot.append([text_cell(title), Cell(""), *(_cell(groups[group].get(name), name) for name in names)])
+    return table(f"{GROUPS.get(group, group)}, clip by clip", columns, rows, foot)
 
 
 def measure_plot(told: Told, group: str) -> tuple[str, int]:
@@ -64,11 +63,11 @@ def measure_plot(told: Told, group: str) -> tuple[str, int]:
     title = f"{known.name}, {GROUPS.get(group, group)}"
     all_of_them = Interval("pooled", *whole) if len(rows) > 1 else None
     span = (0.0, 1.0 if known.share else 0.0)
-    return interval_plot(title, rows, all_of_them, span), max(len(rows) - MOST_ROWS, 0)
+    return interval_chart(title, rows, all_of_them, span), max(len(rows) - MOST_ROWS, 0)
 
 
 def _cell(value: Figure | None, name: str) -> Cell:
     if value is None:
-        return figure(None)
+        return number_cell(None)
     digits = measure(name).digits
-    return figure(value.value, digits, (value.low, value.high))
+    return number_cell(value.value, digits, (value.low, value.high))

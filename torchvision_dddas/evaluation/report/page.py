@@ -16,8 +16,7 @@ from torchvision_dddas.evaluation.report.words import GROUPS, TITLES
 from torchvision_dddas.evaluation.report.worst import Worst, drawn, worst_frames
 from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results
 from torchvision_dddas.io.output.run_record import finite, versions
-from torchvision_dddas.io.report.page import SCRIPT, page, picture_url
-from torchvision_dddas.io.report.page_tables import Column, sorted_table, words
+from torchvision_dddas.io.report import Column, data_url, render_page, table, text_cell
 
 MOST_LEFT_OUT = 200
 """Lines; run.json has them all."""
@@ -47,7 +46,7 @@ def report(metrics: Mapping[str, Any], results: Results) -> str:
         parts += _task(task, mine, by_task[task])
     parts += _costs(costs)
     parts += _facts(results)
-    return page(title, [part for part in parts if part], script=SCRIPT)
+    return render_page("page.html", title=title, parts=[part for part in parts if part])
 
 
 def _task(task: str, mine: Told, cases: Sequence[Case]) -> list[str]:
@@ -103,7 +102,7 @@ def _figure(one: Worst) -> str:
         )
     sides = "".join(
         f'<div><span>{what}</span><img loading="lazy" alt="{escape(f"{what} of {when}: {one.words}")}" '
-        f'src="{picture_url(jpeg)}"></div>'
+        f'src="{data_url(jpeg)}"></div>'
         for what, jpeg in (("truth", one.pair.truth), ("result", one.pair.result))
     )
     return f'<figure><div class="pair">{sides}</div>{words_of_it}</figure>'
@@ -153,11 +152,11 @@ def _facts(results: Results) -> list[str]:
     }
     said["datasets"] = [_of_set(one) for one in results.facts.get("datasets", ())] or said["datasets"]
     said = {name: value for name, value in said.items() if value not in ("", [], (), None)}
-    rows = [[words(name.replace("_", " ")), words(_in_words(value))] for name, value in said.items()]
+    rows = [[text_cell(name.replace("_", " ")), text_cell(_in_words(value))] for name, value in said.items()]
     settings = json.dumps(finite(results.settings.model_dump(mode="json")), indent=2)
     return [
         '<h2 id="settings">What was run</h2>',
-        sorted_table("what was run", [Column("what", text=True), Column("value", text=True)], rows, sorts=False),
+        table("what was run", [Column("what", text=True), Column("value", text=True)], rows, sorts=False),
         f'<details><summary>Settings in force</summary><pre tabindex="0">{escape(settings)}</pre></details>',
     ]
 

@@ -16,7 +16,7 @@ from torchvision_dddas.evaluation.report.tallies import Tally, main_group, tally
 from torchvision_dddas.evaluation.studies.record import Case, Found
 from torchvision_dddas.io.image_bytes import decoded
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
-from torchvision_dddas.io.report.page_tables import number
+from torchvision_dddas.io.report import format_number
 from torchvision_dddas.io.sources import open_source
 
 MOST = 8
@@ -91,10 +91,10 @@ def _of_case(case: Case) -> tuple[list[Worst], int]:
 def _said(counts: Tally, k: int) -> str:
     right, false, missed, switched = (float(x[k]) for x in counts[:4])
     named = ((right, "right"), (false, "false"), (missed, "missed"))
-    found = f"{counts.unit}: " + ", ".join(f"{number(int(n))} {what}" for n, what in named)
+    found = f"{counts.unit}: " + ", ".join(f"{format_number(int(n))} {what}" for n, what in named)
     whole = 2 * right + false + missed
-    score = f"{counts.measure} {number(2 * right / whole, 2)}; " if whole and counts.measure != "hit" else ""
-    return f"{score}{found}" + (f"; {number(int(switched))} changed identity" if switched else "")
+    score = f"{counts.measure} {format_number(2 * right / whole, 2)}; " if whole and counts.measure != "hit" else ""
+    return f"{score}{found}" + (f"; {format_number(int(switched))} changed identity" if switched else "")
 
 
 def _pictures(case: Case, frames: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:

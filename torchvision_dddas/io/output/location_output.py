@@ -20,8 +20,8 @@ from torchvision_dddas.io.maps.map_signs import Signs
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.location_tables import GroundedTables
 from torchvision_dddas.io.output.run_record import NAME, Record
-from torchvision_dddas.io.report.run_report import Story, Table, report, span
-from torchvision_dddas.io.report.timeline import USED, Timeline
+from torchvision_dddas.io.report.run_report import RunSummary, Table, format_span, run_report
+from torchvision_dddas.io.report.timelines import USED, LocationTimeline
 from torchvision_dddas.types import AerialLocations, Camera, Fix, Ortho, Positions
 
 SAVED = ("cot", "map", "report")
@@ -124,7 +124,7 @@ class More(Protocol):
 
     signs: Signs
 
-    def told(self, story: Story) -> Story:
+    def told(self, story: RunSummary) -> RunSummary:
         """The story of a report, with that."""
 
 
@@ -150,7 +150,7 @@ class Maps:
         self._geographic, self._start_utc_s, self._photo = geographic, start_utc_s, photo
         self._camera, self._degrees = camera, degrees
         self._name = Path(str(kept.facts.get("input", ""))).name
-        self._targets, self._marks, self._timeline = Gathered(), Gathered(), Timeline()
+        self._targets, self._marks, self._timeline = Gathered(), Gathered(), LocationTimeline()
         self._way: list[tuple[float, float]] = []
         self._last: Fix | None = None
         self.written: set[str] = set()
@@ -192,7 +192,7 @@ class Maps:
                 story = _story(self._kept, targets, complete, _smaller(picture))
                 if self.more is not None:
                     story = self.more.told(story)
-                self._put(REPORT, report(story, self._timeline).encode())
+                self._put(REPORT, run_report(story, self._timeline).encode())
 
     def discard(self) -> None:
         """Remove what was begun."""
@@ -267,7 +267,7 @@ def _smaller(map_png: bytes) -> bytes:
     return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
 
 
-def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png: bytes) -> Story:
+def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png: bytes) -> RunSummary:
     """What the report tells of a run."""
     located = kept.frames - kept.by["nothing"]
     axes, _ = semi_axes(targets.covariance_m2)
@@ -286,19 +286,19 @@ def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png
         (
             "Frames that could not be located",
             ("frames", "cause"),
-            [(span(g["first"], g["last"]), g["cause"]) for g in kept.gaps],
+            [(format_span(g["first"], g["last"]), g["cause"]) for g in kept.gaps],
             "none",
         ),
         (
             "Frames located with something amiss",
             ("frames", "by", "cause"),
-            [(span(w["first"], w["last"]), w["by"], w["cause"]) for w in kept.weak.rows],
+            [(format_span(w["first"], w["last"]), w["by"], w["cause"]) for w in kept.weak.rows],
             "none",
         ),
         (
             "Repairs and exclusions",
             ("frames", "what and why"),
-            [(span(r["first"], r["last"]), r["cause"]) for r in kept.repairs.rows],
+            [(format_span(r["first"], r["last"]), r["cause"]) for r in kept.repairs.rows],
             "none",
         ),
         (
@@ -311,7 +311,13 @@ def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png
             "Landmarks",
             ("name", "frames seen", "used", "reassigned in frames", "excluded in frames"),
             [
-                (name, k["seen"], k["used"], [span(*s) for s in k["reassigned"]], [span(*s) for s in k["excluded"]])
+                (
+                    name,
+                    k["seen"],
+                    k["used"],
+                    [format_span(*s) for s in k["reassigned"]],
+                    [format_span(*s) for s in k["excluded"]],
+                )
                 for name, k in kept.landmarks.items()
             ],
             "none",
@@ -320,4 +326,4 @@ def _story(kept: GroundedJournal, targets: GroundTracks, complete: bool, map_png
     state = "complete" if complete else "interrupted: up to the last whole frame"
     name = Path(str(kept.facts.get("input", ""))).name
     title = f"GroundLocations from the air: {name}" if name else "GroundLocations from the air"
-    return Story(title, state, figures, kept.facts, tables, [*kept.notes, *kept.problems], map_png)
+    return RunSummary(title, state, figures, kept.facts, tables, [*kept.notes, *kept.problems], map_png)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.io.output.position_output import COLUMNS, DEGREES
-from torchvision_dddas.io.report.timeline import USED
+from torchvision_dddas.io.report.timelines import USED
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.types import AerialLocations, CameraPose, Fix
 

@@ -1,25 +1,32 @@
-"""Plots of a page as SVG, small enough that a phone shows their words: curves and dots over two axes."""
+"""Charts as inline SVG: curves and points over two axes, one value per row with its interval, panels over time."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 
 import numpy as np
+from markupsafe import Markup
 
 from torchvision_dddas.io.maps.map_frame import step_of
+from torchvision_dddas.io.report.page import format_number
 
-WIDE, HIGH = 420, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 18, 28, 40
-_LETTER = 6.4
-"""Pixels of a letter, about."""
+WIDTH, HEIGHT = 420, 300
 MOST_POINTS = 400
-"""Of a curve: more cannot be told apart."""
+"""Points drawn per curve of `chart`."""
+MOST_ROWS = 40
+"""Rows of an interval chart."""
+TIME_LEFT, TIME_WIDTH = 64, 1080
+"""Left edge and width in pixels of the panels of a time chart."""
+
+_LETTER_PX = 6.4
+_DASHES = ' stroke-dasharray="5 4"'
+_MOST_BINS = 540
 
 
 @dataclass(frozen=True)
 class Axis:
-    """What is drawn along an axis, from where to where; NaN: as the values ask. log: ten times as much each step."""
+    """An axis with its limits; a limit of NaN follows from the values. log: decades."""
 
     name: str
     low: float = math.nan
@@ -29,9 +36,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Line:
-    """A curve of (N,) places, broken where they are NaN. colour: 1 to 6, see page.STYLE. faint: one of many.
+    """A curve through (N,) points, broken where they are NaN.
 
-    steps: it stays as high as it is until the next place.
+    colour: 1 to 8, see style.css. faint: one of many. steps: each value holds until the next point.
+    area: filled down to zero. band: `time_chart` shades the range of the values behind the medians that it draws.
     """
 
     name: str
@@ -41,49 +49,195 @@ class Line:
     faint: bool = False
     dashed: bool = False
     steps: bool = False
+    area: bool = False
+    band: bool = False
 
 
 @dataclass(frozen=True)
 class Dots:
-    """Places (N,), each with what it is in words. sign: disc, cross or ring."""
+    """(N,) points, each with a text that is shown under the pointer. sign: disc, cross or ring."""
 
     name: str
     x: np.ndarray
     y: np.ndarray
     colour: int = 1
-    words: Sequence[str] = field(default_factory=tuple)
+    texts: Sequence[str] = field(default_factory=tuple)
     sign: str = "disc"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A named value with an interval, NaN where unknown. link: the address that its name leads to."""
+
+    name: str
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    link: str = ""
+
+
+@dataclass(frozen=True)
+class Events:
+    """A row of ticks at (N,) places on the time axis, each with a text that is shown under the pointer."""
+
+    name: str
+    x: np.ndarray
+    texts: Sequence[str]
+    colour: int = 1
+
+
+Panel = tuple[str, Sequence[Line] | Sequence[Events]]
+"""A title and what a panel of a time chart shows: lines or events, not both."""
 
 
 def chart(
     title: str, across: Axis, up: Axis, lines: Sequence[Line] = (), dots: Sequence[Dots] = (), equal: bool = False
-) -> str:
-    """A plot. equal: as long across as up, as on a map. What lies beyond the axes is cut."""
+) -> Markup:
+    """Draw lines and points over two axes. equal: one scale for both, as on a map. Values beyond the axes are cut."""
     series: list[Line | Dots] = [*lines, *dots]
-    x = _span(across, np.concatenate([one.x for one in series]) if series else np.zeros(0))
-    y = _span(up, np.concatenate([one.y for one in series]) if series else np.zeros(0))
-    names = [(one.name, one) for one in series if one.name]
-    legend, top = _legend(names)
-    wide, high = float(WIDE - _LEFT - _RIGHT), float(HIGH - _TOP - _BOTTOM)
+    named = [one for one in series if one.name]
+    legend, legend_high = _legend(named, 8, 30, WIDTH) if len(named) > 1 else ([], 0)
+    x = _limits(across, np.concatenate([one.x for one in series]) if series else np.zeros(0))
+    y = _limits(up, np.concatenate([one.y for one in series]) if series else np.zeros(0))
+    plot = _Plot(58, 28 + legend_high, WIDTH - 76, HEIGHT - 68, x, y, across.log, up.log)
     if equal:
-        x, y, high = _equal(x, y, wide)
-    y0 = float(_TOP + top)
-
-    def place(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _LEFT + _share(a, x, across.log) * wide, y0 + high - _share(b, y, up.log) * high
-
-    parts = [f'<text x="6" y="16" class="title">{escape(title)}</text>', *legend]
-    parts += _ticks_up(up, y, y0, wide, high) + _ticks_across(across, x, y0, wide, high)
+        plot = _with_equal_scales(plot)
+    middle = f"{plot.top + plot.high / 2:g}"
+    parts = [
+        _text(6, 16, title, "start", "title"),
+        *legend,
+        f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">{escape(up.name)}</text>',
+        *plot.grid(max(2, int(plot.high // 45))),
+        *plot.base(6),
+        _text(plot.left + plot.wide / 2, plot.top + plot.high + 34, across.name, "middle"),
+    ]
     for line in lines:
-        parts.append(_path(line, *place(*_corners(*_thinned(line.x, line.y), line.steps))))
+        kept = np.unique(np.linspace(0, len(line.x) - 1, min(len(line.x), MOST_POINTS)).round().astype(int))
+        parts += plot.curve(replace(line, x=line.x[kept], y=line.y[kept]))
     for one in dots:
-        parts += _signs(one, *place(one.x, one.y))
-    total = y0 + high + _BOTTOM
-    said = escape(f"{title}: {up.name} against {across.name}" + "".join(f", {name}" for name, _ in names[:8]))
-    return f'<svg viewBox="0 0 {WIDE} {total:g}" role="img" aria-label="{said}">{"".join(parts)}</svg>'
+        for k, (a, b) in enumerate(zip(*plot.place(one.x, one.y), strict=True)):
+            if math.isfinite(a) and math.isfinite(b):
+                parts.append(_sign(one.sign, one.colour, a, b, one.texts[k] if k < len(one.texts) else ""))
+    label = f"{title}: {up.name} against {across.name}" + "".join(f", {one.name}" for one in named[:8])
+    return _svg(WIDTH, plot.top + plot.high + 40, label, parts)
 
 
-def _span(axis: Axis, values: np.ndarray) -> tuple[float, float]:
+def interval_chart(
+    title: str,
+    rows: Sequence[Interval],
+    whole: Interval | None = None,
+    limits: tuple[float, float] = (0.0, 1.0),
+    colour: int = 1,
+) -> Markup:
+    """Draw a row per value with its interval: the first MOST_ROWS known ones, in their order.
+
+    whole: a line through all rows with its band. limits: what the axis covers at least.
+    """
+    shown = [row for row in rows if math.isfinite(row.value)][:MOST_ROWS]
+    ends = [end for row in shown for end in (row.value, row.low, row.high) if math.isfinite(end)]
+    low, high = min([limits[0], *ends]), max([limits[1], *ends])
+    high = high if high > low else low + 1
+    plot = _Plot(150, 30, WIDTH - 196, 19 * len(shown), (low, high), (0, 1))
+    below = plot.top + plot.high
+    parts = [_text(6, 16, title, "start", "title")]
+    for x, text in plot.numbers_across(5):
+        parts += [f'<path d="M{x:.1f} {plot.top}v{plot.high}" class="grid"/>', _text(x, below + 16, text, "middle")]
+    if whole is not None and math.isfinite(whole.value):
+        if math.isfinite(whole.low) and math.isfinite(whole.high):
+            left, right = plot.across([max(whole.low, low), min(whole.high, high)])
+            parts.append(
+                f'<rect x="{left:.1f}" y="{plot.top}" width="{max(right - left, 1):.1f}" height="{plot.high}" '
+                'class="band f2"/>'
+            )
+        (x,) = plot.across([whole.value])
+        said = f"{whole.name} {format_number(whole.value)}"
+        parts.append(f'<path d="M{x:.1f} {plot.top - 3}v{plot.high + 6}" class="line c2"{_DASHES}>{_hint(said)}</path>')
+        anchor = "end" if x > WIDTH - 120 else "start" if x < plot.left + 60 else "middle"
+        parts.append(_text(x, below + 31, said if whole.value else whole.name, anchor, "f2"))
+    for k, row in enumerate(shown):
+        parts += _interval_row(row, plot.top + 19 * k + 9.5, plot.across, colour)
+    values = "; ".join(f"{row.name} {format_number(row.value)}" for row in shown[:12])
+    return _svg(WIDTH, below + 36, f"{title}, clip by clip: {values}", parts)
+
+
+def time_chart(panels: Sequence[Panel], at: np.ndarray, has_gap: np.ndarray, unit: str) -> Markup:
+    """Draw panels one below the other over a shared time axis; empty for fewer than two frames.
+
+    at: (N,) places of the frames on the axis, growing; each line has a value for each of them. has_gap: (N,) bool,
+    frames that are shaded. unit: what the axis counts. Panels without a known value are left out.
+    """
+    panels = [(title, lines) for title, lines in panels if any(_is_known(one) for one in lines)]
+    if len(at) < 2 or not panels:
+        return Markup("")
+    parts: list[str] = []
+    top = 0.0
+    for title, series in panels:
+        lines = [one for one in series if isinstance(one, Line)]
+        events = [one for one in series if isinstance(one, Events)]
+        high = 20.0 * len(events) if events else 70.0 if all(line.steps for line in lines) else 130.0
+        legend, more = _legend([line for line in lines if line.name], 90 + 7 * len(title), top + 13, 1160)
+        top += more - 17 if more else 0
+        plot = _Plot(TIME_LEFT, top + 26, TIME_WIDTH, high, (float(at[0]), max(float(at[-1]), at[0] + 1e-9)), (0, 1))
+        parts += [_text(TIME_LEFT, plot.top - 9, title, "start", "title"), *legend, *_shading(has_gap, at, plot)]
+        parts += _event_rows(events, plot) if events else _panel(lines, at, plot)
+        parts += [*plot.base(10), _text(TIME_LEFT + TIME_WIDTH, plot.top + high + 31, unit, "end")]
+        top += high + 60
+    label = "plots over time of " + ", ".join(title for title, _ in panels)
+    return _svg(TIME_LEFT + TIME_WIDTH + 16, top, label, parts)
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """A rectangle of a picture and the values at its edges."""
+
+    left: float
+    top: float
+    wide: float
+    high: float
+    x: tuple[float, float]
+    y: tuple[float, float]
+    log_x: bool = False
+    log_y: bool = False
+
+    def across(self, x: Sequence[float] | np.ndarray) -> list[float]:
+        return (self.left + _share(np.asarray(x, float), self.x, self.log_x) * self.wide).tolist()
+
+    def place(self, x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:
+        return self.across(x), (self.top + self.high - _share(y, self.y, self.log_y) * self.high).tolist()
+
+    def grid(self, count: int) -> list[str]:
+        parts = []
+        for value, text in _ticks(self.y, self.log_y, count):
+            (y,) = self.place(np.zeros(1), np.array([value]))[1]
+            parts.append(f'<path d="M{self.left} {y:.1f}h{self.wide}" class="grid"/>')
+            parts.append(_text(self.left - 6, y + 4, text, "end"))
+        return parts
+
+    def numbers_across(self, count: int) -> list[tuple[float, str]]:
+        return [(self.across([value])[0], text) for value, text in _ticks(self.x, self.log_x, count)]
+
+    def base(self, count: int) -> list[str]:
+        bottom = self.top + self.high
+        parts = [f'<path d="M{self.left} {self.top:g}v{self.high:g}h{self.wide}" class="axis"/>']
+        for x, text in self.numbers_across(count):
+            parts += [f'<path d="M{x:.1f} {bottom:g}v4" class="axis"/>', _text(x, bottom + 17, text, "middle")]
+        return parts
+
+    def curve(self, line: Line) -> list[str]:
+        """The path of a line, with the area below it where that is filled."""
+        pieces, areas = [], []
+        for piece in _runs(np.isfinite(line.x) & np.isfinite(line.y)):
+            x, y = (_stairs if line.steps else lambda *xy: xy)(line.x[piece], line.y[piece])
+            way = _way(*self.place(x, y))
+            pieces.append(f"M{way}" + ("h1.5" if len(x) == 1 else ""))  # a single point would be no line
+            if line.area and len(x) > 1:
+                areas.append(f"M{way}L{_way(*self.place(x[[-1, 0]], np.zeros(2)))}Z")
+        dashes, kind = _DASHES if line.dashed else "", "faint" if line.faint else "line"
+        drawn = f'<path d="{"".join(pieces)}" class="{kind} c{line.colour}"{dashes}>{_hint(line.name)}</path>'
+        return [*([f'<path d="{"".join(areas)}" class="area f{line.colour}"/>'] if areas else []), drawn]
+
+
+def _limits(axis: Axis, values: np.ndarray) -> tuple[float, float]:
     known = values[np.isfinite(values) & ((values > 0) | (not axis.log))]
     low = axis.low if math.isfinite(axis.low) else float(known.min(initial=math.inf))
     high = axis.high if math.isfinite(axis.high) else float(known.max(initial=-math.inf))
@@ -97,119 +251,157 @@ def _span(axis: Axis, values: np.ndarray) -> tuple[float, float]:
     return (low, high) if math.isfinite(axis.high) else (low, high + 0.05 * (high - low))
 
 
-def _equal(
-    x: tuple[float, float], y: tuple[float, float], wide: float
-) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Spans widened about their middles, and the height of the plot, so that a metre is as long in both."""
-    room = 1.1
-    size_x, size_y = (x[1] - x[0]) * room, (y[1] - y[0]) * room
-    high = float(min(max(wide * size_y / size_x, 150), 420))
-    unit = max(size_x / wide, size_y / high)
-    middle_x, middle_y = (x[0] + x[1]) / 2, (y[0] + y[1]) / 2
-    return (
-        (middle_x - unit * wide / 2, middle_x + unit * wide / 2),
-        (middle_y - unit * high / 2, middle_y + unit * high / 2),
-        high,
-    )
+def _with_equal_scales(plot: _Plot) -> _Plot:
+    """Widen the limits about their middles and choose the height so that a unit is as long in both directions."""
+    (west, east), (south, north) = plot.x, plot.y
+    size_x, size_y = 1.1 * (east - west), 1.1 * (north - south)
+    high = float(min(max(plot.wide * size_y / size_x, 150), 420))
+    unit = max(size_x / plot.wide, size_y / high)
+    x, y = (west + east) / 2, (south + north) / 2
+    half_x, half_y = unit * plot.wide / 2, unit * high / 2
+    return replace(plot, high=high, x=(x - half_x, x + half_x), y=(y - half_y, y + half_y))
 
 
-def _share(values: np.ndarray, span: tuple[float, float], log: bool) -> np.ndarray:
-    values = np.asarray(values, float)
+def _share(values: np.ndarray, limits: tuple[float, float], log: bool) -> np.ndarray:
+    """Where values lie between the limits, 0 to 1."""
     if log:
         with np.errstate(divide="ignore", invalid="ignore"):
             values = np.log10(np.maximum(values, 1e-30))
-        span = math.log10(span[0]), math.log10(span[1])
-    return np.clip((values - span[0]) / (span[1] - span[0]), 0, 1)
+        limits = math.log10(limits[0]), math.log10(limits[1])
+    return np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
 
 
-def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fewer points of a long curve: the first and the last stay."""
-    if len(x) <= MOST_POINTS:
-        return x, y
-    kept = np.unique(np.linspace(0, len(x) - 1, MOST_POINTS).round().astype(int))
-    return x[kept], y[kept]
+def _ticks(limits: tuple[float, float], log: bool, count: int) -> list[tuple[float, str]]:
+    if log:
+        powers = range(math.ceil(math.log10(limits[0]) - 1e-9), math.floor(math.log10(limits[1]) + 1e-9) + 1)
+        return [(10.0**k, f"{10.0**k:g}") for k in powers]
+    step = step_of(limits[1] - limits[0], count)
+    first, last = math.ceil(limits[0] / step - 1e-9), math.floor(limits[1] / step + 1e-9)
+    return [(k * step, f"{k * step:g}".replace("-", "−")) for k in range(first, last + 1)]
 
 
-def _corners(x: np.ndarray, y: np.ndarray, steps: bool) -> tuple[np.ndarray, np.ndarray]:
-    return (np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]) if steps and len(x) else (x, y)
-
-
-def _path(line: Line, x: np.ndarray, y: np.ndarray) -> str:
-    known = np.isfinite(x) & np.isfinite(y)
-    edges = np.flatnonzero(np.diff(np.r_[0, known.astype(np.int8), 0])).reshape(-1, 2)
-    drawn = []
-    for first, last in edges.tolist():
-        way = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x[first:last], y[first:last], strict=True))
-        drawn.append(f"M{way}" + ("h1.5" if last - first == 1 else ""))  # a single point would be no line
-    dash = ' stroke-dasharray="5 4"' if line.dashed else ""
-    hint = f"<title>{escape(line.name)}</title>" if line.name else ""
-    return f'<path d="{"".join(drawn)}" class="{"faint" if line.faint else "line"} c{line.colour}"{dash}>{hint}</path>'
-
-
-def _signs(dots: Dots, x: np.ndarray, y: np.ndarray) -> list[str]:
-    parts = []
-    for k, (a, b) in enumerate(zip(x.tolist(), y.tolist(), strict=True)):
-        if not (math.isfinite(a) and math.isfinite(b)):
-            continue
-        hint = f"<title>{escape(dots.words[k])}</title>" if k < len(dots.words) else ""
-        parts.append(_sign(dots.sign, dots.colour, a, b, hint))
+def _panel(lines: Sequence[Line], at: np.ndarray, plot: _Plot) -> list[str]:
+    values = np.concatenate([line.y for line in lines])
+    low, high = np.percentile(values[np.isfinite(values)], [0.5, 99.5]) * 1.12  # a few outliers flatten nothing
+    plot = replace(plot, y=(min(float(low), 0.0), max(float(high) or 1.0, 0.0)))
+    parts = plot.grid(4)
+    for line in lines:
+        middle, lowest, median, highest = _binned(at, line.y)
+        for piece in _runs(np.isfinite(median)) if line.band else ():
+            upper = _way(*plot.place(middle[piece], highest[piece]))
+            lower = _way(*plot.place(middle[piece][::-1], lowest[piece][::-1]))
+            parts.append(f'<path d="M{upper}L{lower}Z" class="band f{line.colour}"/>')
+        parts += plot.curve(replace(line, x=middle, y=median))
     return parts
+
+
+def _event_rows(events: Sequence[Events], plot: _Plot) -> list[str]:
+    parts = []
+    for k, one in enumerate(events):
+        y = plot.top + 20 * k
+        parts.append(f'<path d="M{plot.left} {y + 20:g}h{plot.wide}" class="grid"/>')
+        parts.append(_text(plot.left - 8, y + 14, one.name, "end"))
+        texts: dict[int, list[str]] = {}
+        for x, text in zip(plot.across(one.x), one.texts, strict=True):
+            texts.setdefault(round(x / 2) * 2, []).append(text)
+        for x, said in texts.items():
+            hint = said[0][:160] + (f" and {len(said) - 1} more" if len(said) > 1 else "")
+            parts.append(f'<path d="M{x} {y + 3:g}v14" class="line c{one.colour}">{_hint(hint)}</path>')
+    return parts
+
+
+def _shading(has_gap: np.ndarray, at: np.ndarray, plot: _Plot) -> list[str]:
+    parts = []
+    for piece in _runs(has_gap):
+        west, east = plot.across(at[[piece.start, piece.stop - 1]])
+        wide = max(east - west, 1.5)
+        parts.append(f'<rect x="{west:.1f}" y="{plot.top:g}" width="{wide:.1f}" height="{plot.high:g}" class="gap"/>')
+    return parts
+
+
+def _interval_row(row: Interval, y: float, across: Callable[[list[float]], list[float]], colour: int) -> list[str]:
+    name = _text(142, y + 4, row.name if len(row.name) <= 21 else f"{row.name[:20]}…", "end", "name")
+    value, said = format_number(row.value), f"{row.name} {format_number(row.value)}"
+    parts = [f'<a href="{escape(row.link)}">{name}</a>' if row.link else name]
+    if math.isfinite(row.low) and math.isfinite(row.high):
+        said += f", 95 %: {format_number(row.low)} to {format_number(row.high)}"
+        a, b = across([row.low, row.high])
+        parts.append(f'<path d="M{a:.1f} {y - 4:g}v8m0-4H{b:.1f}m0-4v8" class="line c{colour}"/>')
+    (x,) = across([row.value])
+    parts.append(f'<circle cx="{x:.1f}" cy="{y:g}" r="4.5" class="f{colour}">{_hint(said)}</circle>')
+    return [*parts, _text(WIDTH - 4, y + 4, value, "end")]
+
+
+def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float) -> tuple[list[str], int]:
+    """A sign and a name for each series in rows between left and right, and the height of these rows."""
+    parts, x, row = [], left, 0
+    for one in series:
+        name = one.name if len(one.name) <= 40 else f"{one.name[:39]}…"
+        wide = 30 + _LETTER_PX * len(name)
+        if x > left and x + wide > right:
+            x, row = left, row + 1
+        y = top + 17 * row
+        if isinstance(one, Line):
+            parts.append(f'<path d="M{x:.1f} {y:g}h16" class="line c{one.colour}"{_DASHES if one.dashed else ""}/>')
+        else:
+            parts.append(_sign(one.sign, one.colour, x + 8, y))
+        parts.append(_text(x + 21, y + 4, name, "start"))
+        x += wide
+    return parts, 17 * (row + 1) if series else 0
 
 
 def _sign(kind: str, colour: int, x: float, y: float, hint: str = "") -> str:
     if kind == "cross":
-        return f'<path d="M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6" class="line c{colour}">{hint}</path>'
-    shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="'
-    return f'{shape}{f"line c{colour}" if kind == "ring" else f"f{colour}"}">{hint}</circle>'
+        return f'<path d="M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6" class="line c{colour}">{_hint(hint)}</path>'
+    style = f"line c{colour}" if kind == "ring" else f"f{colour}"
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="{style}">{_hint(hint)}</circle>'
 
 
-def _legend(names: Sequence[tuple[str, Line | Dots]]) -> tuple[list[str], int]:
-    """What each colour is, in rows below the title, and how high they are."""
-    parts, x, row = [], 8.0, 0
-    if len(names) < 2:
-        return [], 0
-    for name, one in names:
-        shown = name if len(name) <= 40 else f"{name[:39]}…"
-        wide = 30 + _LETTER * len(shown)
-        if x > 8 and x + wide > WIDE:
-            x, row = 8.0, row + 1
-        y = 30 + 17 * row
-        if isinstance(one, Line):
-            dash = ' stroke-dasharray="5 4"' if one.dashed else ""
-            parts.append(f'<path d="M{x:.1f} {y}h16" class="line c{one.colour}"{dash}/>')
-        else:
-            parts.append(_sign(one.sign, one.colour, x + 8, y))
-        parts.append(f'<text x="{x + 21:.1f}" y="{y + 4}">{escape(shown)}</text>')
-        x += wide
-    return parts, 17 * (row + 1)
+def _text(x: float, y: float, text: str, anchor: str, style: str = "") -> str:
+    kind = f' class="{style}"' if style else ""
+    return f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}"{kind}>{escape(text)}</text>'
 
 
-def _ticks_up(axis: Axis, span: tuple[float, float], y0: float, wide: float, high: float) -> list[str]:
-    middle = f"{y0 + high / 2:g}"
-    turned = f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">'
-    parts = [f"{turned}{escape(axis.name)}</text>"]
-    for value, text in _numbers(axis, span, max(2, int(high // 45))):
-        y = y0 + high - float(_share(np.array(value), span, axis.log)) * high
-        parts.append(f'<path d="M{_LEFT} {y:.1f}h{wide}" class="grid"/>')
-        parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
-    return parts
+def _hint(text: str) -> str:
+    return f"<title>{escape(text)}</title>" if text else ""
 
 
-def _ticks_across(axis: Axis, span: tuple[float, float], y0: float, wide: float, high: float) -> list[str]:
-    parts = [f'<path d="M{_LEFT} {y0:g}v{high:g}h{wide}" class="axis"/>']
-    for value, text in _numbers(axis, span, 6):
-        x = _LEFT + float(_share(np.array(value), span, axis.log)) * wide
-        parts.append(f'<path d="M{x:.1f} {y0 + high:g}v4" class="axis"/>')
-        parts.append(f'<text x="{x:.1f}" y="{y0 + high + 17:g}" text-anchor="middle">{text}</text>')
-    middle = _LEFT + wide / 2
-    parts.append(f'<text x="{middle:g}" y="{y0 + high + 34:g}" text-anchor="middle">{escape(axis.name)}</text>')
-    return parts
+def _svg(wide: float, high: float, label: str, parts: Sequence[str]) -> Markup:
+    box = f'viewBox="0 0 {wide:g} {high:g}" role="img" aria-label="{escape(label)}"'
+    return Markup(f"<svg {box}>{''.join(parts)}</svg>")
 
 
-def _numbers(axis: Axis, span: tuple[float, float], count: int) -> list[tuple[float, str]]:
-    if axis.log:
-        powers = range(math.ceil(math.log10(span[0]) - 1e-9), math.floor(math.log10(span[1]) + 1e-9) + 1)
-        return [(10.0**k, f"{10.0**k:g}") for k in powers]
-    step = step_of(span[1] - span[0], count)
-    first, last = math.ceil(span[0] / step - 1e-9), math.floor(span[1] / step + 1e-9)
-    return [(k * step, f"{k * step:g}".replace("-", "−")) for k in range(first, last + 1)]
+def _way(x: Sequence[float], y: Sequence[float]) -> str:
+    return "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+
+
+def _runs(flags: np.ndarray) -> list[slice]:
+    """Each run of True."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0])).reshape(-1, 2)
+    return [slice(first, last) for first, last in edges.tolist()]
+
+
+def _stairs(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a line whose values hold until they change."""
+    jumps = np.flatnonzero(np.diff(y)) + 1
+    corner_y = np.stack([y[jumps - 1], y[jumps]], axis=1).ravel()
+    return np.r_[x[0], np.repeat(x[jumps], 2), x[-1]], np.r_[y[0], corner_y, y[-1]]
+
+
+def _binned(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The middle of each bin of successive frames, and the lowest, median and highest of the known values in it."""
+    size = max(1, math.ceil(len(at) / _MOST_BINS))
+    full = np.full(math.ceil(len(at) / size) * size, np.nan)
+    full[: len(at)] = values
+    bins = full.reshape(-1, size)
+    known = np.isfinite(bins).any(axis=1)
+    found = np.full((3, len(bins)), np.nan)
+    found[0, known] = np.nanmin(bins[known], axis=1)
+    found[1, known] = np.nanmedian(bins[known], axis=1)
+    found[2, known] = np.nanmax(bins[known], axis=1)
+    middle = at[np.minimum(np.arange(len(bins)) * size + size // 2, len(at) - 1)]
+    return middle, found[0], found[1], found[2]
+
+
+def _is_known(one: Line | Events) -> bool:
+    return len(one.x) > 0 if isinstance(one, Events) else bool(np.isfinite(one.y).any())

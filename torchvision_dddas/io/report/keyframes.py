@@ -1,5 +1,6 @@
-"""Key frames of a run: a few small pictures spread over it, and where something happened, in memory that is bounded."""
+"""Key frames of a run: a few small pictures spread over it and at its events, in bounded memory."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -7,26 +8,31 @@ import cv2
 import numpy as np
 
 MOST = 9
-"""Pictures that a report shows."""
-_MARKED = 7  # of them at most, for what happened
-_HELD = 18  # kept of each kind while the run goes on
+"""Pictures in a report."""
+_MARKED = 7  # at events, at most
+_HELD = 18  # of either kind while the run goes on
 _AREA_PX = 520 * 390
 _QUALITY = 78
 
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """A picture as JPEG, when it was, and what happened then, empty if nothing. weight: how much that matters."""
+    """A picture as JPEG with its frame number, time and a caption. weight: how much its events matter."""
 
     number: int
     time_s: float
-    words: str
+    text: str
     jpeg: bytes
     weight: float = 1.0
 
+    @property
+    def when(self) -> str:
+        """Frame number and time for a reader."""
+        return f"frame {self.number}" + (f", {self.time_s:.1f} s" if math.isfinite(self.time_s) else "")
+
 
 class KeyFrames:
-    """Takes the frames of a run in order and keeps few."""
+    """Chooses a few of the frames of a run, given in order."""
 
     def __init__(self) -> None:
         self._even: list[KeyFrame] = []
@@ -36,12 +42,12 @@ class KeyFrames:
         self._known: set[str] = set()
 
     def add(
-        self, number: int, time_s: float, kinds: Mapping[str, float], words: str, draw: Callable[[], np.ndarray]
+        self, number: int, time_s: float, kinds: Mapping[str, float], text: str, draw: Callable[[], np.ndarray]
     ) -> None:
-        """A frame. kinds: of what happened at it, each with its weight; the first frame of each is kept.
+        """Consider the next frame.
 
-        words: the same, to be read.
-        draw: makes the frame's picture, (H, W, 3) uint8 BGR; only called where it is wanted.
+        kinds: kinds of events at it with their weights; the first frame of each kind is kept. text: the caption.
+        draw: returns the frame's picture, (H, W, 3) uint8 BGR; called only if the frame is kept.
         """
         new = set(kinds) - self._known
         due = self._taken % self._stride == 0
@@ -49,23 +55,23 @@ class KeyFrames:
         if not (due or new):
             return
         weight = max((kinds[kind] for kind in new), default=0.0)
-        taken = KeyFrame(number, time_s, words, _jpeg(draw()), weight)
+        taken = KeyFrame(number, time_s, text, _jpeg(draw()), weight)
         if new:
             self._known |= new
             self._marked.append(taken)
             if len(self._marked) > _HELD:
-                del self._marked[_spared(self._marked)]
+                del self._marked[_least_needed(self._marked)]
         if due:
             self._even.append(taken)
             if len(self._even) > _HELD:
-                # Every other one goes: those left are spread evenly, however long the run.
+                # Dropping every other one keeps the rest evenly spread.
                 self._even, self._stride = self._even[::2], 2 * self._stride
 
     def chosen(self) -> list[KeyFrame]:
-        """Those to show, by frame: where something happened, and others that are far from all of these."""
+        """The key frames by number: those at events, and others that are far from all of these."""
         marked = list(self._marked)
         while len(marked) > _MARKED:
-            del marked[_spared(marked)]
+            del marked[_least_needed(marked)]
         chosen = {taken.number: taken for taken in marked}
         rest = [taken for taken in self._even if taken.number not in chosen]
         if rest and not chosen:
@@ -78,8 +84,8 @@ class KeyFrames:
         return [chosen[number] for number in sorted(chosen)]
 
 
-def _spared(taken: Sequence[KeyFrame]) -> int:
-    """Which of some frames in order can best be done without: one that matters little, or that has another near."""
+def _least_needed(taken: Sequence[KeyFrame]) -> int:
+    """The index of the frame with the least weight or the nearest neighbour."""
     apart = np.diff([one.number for one in taken]).astype(float)
     nearest = np.minimum(np.r_[np.inf, apart], np.r_[apart, np.inf])
     return int(np.argmin(nearest * [one.weight for one in taken]))

@@ -30,8 +30,8 @@ from torchvision_dddas.io.output.run_log import (
 from torchvision_dddas.io.output.run_record import Record
 from torchvision_dddas.io.overlay.survey_overlay import Once
 from torchvision_dddas.io.report.keyframes import KeyFrames
-from torchvision_dddas.io.report.run_plots import Course
-from torchvision_dddas.io.report.run_report import Story, Table, report, span
+from torchvision_dddas.io.report.run_report import RunSummary, Table, format_span, run_report
+from torchvision_dddas.io.report.timelines import RunTimeline
 from torchvision_dddas.types import FrameResult
 
 REPORT = "report.html"
@@ -48,7 +48,7 @@ class RunStory:
     def __init__(self, folder: Path, name: str, kept: Record, names: Sequence[str], pictures: Once | None) -> None:
         """name: of the clip. names: of the landmarks. pictures: of the frames, None where no key frames are wanted."""
         self._folder, self._name, self._kept, self._names, self._pictures = folder, name, kept, tuple(names), pictures
-        self.log, self.course, self.frames, self.signs = RunLog(), Course(names), KeyFrames(), Signs()
+        self.log, self.course, self.frames, self.signs = RunLog(), RunTimeline(names), KeyFrames(), Signs()
         self._orders = Orders()
         self._explained: set[str] = set()
         self._score: dict[str, Any] = {}
@@ -108,7 +108,7 @@ class RunStory:
         """The log's entries by frame."""
         return [e for e in self.log.ordered() if e.kind != MARK or e.count >= _BRIEF]
 
-    def told(self, story: Story) -> Story:
+    def told(self, story: RunSummary) -> RunSummary:
         """A report's story with what is known of the run beside."""
         self.course.entries = entries = self.entries()
         clock = self._clock()
@@ -133,8 +133,8 @@ class RunStory:
             story,
             figures=[*story.figures, *figures],
             tables=tables,
-            first=said,
-            pictures=self.frames.chosen(),
+            first_tables=said,
+            key_frames=self.frames.chosen(),
             panels=self.course.panels(),
         )
 
@@ -142,8 +142,8 @@ class RunStory:
         """Write report.html of a run that locates nothing. Raises OSError if it cannot be written."""
         state = "complete" if complete else "interrupted: up to the last whole frame"
         notes = [*self._kept.notes, *self._kept.problems]
-        story = self.told(Story(f"Found and followed: {self._name}", state, figures, facts, [], notes))
-        write_whole(self._folder / REPORT, report(replace(story, panels=()), self.course).encode())
+        story = self.told(RunSummary(f"Found and followed: {self._name}", state, figures, facts, [], notes))
+        write_whole(self._folder / REPORT, run_report(replace(story, panels=()), self.course).encode())
 
     def _clock(self) -> Clock:
         return Clock(self.course.rows["frame"], self.course.rows["time_s"])
@@ -219,4 +219,4 @@ def _row(entry: Entry, clock: Clock) -> tuple[str, str, str, str]:
     """An entry as a row of a report's table."""
     at, seldom = clock.of(entry), clock.seldom(entry)
     text = f"{entry.text} ({seldom})" if seldom else entry.text
-    return f"{at:.2f}" if np.isfinite(at) else "", span(entry.first, entry.last), entry.kind, text
+    return f"{at:.2f}" if np.isfinite(at) else "", format_span(entry.first, entry.last), entry.kind, text
