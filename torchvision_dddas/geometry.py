@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from math import atan2, cos, sin, sqrt
 from typing import Any
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import Float, Int
+from torchvision_dddas.types import Camera, Float, Int, Poses, PoseTable
 
 
 def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
@@ -127,6 +128,20 @@ def _disjoint(boxes: list[Box]) -> list[Box]:
         else:
             apart.append(box)
     return apart
+
+
+def parts_of(
+    mask: np.ndarray, box: tuple[int, int, int, int], min_area_px: float
+) -> list[tuple[tuple[int, int, int, int], np.ndarray]]:
+    """The connected parts (8 neighbours) of a (height, width) mask in a box that are large enough: (box, mask) each."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
+    parts = []
+    for label in range(1, count):
+        left, top, width, height, area = (int(v) for v in stats[label])
+        if area >= min_area_px:
+            part = labels[top : top + height, left : left + width] == label
+            parts.append(((box[0] + left, box[1] + top, width, height), part))
+    return parts
 
 
 def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
@@ -341,3 +356,63 @@ def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
     """(..., 2) metres a degree of longitude and of latitude."""
     latitude = origin_deg[..., 1]
     return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)
+
+
+def great_circle_m(lonlat_deg: np.ndarray, from_deg: np.ndarray) -> np.ndarray:
+    """(N,) great-circle distances on a sphere, good to half a percent: enough to see a mistake."""
+    longitude, latitude = np.radians(lonlat_deg).T
+    longitude_0, latitude_0 = np.radians(from_deg)
+    half = (
+        np.sin((latitude - latitude_0) / 2) ** 2
+        + np.cos(latitude) * np.cos(latitude_0) * np.sin((longitude - longitude_0) / 2) ** 2
+    )
+    return 2 * 6_371_000.0 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))
+
+
+def poses_at(
+    camera: Camera, table: PoseTable | None, frame: np.ndarray, rate_hz: float | None = None
+) -> tuple[Camera, Poses]:
+    """The camera, with the kind of place that its poses have, and where it stood in each frame.
+
+    Between samples place and pitch go straight on, heading and longitude by the shorter way round.
+    Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
+    """
+    n = len(frame)
+    if table is None:
+        return camera, Poses(
+            np.tile(camera.place, (n, 1)).astype(float),
+            np.full(n, camera.heading_rad),
+            np.full(n, camera.pitch_rad),
+        )
+    if table.timed and rate_hz is None:
+        raise InputError(f"poses {table.path} are by time_s; say with --rate how many frames a second there are")
+    when = (np.asarray(frame) - 1) / rate_hz if table.timed and rate_hz else np.asarray(frame, float)
+    outside = (when < table.at[0] - 1e-6) | (when > table.at[-1] + 1e-6)
+    if outside.any():
+        unit = "seconds" if table.timed else "frames"
+        first = int(outside.argmax())
+        raise InputError(
+            f"poses {table.path} cover {unit} {table.at[0]:g} to {table.at[-1]:g}; {int(outside.sum())} of {n} rows of "
+            f"the table lie outside, the first at frame {frame[first]}. Give poses for all of them"
+        )
+    values = table.values
+    for kind, geographic in ((("longitude_deg", "latitude_deg"), True), (("east_m", "north_m"), False)):
+        if kind[0] in values:
+            camera = replace(camera, geographic=geographic)
+            # A longitude goes on over 180 degrees, not back through 0; a place of metres is not turned.
+            samples = [values[key] for key in kind]
+            if geographic:
+                samples[0] = np.unwrap(samples[0], period=360)
+            place = np.stack([np.interp(when, table.at, sample) for sample in samples], axis=1)
+            if geographic:
+                place[:, 0] = (place[:, 0] + 180) % 360 - 180
+            break
+    else:
+        place = np.tile(camera.place, (n, 1)).astype(float)
+    heading = np.full(n, camera.heading_rad)
+    if "heading_deg" in values:
+        heading = np.interp(when, table.at, np.unwrap(np.radians(values["heading_deg"])))
+    pitch = np.full(n, camera.pitch_rad)
+    if "pitch_deg" in values:
+        pitch = np.interp(when, table.at, np.radians(values["pitch_deg"]))
+    return camera, Poses(place, heading, pitch)

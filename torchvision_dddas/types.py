@@ -1,8 +1,9 @@
 """The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 
@@ -19,6 +20,26 @@ else:
             return array_and_shape[0]
 
     Bool = Float = Int = _Array
+
+
+class Table:
+    """A record whose arrays have one row an item each: rows can be selected, and tables of one kind joined."""
+
+    def __getitem__(self, rows: np.ndarray | slice) -> Self:
+        """The rows with the given numbers, mask or slice. What is no array stays as it is."""
+        return replace(self, **{name: column[rows] for name, column in _columns(self).items()})  # type: ignore[type-var]
+
+    @classmethod
+    def concat(cls, tables: Sequence[Self]) -> Self:
+        """One table of the rows of all. What is no array is taken from the first."""
+        columns = [_columns(table) for table in tables]
+        joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
+        return replace(tables[0], **joined)  # type: ignore[type-var]
+
+
+def _columns(table: Any) -> dict[str, np.ndarray]:
+    values = {column.name: getattr(table, column.name) for column in fields(table)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 @dataclass(frozen=True)
@@ -132,7 +153,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Detections:
+class Detections(Table):
     """The moving targets of one frame, one row a target.
 
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
@@ -293,7 +314,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class People:
+class People(Table):
     """The people recognized in one frame, one row a person.
 
     box_px: (N, 4) float64, the body: x, y of the top left pixel, width, height. score: (N,) probability in [0, 1].
@@ -366,7 +387,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Poses:
+class Poses(Table):
     """Where a camera stood and looked, one row a picture or a sighting; the angles as in Camera.
 
     place: (N, 2), in the camera's own kind. heading_rad, pitch_rad: (N,).
@@ -378,7 +399,21 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PoseTable:
+    """What a CSV says of a camera at some frames or times, sorted. at: (N,) frames, or seconds if timed.
+
+    values: column -> (N,), heading_deg, pitch_deg and a place in longitude_deg,
+    latitude_deg or east_m, north_m; a column that is not there stays as the camera's own file has it.
+    """
+
+    path: str
+    at: np.ndarray
+    timed: bool
+    values: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Sightings(Table):
     """People as cameras on the ground saw them, one row a person in a picture; metres are local.
 
     east_north_m: (N, 2), NaN where no distance is known. distance_m: (N,) over the ground. bearing_rad: (N,) clockwise
@@ -408,7 +443,7 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class Landmarks:
+class Landmarks(Table):
     """What is known of landmarks, ground vehicles of known place: one row a report, sorted by frame.
 
     frame: (N,) float64 from 1; a report between two pictures has a broken number. landmark: (N,) int64, which of the
@@ -434,7 +469,7 @@ class Landmarks:
 
 
 @dataclass(frozen=True)
-class LandmarkObservations:
+class LandmarkObservations(Table):
     """The landmarks of one frame, one row each.
 
     landmark: (n,) int64, which of the names. image_px: (n, 2), NaN where the picture does not show it.
@@ -538,7 +573,7 @@ class Elevation:
 
 
 @dataclass(frozen=True)
-class Positions:
+class Positions(Table):
     """Where targets stand on the ground, one row a sighting, sorted by frame.
 
     frame: (N,) int64 from 1. target: (N,) int64, the identity where there is one, else the row in its frame, from 1.
@@ -636,7 +671,7 @@ class Confirmation:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class Tracks(Table):
     """The targets of one frame with their identities, one row a target.
 
     frame: 1-based number. identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.

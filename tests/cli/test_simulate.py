@@ -11,7 +11,7 @@ from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry
 from torchvision_dddas.evaluation.metrics import truth as judges
-from torchvision_dddas.io.camera_files import poses_at, read_camera, read_poses
+from torchvision_dddas.io.camera_files import read_camera, read_poses
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.landmark_tables import read_landmarks
 from torchvision_dddas.io.position_tables import read_positions
@@ -123,7 +123,7 @@ def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
         11,
         16,
     ]
-    camera, poses = poses_at(camera, table, np.array([1, 4]))
+    camera, poses = geometry.poses_at(camera, table, np.array([1, 4]))
     assert camera.geographic
     true = read_positions(folder / "truth" / "positions.csv")
     vehicles = [r for r in csv.DictReader((folder / "truth" / "positions.csv").open()) if r["kind"] == "ugv"]

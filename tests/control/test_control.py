@@ -15,13 +15,10 @@ from torchvision_dddas.config import (
 )
 from torchvision_dddas.control.rules import (
     SAMPLING,
-    LandmarkUse,
     Load,
     Regime,
     adjusted,
-    best_spread,
     bounded,
-    chosen,
     every_least,
     every_wanted,
     interval_from_flow,
@@ -30,9 +27,9 @@ from torchvision_dddas.control.rules import (
     rungs,
     sampled,
     shed,
-    spread_m2,
     steered,
 )
+from torchvision_dddas.geo.landmark_selection import LandmarkUse, best_spread, chosen, spread_m2
 from torchvision_dddas.types import Adjustment, LandmarkObservations
 
 KNOBS = IntervalParameters(minimum_frames=1, maximum_frames=12)

@@ -142,7 +142,8 @@ def _positions(path: Path) -> None:
 
 
 def _landmarks(path: Path) -> None:
-    from torchvision_dddas.io.landmark_tables import looks_swapped, read_landmarks
+    from torchvision_dddas.geo.site import looks_swapped
+    from torchvision_dddas.io.landmark_tables import read_landmarks
 
     found = read_landmarks(path, 10.0, 0.5)
     _finite(found.frame)
@@ -164,7 +165,8 @@ def _camera(path: Path) -> None:
 
 
 def _poses(path: Path) -> None:
-    from torchvision_dddas.io.camera_files import poses_at, read_poses
+    from torchvision_dddas.geometry import poses_at
+    from torchvision_dddas.io.camera_files import read_poses
     from torchvision_dddas.types import Camera
 
     camera = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)

@@ -195,7 +195,7 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert camera.focal_px[0] == pytest.approx(500 / np.tan(np.radians(30)))
     camera, known, (note,) = camera_of(None, (1000, 600), None, Settings())
     assert not known
-    assert "70 degrees were taken" in note
+    assert "using 70 degrees" in note
     assert camera.centre_px == (499.5, 299.5)
 
 

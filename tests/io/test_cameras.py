@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.camera_files import camera_keys, poses_at, read_camera, read_poses
+from torchvision_dddas.geometry import poses_at
+from torchvision_dddas.io.camera_files import camera_keys, read_camera, read_poses
 
 LEAST = "focal_px = 1000\nwidth_px = 640\nheight_px = 480\n"
 

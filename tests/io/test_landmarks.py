@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.landmark_tables import looks_swapped, read_landmarks
+from torchvision_dddas.geo.site import looks_swapped
+from torchvision_dddas.io.landmark_tables import read_landmarks
 
 HEADER = "frame,landmark,longitude_deg,latitude_deg\n"
 

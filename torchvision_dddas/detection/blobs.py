@@ -92,20 +92,6 @@ def weak_blobs(
     return [replace(blob, weak=True) for blob in others if not taken[blob.window][blob.mask].any()]
 
 
-def parts_of(
-    mask: np.ndarray, box: tuple[int, int, int, int], min_area_px: float
-) -> list[tuple[tuple[int, int, int, int], np.ndarray]]:
-    """The connected parts (8 neighbours) of a (height, width) mask in a box that are large enough: (box, mask) each."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
-    parts = []
-    for label in range(1, count):
-        left, top, width, height, area = (int(v) for v in stats[label])
-        if area >= min_area_px:
-            part = labels[top : top + height, left : left + width] == label
-            parts.append(((box[0] + left, box[1] + top, width, height), part))
-    return parts
-
-
 def filled_hull(region: np.ndarray) -> np.ndarray:
     """The convex hull of the true pixels of a (h, w) mask, as a mask of the same shape."""
     canvas = region.astype(np.uint8)

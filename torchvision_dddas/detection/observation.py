@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, blob_motion, only_velocity
-from torchvision_dddas.detection.blobs import Blob, find_blobs, parts_of, weak_blobs
+from torchvision_dddas.detection.blobs import Blob, find_blobs, weak_blobs
 from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, Window
 from torchvision_dddas.detection.flow_split import parted_by_flow
 from torchvision_dddas.detection.fragments import groups
@@ -17,6 +17,7 @@ from torchvision_dddas.detection.motion_segmentation import moving_parts
 from torchvision_dddas.detection.outlines import refine
 from torchvision_dddas.detection.persistence import Sighting, persistent
 from torchvision_dddas.detection.shadows import without_shadow
+from torchvision_dddas.geometry import parts_of
 from torchvision_dddas.types import Detections
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import AerialParameters, Settings
-from torchvision_dddas.control.rules import LandmarkUse, chosen
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.elevation import surface, up
 from torchvision_dddas.geo.georeferencer import Registrar
+from torchvision_dddas.geo.landmark_selection import LandmarkUse, chosen
 from torchvision_dddas.geo.landmark_trajectories import Courses
 from torchvision_dddas.geo.plane import absolute, ground_points
 from torchvision_dddas.geo.site import Site

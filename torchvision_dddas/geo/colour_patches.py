@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.mask_cleaning import ellipse
 from torchvision_dddas.geometry import occupied
 
 _CLOSE_PX = 5
 """Gaps of a patch up to about this wide are closed: an antenna, a seam, a pixel of noise."""
+
+_CLOSING = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSE_PX, _CLOSE_PX))
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ def patches_of(mask: np.ndarray, least_area_px: int) -> Patches:
     """The patches of a (H, W) uint8 mask, 8 neighbours, small gaps closed, of at least an area."""
     centres, areas, boxes = [], [], []
     for left, top, wide, high in occupied(mask, 2 * _CLOSE_PX):
-        part = cv2.morphologyEx(mask[top : top + high, left : left + wide], cv2.MORPH_CLOSE, ellipse(_CLOSE_PX))
+        part = cv2.morphologyEx(mask[top : top + high, left : left + wide], cv2.MORPH_CLOSE, _CLOSING)
         count, _, stats, middles = cv2.connectedComponentsWithStats(part, ltype=cv2.CV_32S)
         large = 1 + np.flatnonzero(stats[1:count, cv2.CC_STAT_AREA] >= least_area_px)
         centres.append(middles[large] + (left, top))

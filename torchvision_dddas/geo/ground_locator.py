@@ -10,8 +10,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.fusion import fuse
 from torchvision_dddas.geo.ranging import sight, touches_border
-from torchvision_dddas.io.camera_files import PoseTable, poses_at
-from torchvision_dddas.types import Camera, DetectionTable, GroundLocations, Poses, Positions, Sightings
+from torchvision_dddas.types import Camera, DetectionTable, GroundLocations, Poses, PoseTable, Positions, Sightings
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,8 @@ def survey(
             f"ground.mode = paper knows no covariances to fuse {len(tables)} cameras by; give one table, or use default"
         )
     stood = [
-        poses_at(camera, pose, table.frame, rate_hz) for camera, pose, table in zip(cameras, poses, tables, strict=True)
+        geometry.poses_at(camera, pose, table.frame, rate_hz)
+        for camera, pose, table in zip(cameras, poses, tables, strict=True)
     ]
     if len({camera.geographic for camera, _ in stood}) > 1:
         raise InputError("some cameras stand at longitude and latitude, others at local metres; give all in one kind")

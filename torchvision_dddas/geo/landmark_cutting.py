@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.blobs import parts_of
+from torchvision_dddas.geometry import parts_of
 from torchvision_dddas.types import Bool, Detections, Float
 
 _OF_VEHICLE = 4

@@ -10,7 +10,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.elevation import up
-from torchvision_dddas.io.landmark_tables import looks_swapped
+from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)
@@ -82,6 +82,17 @@ def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
         telemetry = local(telemetry, origin)
         _near(landmarks, telemetry)
     return Site(landmarks, telemetry, origin)
+
+
+def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
+    """Whether longitude and latitude are swapped, judged by a place in degrees that must be near, as the vehicle's."""
+    known = landmarks.place[np.isfinite(landmarks.place).all(axis=1)]
+    if not landmarks.geographic or not len(known) or not np.isfinite(near_lonlat).all():
+        return False
+    near, middle = np.array(near_lonlat, float), np.median(known, axis=0)
+    given, swapped = (float(great_circle_m(point[None], near)[0]) for point in (middle, middle[::-1]))
+    # Where longitude and latitude are nearly alike, swapping them moves a place by little.
+    return swapped < FARTHEST_M and given > 10 * max(swapped, 300.0)
 
 
 def local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:

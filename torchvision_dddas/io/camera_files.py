@@ -12,7 +12,6 @@ latitude_deg = 32.23
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.csv_text import Line, opened
 from torchvision_dddas.io.toml_text import toml_of
-from torchvision_dddas.types import Camera, Poses
+from torchvision_dddas.types import Camera, PoseTable
 
 LIMITS: dict[str, tuple[float, float]] = {
     "focal_px": (1, 1e6),
@@ -88,7 +87,7 @@ def camera_keys(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def left_open(camera: str | Path, poses: "PoseTable | None" = None) -> str:
+def left_open(camera: str | Path, poses: PoseTable | None = None) -> str:
     """What a camera's file, and its poses, do not say, and what is taken for it, in words; empty where all is there."""
     given = {*camera_keys(camera), *(poses.values if poses is not None else ())}
     gaps = []
@@ -186,19 +185,6 @@ def _place(numbers: dict[str, float], path: str | Path) -> tuple[tuple[float, fl
 POSE_COLUMNS = ("frame", "time_s", "longitude_deg", "latitude_deg", "east_m", "north_m", "heading_deg", "pitch_deg")
 
 
-@dataclass(frozen=True)
-class PoseTable:
-    """What a CSV says of a camera at some frames or times, sorted. at: (N,) frames, or seconds if timed.
-
-    values: column -> (N,), any of POSE_COLUMNS; a column that is not there stays as the camera's own file has it.
-    """
-
-    path: str
-    at: np.ndarray
-    timed: bool
-    values: dict[str, np.ndarray]
-
-
 def read_poses(path: str | Path) -> PoseTable:
     """Read the poses of a camera: `frame` or `time_s`, and any of the other POSE_COLUMNS; further ones are ignored.
 
@@ -207,55 +193,6 @@ def read_poses(path: str | Path) -> PoseTable:
     """
     with opened(path, "poses") as (header, lines):
         return _parse(header, lines, str(path))
-
-
-def poses_at(
-    camera: Camera, table: PoseTable | None, frame: np.ndarray, rate_hz: float | None = None
-) -> tuple[Camera, Poses]:
-    """The camera, with the kind of place that its poses have, and where it stood in each frame.
-
-    Between samples place and pitch go straight on, heading and longitude by the shorter way round.
-    Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
-    """
-    n = len(frame)
-    if table is None:
-        return camera, Poses(
-            np.tile(camera.place, (n, 1)).astype(float),
-            np.full(n, camera.heading_rad),
-            np.full(n, camera.pitch_rad),
-        )
-    if table.timed and rate_hz is None:
-        raise InputError(f"poses {table.path} are by time_s; say with --rate how many frames a second there are")
-    when = (np.asarray(frame) - 1) / rate_hz if table.timed and rate_hz else np.asarray(frame, float)
-    outside = (when < table.at[0] - 1e-6) | (when > table.at[-1] + 1e-6)
-    if outside.any():
-        unit = "seconds" if table.timed else "frames"
-        first = int(outside.argmax())
-        raise InputError(
-            f"poses {table.path} cover {unit} {table.at[0]:g} to {table.at[-1]:g}; {int(outside.sum())} of {n} rows of "
-            f"the table lie outside, the first at frame {frame[first]}. Give poses for all of them"
-        )
-    values = table.values
-    for kind, geographic in zip(PLACES, (True, False), strict=True):
-        if kind[0] in values:
-            camera = replace(camera, geographic=geographic)
-            # A longitude goes on over 180 degrees, not back through 0; a place of metres is not turned.
-            samples = [values[key] for key in kind]
-            if geographic:
-                samples[0] = np.unwrap(samples[0], period=360)
-            place = np.stack([np.interp(when, table.at, sample) for sample in samples], axis=1)
-            if geographic:
-                place[:, 0] = (place[:, 0] + 180) % 360 - 180
-            break
-    else:
-        place = np.tile(camera.place, (n, 1)).astype(float)
-    heading = np.full(n, camera.heading_rad)
-    if "heading_deg" in values:
-        heading = np.interp(when, table.at, np.unwrap(np.radians(values["heading_deg"])))
-    pitch = np.full(n, camera.pitch_rad)
-    if "pitch_deg" in values:
-        pitch = np.interp(when, table.at, np.radians(values["pitch_deg"]))
-    return camera, Poses(place, heading, pitch)
 
 
 def _parse(header: list[str], lines: Iterator[Line], path: str) -> PoseTable:

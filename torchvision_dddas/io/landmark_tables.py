@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.io.csv_text import Line, opened
 from torchvision_dddas.io.detection_tables import LAST_FRAME
 from torchvision_dddas.types import Landmarks
@@ -48,17 +49,6 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
     """
     with opened(path, "landmarks") as (header, lines):
         return _parse(header, list(lines), str(path), rate_hz, clock_offset_s)
-
-
-def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
-    """Whether longitude and latitude are swapped, judged by a place in degrees that must be near, as the vehicle's."""
-    known = landmarks.place[np.isfinite(landmarks.place).all(axis=1)]
-    if not landmarks.geographic or not len(known) or not np.isfinite(near_lonlat).all():
-        return False
-    near, middle = np.array(near_lonlat, float), np.median(known, axis=0)
-    given, swapped = (float(_apart_m(point[None], near)[0]) for point in (middle, middle[::-1]))
-    # Where longitude and latitude are nearly alike, swapping them moves a place by little.
-    return swapped < FARTHEST_M and given > 10 * max(swapped, 300.0)
 
 
 def _parse(header: list[str], lines: list[Line], path: str, rate_hz: float | None, offset_s: float) -> Landmarks:
@@ -240,7 +230,7 @@ def _check_far(found: Landmarks) -> None:
     if found.geographic:
         from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # both sides of 180 degrees are near each other
     middle = start + np.median(from_start[known], axis=0)
-    away = _apart_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
+    away = great_circle_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
     away = np.where(known, away, 0.0)
     k = int(away.argmax())
     if away[k] > FARTHEST_M:
@@ -250,14 +240,3 @@ def _check_far(found: Landmarks) -> None:
             f"landmarks {found.path}, line {found.line[k]}: {first:g}, {second:g} lies {away[k] / 1000:.0f} km from "
             f"most others; wanted at most {FARTHEST_M / 1000:g} km{fix or ': check the digits'}"
         )
-
-
-def _apart_m(lonlat_deg: np.ndarray, from_deg: np.ndarray) -> np.ndarray:
-    """(N,) great-circle distances on a sphere, good to half a percent: enough to see a mistake."""
-    longitude, latitude = np.radians(lonlat_deg).T
-    longitude_0, latitude_0 = np.radians(from_deg)
-    half = (
-        np.sin((latitude - latitude_0) / 2) ** 2
-        + np.cos(latitude) * np.cos(latitude_0) * np.sin((longitude - longitude_0) / 2) ** 2
-    )
-    return 2 * 6_371_000.0 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))

@@ -7,11 +7,10 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import east_north
-from torchvision_dddas.io.camera_files import PoseTable, poses_at
+from torchvision_dddas.geometry import east_north, poses_at
 from torchvision_dddas.people.collaboration import Beliefs, Look, View, confirm_boxes, look, view_of
 from torchvision_dddas.people.pyramid import smallest_body_px
-from torchvision_dddas.types import Camera, Confirmation, DetectionTable, Positions
+from torchvision_dddas.types import Camera, Confirmation, DetectionTable, PoseTable, Positions
 
 
 @dataclass(frozen=True)
