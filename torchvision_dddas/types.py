@@ -1,9 +1,9 @@
 """The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, overload
+from typing import TYPE_CHECKING, Any, Protocol, Self, overload
 
 import numpy as np
 
@@ -57,6 +57,49 @@ class Frame:
     image: np.ndarray
     skipped: int = 0
     taken_s: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A fault that reading a clip survived: the 1-based number of the first frame it touches, and what it was."""
+
+    frame: int
+    what: str
+
+    def __str__(self) -> str:
+        return self.what
+
+
+class Source(Protocol):
+    """A clip that is read frame by frame.
+
+    Iterating yields frames in order, numbered from 1. A frame that cannot be decoded is left out.
+    name: for messages. count: announced frames, None where unknown, as for a live stream. exact: whether the count is
+    more than a guess from the duration. rate_hz: frames a second. size: (width, height) of every frame, px. last: the
+    number of the last frame read; once the clip was read to its end, of the last frame in it, decoded or not. problems:
+    filled while reading; each new iteration starts at frame 1 and empties it.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def count(self) -> int | None: ...  # noqa: D102
+    @property
+    def exact(self) -> bool: ...  # noqa: D102
+    @property
+    def rate_hz(self) -> float: ...  # noqa: D102
+    @property
+    def size(self) -> tuple[int, int]: ...  # noqa: D102
+    @property
+    def last(self) -> int: ...  # noqa: D102
+    @property
+    def problems(self) -> list[Problem]: ...  # noqa: D102
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Yield frames 1, 1 + interval, ...; the others are not decoded where that can be avoided."""
+        ...
 
 
 @overload

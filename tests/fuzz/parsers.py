@@ -83,19 +83,17 @@ def _finite(*arrays: np.ndarray) -> None:
 
 
 def _detections(path: Path) -> None:
-    from torchvision_dddas.io.detection_tables import read_detections
-    from torchvision_dddas.io.table_checks import agreed
-    from torchvision_dddas.io.table_rows import header_of, read_rows
+    from torchvision_dddas.io.detection_tables import check_table, read_detections, read_header, read_rows
 
     table = read_detections(path)
     _finite(table.box_px, table.score)
     assert (np.diff(table.frame) >= 0).all()
     _ = (table.extent, table.probable, table.at(table.first))
-    header_of(path)
+    read_header(path)
     if len(table):
-        read_rows(path, len(table))
+        read_rows(path)
     _ = table.targets
-    agreed(table, 2)
+    check_table(table, 2)
 
 
 def _truth(path: Path) -> None:

@@ -91,8 +91,9 @@ def test_a_file_that_cannot_be_read_is_said(tmp_path, content, message):
 
 
 def test_numbers_are_told_from_what_is_none():
-    np.testing.assert_array_equal(parse_numbers(["1", "", "nan", "-2e3"]), [1, math.nan, math.nan, -2000])
-    np.testing.assert_array_equal(parse_numbers(["1", "", "x", "1_0"]), [1, math.nan, math.inf, math.inf])
+    np.testing.assert_array_equal(parse_numbers(["1", "", "-2e3"]), [1, math.nan, -2000])
+    np.testing.assert_array_equal(parse_numbers(["1", "", "x"]), [1, math.nan, math.inf])
+    np.testing.assert_array_equal(parse_numbers(["nan", "1_0", ""]), [math.inf, math.inf, math.nan])
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,10 @@ import pytest
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.io.sources import Source
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.tracking.source_tracker import PaperTracker
 from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.types import Detections, DetectionTable, Frame, Scene
+from torchvision_dddas.types import Detections, DetectionTable, Frame, Scene, Source
 
 SETTINGS = load_config()
 SIZE = (320, 240)

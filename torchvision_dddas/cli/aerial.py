@@ -88,10 +88,9 @@ def aerial_into(
     from torchvision_dddas.geo import check_table, locate
     from torchvision_dddas.geo.table_location import frames_of, outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
     from torchvision_dddas.io.output.location_output import GroundedOutput
     from torchvision_dddas.io.sources import open_source
-    from torchvision_dddas.io.table_checks import within_clip
 
     check_rate(rate_hz)
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
@@ -101,7 +100,7 @@ def aerial_into(
         source = open_source(clip, rate_hz=rate_hz) if clip else None
         rate = source.rate_hz if source is not None else rate_hz
         if source is not None:
-            within_clip(read, source)
+            check_within_clip(read, source)
         size = source.size if source is not None else None
         locator, notes = read_locator(
             given, settings, size, rate, backend, (read.first, read.last), "table", clip, extent=read.extent

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchvision_dddas.io.output.run_record import Record
-    from torchvision_dddas.io.sources import Source
+    from torchvision_dddas.types import Source
 
 
 def folders_for(inputs: Sequence[str], out: Path) -> list[Path]:

@@ -57,7 +57,7 @@ def confirm(
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.detection_tables import LAST_FRAME
+    from torchvision_dddas.io.tables import LAST_FRAME
 
     settings = load_config(config, set_ or [])
     if not 1 <= interval <= LAST_FRAME:
@@ -82,13 +82,13 @@ def confirm_into(
 ) -> "ConfirmJournal":
     """Confirm and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.detection_tables import read_header
     from torchvision_dddas.io.output.confirmation_output import ConfirmOutput
-    from torchvision_dddas.io.table_rows import header_of
 
     check_rate(rate_hz)
     written = [folder / name for name in ConfirmOutput.files]
     refuse_own_input([blobs, *people, *cameras, *poses], written, "folder with --out")
-    headers = {path: header_of(path) for path in (blobs, *people)}
+    headers = {path: read_header(path) for path in (blobs, *people)}
     places = {path: "east_m" in header for path, header in headers.items()}
     for path, of_places in places.items():
         if of_places != places[blobs]:
@@ -142,9 +142,9 @@ def _on_the_ground(
     rate_hz: float | None,
     notes: list[str],
 ) -> _Found:
+    from torchvision_dddas.io.detection_tables import read_rows
     from torchvision_dddas.io.output.confirmation_output import COLUMNS
     from torchvision_dddas.io.position_tables import read_positions
-    from torchvision_dddas.io.table_rows import read_rows
     from torchvision_dddas.people.confirmation import confirm_positions
 
     given = read_positions(blobs)
@@ -153,7 +153,7 @@ def _on_the_ground(
         notes.append("without --camera nothing is known of what was seen: no blob can be found not human")
     if identities is None:  # a table of positions does not say it, and looks at different blobs must not add up
         notes.append("every row is judged alone; where target numbers last, --identities adds up the looks at each")
-    rows = read_rows(blobs, len(given), COLUMNS)
+    rows = read_rows(blobs, COLUMNS)
     return *rows, confirm_positions(given, vehicles, settings, interval, bool(identities), rate_hz)
 
 
@@ -193,16 +193,15 @@ def _in_pictures(
 ) -> _Found:
     from dataclasses import replace
 
-    from torchvision_dddas.io.detection_tables import read_detections
+    from torchvision_dddas.io.detection_tables import read_detections, read_rows
     from torchvision_dddas.io.output.confirmation_output import COLUMNS
-    from torchvision_dddas.io.table_rows import read_rows
     from torchvision_dddas.people.confirmation import confirm_pictures
 
     given = read_detections(blobs)
     if identities is False:
         given = replace(given, identity=None)
     tables = [read_detections(path) for path in people]
-    return *read_rows(blobs, len(given), COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
+    return *read_rows(blobs, COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
 
 
 def _names(people: Sequence[Path]) -> list[str]:

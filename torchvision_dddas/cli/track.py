@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.detection.engine import Engine
     from torchvision_dddas.io.output.track_output import TrackJournal
-    from torchvision_dddas.io.sources import Source
-    from torchvision_dddas.types import DetectionTable, TrackedFrame
+    from torchvision_dddas.types import DetectionTable, Source, TrackedFrame
 
 
 @explained
@@ -86,16 +85,15 @@ def track_into(
     refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
     with TrackOutput(folder, save) as output:
         from torchvision_dddas.detection.engine import load_engine
-        from torchvision_dddas.io.detection_tables import read_detections
+        from torchvision_dddas.io.detection_tables import check_birth_score, check_table, read_detections
         from torchvision_dddas.io.sources import open_source
-        from torchvision_dddas.io.table_checks import agreed, beginning
         from torchvision_dddas.types import is_sampled
 
         table = read_detections(detections) if detections is not None else None
         source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
-        notes = agreed(table, interval, source) if table is not None else []
+        notes = check_table(table, interval, source) if table is not None else []
         if table is not None and settings.track.mode == "default":
-            notes += beginning(table, settings.track.birth_score)
+            notes += check_birth_score(table, settings.track.birth_score)
         engine = load_engine(backend, settings) if source is not None else None
         facts = {
             "input": clip,

@@ -1,173 +1,196 @@
-"""Detections from a table: MOTChallenge text of any tool, or the CSV that `dddas detect` writes."""
+"""Detections from a table: MOTChallenge text of any tool, or a CSV with named columns as `dddas detect` writes it."""
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import DetectionTable
+from torchvision_dddas.io.tables import (
+    BOX,
+    FARTHEST,
+    FRAME,
+    Column,
+    CsvText,
+    Schema,
+    parse_numbers,
+    read_csv,
+    read_table,
+)
+from torchvision_dddas.types import DetectionTable, Source, is_sampled
 
-COLUMNS = ("frame", "x_px", "y_px", "width_px", "height_px")
-"""The named columns that a CSV must have; `score` may be there as well, any other is ignored."""
+MOT_NAMES = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
+"""The columns of MOTChallenge text, which has no first line that names them."""
 
 FEET = ("feet_u_px", "feet_v_px")
 """Columns of the point between the feet, from the first pixel's centre."""
 
-LAST_FRAME = 10_000_000
-"""A higher frame number is taken for a mistake, such as a time stamp."""
-
-FARTHEST_PX = 1e9
-"""A place or size beyond is no pixel's."""
-
-LEAST_PX = 1e-3
-"""A smaller width or height is no target's."""
-
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
 
+REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
+
+SCHEMA = Schema(
+    "detections",
+    FRAME,
+    *BOX,
+    Column("score", ".6g", may_be_empty=True),
+    Column("identity"),
+    Column("kind"),
+    Column("cut", "d", 0, 1, is_whole=True, may_be_empty=True, wanted="1 where the border cuts it, else 0"),
+    *(Column(name, ".2f", -FARTHEST, FARTHEST, may_be_empty=True, wanted="pixels") for name in FEET),
+)
+
 
 def read_detections(path: str | Path) -> DetectionTable:
-    """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names COLUMNS.
+    """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
 
-    An id, or a column `identity`, that is no whole number from 1 is none. A column `cut` of 0 and 1 is kept, and so are
-    FEET; any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A
-    table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
-    Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole,
-    below 1 or above LAST_FRAME, a width or height below LEAST_PX, a place or size beyond FARTHEST_PX, a column named
-    twice, a few scores outside [0, 1] (see FEW_SHARE), a cut that is neither 0 nor 1.
+    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut` and FEET may be there;
+    any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
+    without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
+    Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
+    range, a few scores outside [0, 1] (see FEW_SHARE).
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"detections {path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"detections {path} is no text: {error}") from None
-    content = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    own = ours = cuts = feet = False
-    if content and _named(content[0][1]):
-        number, header = content.pop(0)
-        rows = list(_by_name(content, header, f"detections {path}", number))
-        own = _all_moving(content, header)
-        ours = own or {"identity", "kind", "row", "speed_px_per_frame"} <= set(_cells(header))
-        cuts, feet = "cut" in _cells(header), set(FEET) <= set(_cells(header))
-    else:
-        rows = list(_by_place(content, f"detections {path}"))
-    table = np.array(rows, np.float64).reshape(-1, 11)
-    _refuse_few_outside(table[:, 5], table[:, 6], f"detections {path}")
-    table = table[np.argsort(table[:, 0], kind="stable")]
+    text, is_named = _read_cells(path, "detections")
+    if not is_named:
+        short = next((place for place, row in enumerate(text.rows) if len(row) < 6), None)
+        if short is not None:
+            count = len(text.rows[short])
+            raise InputError(
+                f"detections {path}, line {text.line[short]}: {count} column{'s' * (count != 1)}; "
+                "wanted frame,id,x,y,w,h[,score]"
+            )
+        text = CsvText([*MOT_NAMES], text.line, [[*row[:7], ""][:7] for row in text.rows])
+    table = read_table(path, SCHEMA, REQUIRED, text=text)
+    score = np.where(np.isnan(table["score"]), 1.0, table["score"])
+    is_outside = (score < 0) | (score > 1)
+    # One score of 1.3 among thousands of probabilities must not make all of these certain.
+    if 0 < is_outside.sum() < FEW_SHARE * len(score):
+        first = int(is_outside.argmax())
+        raise table.error(
+            f"score is {score[first]:g}; {is_outside.sum()} of {len(score)} scores lie outside [0, 1]. Wanted "
+            "probabilities in [0, 1], or scores on another scale throughout",
+            first,
+        )
+    identity = parse_numbers(table.columns.get("identity", [""] * len(table)))
+    is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
+    kinds = set(table.columns.get("kind", ()))
+    order = np.argsort(table["frame"], kind="stable")
     return DetectionTable(
         str(path),
-        table[:, 0].astype(np.int64),
-        table[:, 1:5],
-        table[:, 5],
-        table[:, 6].astype(np.int64),
-        own,
-        table[:, 7].astype(np.int64),
-        table[:, 8] > 0 if cuts else None,
-        table[:, 9:11] if feet else None,
-        ours,
+        table["frame"][order].astype(np.int64),
+        table.stack(*REQUIRED[1:])[order],
+        score[order],
+        table.line[order],
+        own=kinds == {"moving"},
+        identity=np.where(is_identity, identity, -1).astype(np.int64)[order],
+        cut=table["cut"][order] > 0 if "cut" in table else None,
+        feet_px=table.stack(*FEET)[order] if set(FEET) <= table.columns.keys() else None,
+        ours=kinds == {"moving"} or {"identity", "kind", "row", "speed_px_per_frame"} <= set(table.header),
     )
 
 
-def _named(line: str) -> bool:
-    """Whether a line names columns: its first cell begins with a letter and is no number such as nan."""
-    first = line.replace(",", " ").replace('"', " ").split()[:1]
-    return bool(first) and first[0][0].isalpha() and _number(first[0]) is None
+def read_header(path: str | Path) -> list[str]:
+    """The column names of a table, MOT_NAMES where its first line holds numbers, none where it is empty."""
+    text, is_named = _read_cells(path)
+    return text.header if text.rows or is_named else []
 
 
-def _by_place(content: Sequence[tuple[int, str]], name: str) -> Iterator[list[float]]:
-    for number, line in content:
-        cells = [cell.strip() for cell in line.split(",")] if "," in line else line.split()
-        if len(cells) < 6:
-            raise InputError(
-                f"{name}, line {number}: {len(cells)} column{'s' * (len(cells) != 1)}; wanted frame,id,x,y,w,h[,score]"
-            )
-        row = _row((cells[0], *cells[2:6]), cells[6] if len(cells) > 6 else "", number, name)
-        yield [*row, _identity(cells[1]), 0.0, math.nan, math.nan]
+def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
+    """The column names and cells of a table that its reader found valid, sorted by frame as readers sort it.
+
+    without: columns to leave out. Raises InputError where it cannot be read.
+    """
+    (header, _, rows), _ = _read_cells(path)
+    frame = header.index("frame")
+    kept = [place for place, name in enumerate(header) if name not in without]
+    rows = [[*row, *[""] * (len(header) - len(row))] for row in rows]
+    rows.sort(key=lambda row: float(row[frame]))  # a stable sort
+    return [header[place] for place in kept], [[row[place] for place in kept] for row in rows]
 
 
-def _by_name(content: Sequence[tuple[int, str]], header: str, name: str, line: int) -> Iterator[list[float]]:
-    names = _cells(header)
-    if missing := [column for column in COLUMNS if column not in names]:
-        raise InputError(
-            f"{name}, line {line}: its columns are {', '.join(names)}; {', '.join(missing)} missing. Wanted numbers as "
-            f"frame,id,x,y,w,h[,score], or a first line that names {', '.join(COLUMNS)}"
-        )
-    if twice := [column for column in names if column and names.count(column) > 1]:
-        raise InputError(f"{name}, line {line}: column {twice[0]} is named twice; wanted each name once")
-    places = [names.index(column) for column in COLUMNS]
-    # A column that is not there is read as an empty cell after the last.
-    score, identity, cut, *feet = (
-        names.index(n) if n in names else len(names) for n in ("score", "identity", "cut", *FEET)
-    )
-    for number, text in content:
-        cells = _cells(text)
-        if len(cells) != len(names):
-            raise InputError(f"{name}, line {number}: {len(cells)} columns; the first line names {len(names)}")
-        cells = [*cells, ""]
-        row = _row([cells[place] for place in places], cells[score], number, name)
-        if cells[cut] not in ("", "0", "1"):
-            raise InputError(f"{name}, line {number}: cut is '{cells[cut]}'; wanted 1 where the border cuts it, else 0")
-        standing = [_number(cells[place]) if cells[place] else math.nan for place in feet]
-        for value, place, column in zip(standing, feet, FEET, strict=True):
-            if value is None or abs(value) > FARTHEST_PX:
-                raise InputError(f"{name}, line {number}: {column} is '{cells[place]}'; wanted pixels, or nothing")
-        yield [*row, _identity(cells[identity]), float(cells[cut] == "1"), *(v for v in standing if v is not None)]
+def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
+    """The cells of a table, and whether its first line names the columns; else they get the names of MOTChallenge."""
+    _, line, rows = read_csv(path, what, has_header=False)
+    # The first name may be empty: so a table with an index begins.
+    first = next((word for word in " ".join(rows[0]).split()), "") if rows else ""
+    if first[:1].isalpha() and not _is_number(first):
+        return CsvText(rows[0], line[1:], rows[1:]), True
+    rows = [row if len(row) > 1 else row[0].split() for row in rows]
+    widest = max((len(row) for row in rows), default=len(MOT_NAMES))
+    header = [*MOT_NAMES, *(f"column_{place}" for place in range(len(MOT_NAMES) + 1, widest + 1))]
+    return CsvText(header[:widest], line, rows), False
 
 
-def _cells(line: str) -> list[str]:
-    """The cells of a line, without the quotes that some tools put around names."""
-    return [cell.strip().strip('"').strip() for cell in line.split(",")]
-
-
-def _identity(text: str) -> float:
-    """The identity that a cell names; -1 where it names none."""
-    value = _number(text)
-    return value if value is not None and 1 <= value <= 2**53 and value == int(value) else -1.0
-
-
-def _all_moving(content: Sequence[tuple[int, str]], header: str) -> bool:
-    """Whether the column `kind` says so of each row, as `dddas detect` does."""
-    names = _cells(header)
-    if not content or "kind" not in names:
-        return False
-    place = names.index("kind")
-    return all(_cells(line)[place] == "moving" for _, line in content)
-
-
-def _refuse_few_outside(score: np.ndarray, line: np.ndarray, name: str) -> None:
-    """One score of 1.3 among thousands of probabilities must not make all of these certain."""
-    outside = (score < 0) | (score > 1)
-    if 0 < outside.sum() < FEW_SHARE * len(score):
-        first = outside.argmax()
-        raise InputError(
-            f"{name}, line {line[first]:.0f}: score is {score[first]:g}; {outside.sum()} of {len(score)} scores lie "
-            "outside [0, 1]. Wanted probabilities in [0, 1], or scores on another scale throughout"
-        )
-
-
-def _row(cells: Sequence[str], score: str, line: int, name: str) -> list[float]:
-    """frame, x, y, width, height, score, line: checked."""
-    values = [_number(cell) for cell in cells]
-    values.append(_number(score) if score else 1.0)
-    for value, cell, column in zip(
-        values, (*cells, score), ("frame", "x", "y", "width", "height", "score"), strict=True
-    ):
-        if value is None or not math.isfinite(value):
-            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted a finite number")
-        if column == "frame" and not (value == int(value) and 1 <= value <= LAST_FRAME):
-            raise InputError(f"{name}, line {line}: frame is '{cell}'; wanted a whole number from 1 to {LAST_FRAME}")
-        if column in ("width", "height") and value < LEAST_PX:
-            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted pixels, {LEAST_PX:g} at least")
-        if column not in ("frame", "score") and abs(value) > FARTHEST_PX:
-            raise InputError(f"{name}, line {line}: {column} is '{cell}'; wanted pixels, {FARTHEST_PX:g} at most")
-    return [*(value for value in values if value is not None), float(line)]
-
-
-def _number(text: str) -> float | None:
+def _is_number(word: str) -> bool:
     try:
-        return float(text) if "_" not in text else None  # 1_0 is a number to Python alone
+        float(word)
     except ValueError:
-        return None
+        return False
+    return True
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Whether a table fits its clip and the detection interval.
+
+
+def check_table(table: DetectionTable, interval: int, source: Source | None = None) -> list[str]:
+    """Notes on rows that are left out or read in an unexpected way, each a sentence without a full stop.
+
+    Raises InputError as check_within_clip does, and where no row lies on a sampled frame.
+    """
+    name = f"detections {table.path}"
+    if len(table) == 0:
+        return [f"{name} holds no rows"]
+    if source is not None:
+        check_within_clip(table, source)
+    notes = []
+    left_out = len(table) - int(is_sampled(table.frame, interval).sum())
+    if left_out == len(table):
+        sampled = ", ".join(str(1 + k * interval) for k in range(3))
+        raise InputError(
+            f"{name} has no row on frames {sampled}, ..., which --interval {interval} samples; its first is on frame "
+            f"{table.first}: number the frames so that one of them is 1, or take --interval 1"
+        )
+    frames = np.unique(table.frame)
+    step = int(np.gcd.reduce(frames - 1)) if len(frames) > 2 else 1  # two frames do not show an interval
+    if left_out:
+        notes.append(f"{left_out} of {len(table)} rows lie on frames that --interval {interval} leaves out")
+    elif step > interval:
+        notes.append(
+            f"rows lie on every {step}th frame only, and the frames between count as misses: pass --interval {step} if "
+            "they were not searched"
+        )
+    if table.own:
+        notes.append("all rows are moving targets of dddas detect: every row counts as certain")
+    elif not table.probable:
+        low, high = table.score.min(), table.score.max()
+        notes.append(f"scores from {low:g} to {high:g} are no probabilities: every row counts as certain")
+    if source is not None:
+        low, high = table.box_px[:, :2], table.box_px[:, :2] + table.box_px[:, 2:]
+        if outside := int(((high <= 0) | (low >= source.size)).any(axis=1).sum()):
+            notes.append(f"{outside} boxes lie wholly outside the picture; they are tracked like the others")
+    return notes
+
+
+def check_within_clip(table: DetectionTable, source: Source) -> None:
+    """Raises InputError for a table that goes on after the end of a clip whose length is known."""
+    if source.exact and source.count is not None and table.last > source.count:
+        is_beyond = table.frame > source.count
+        raise InputError(
+            f"detections {table.path}, line {table.line[is_beyond].min()}: the table goes on to frame {table.last} but "
+            f"{source.name} ends after frame {source.count} ({is_beyond.sum()} of {len(table)} rows lie beyond); is it "
+            "the table of this clip?"
+        )
+
+
+def check_birth_score(table: DetectionTable, birth_score: float) -> list[str]:
+    """A note where no row's score is high enough to begin a track."""
+    if not len(table) or table.certain or float(table.score.max()) >= birth_score:
+        return []
+    return [
+        (
+            f"no score of {table.path} reaches track.birth_score = {birth_score:g}, so no track begins: lower it with "
+            "--set, or give the detections.csv if dddas detect wrote them"
+        )
+    ]

@@ -10,8 +10,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.image_bytes import decoded
-from torchvision_dddas.io.source import Problem
-from torchvision_dddas.types import Frame, is_sampled
+from torchvision_dddas.types import Frame, Problem, is_sampled
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2", ".gif"}

@@ -11,7 +11,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.io.csv_text import Line, opened
-from torchvision_dddas.io.detection_tables import LAST_FRAME
+from torchvision_dddas.io.tables import LAST_FRAME
 from torchvision_dddas.types import Landmarks
 
 PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))

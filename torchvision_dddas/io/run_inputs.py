@@ -22,9 +22,8 @@ from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation
 from torchvision_dddas.io.landmark_tables import read_landmarks
-from torchvision_dddas.io.sources import Source
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.types import Colours, Telemetry
+from torchvision_dddas.types import Colours, Source, Telemetry
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource, images_of_folder, images_of_glob
-from torchvision_dddas.io.source import Problem, Source
 from torchvision_dddas.io.video import VideoSource
+from torchvision_dddas.types import Problem, Source
 
 __all__ = ["Problem", "Source", "open_source"]
 

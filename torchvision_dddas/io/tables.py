@@ -172,8 +172,11 @@ class CsvText(NamedTuple):
     rows: list[list[str]]
 
 
-def read_csv(path: str | Path, what: str = "") -> CsvText:
-    """Read the cells of a CSV. what: what the file holds, for messages. Raises InputError: unreadable, no CSV text."""
+def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvText:
+    """Read the cells of a CSV. what: what the file holds, for messages. has_header: whether line 1 names the columns.
+
+    Raises InputError: unreadable, no CSV text.
+    """
     name = f"{what} {path}".strip()
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -183,12 +186,12 @@ def read_csv(path: str | Path, what: str = "") -> CsvText:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name} is no CSV text: {error}") from None
-    header = lines[0][1] if lines else []
-    kept = [(number, row) for number, row in lines[1:] if any(row)]
-    return CsvText(header, [number for number, _ in kept], [row for _, row in kept])
+    header = lines.pop(0)[1] if lines and has_header else []
+    lines = [(number, row) for number, row in lines if any(row)]
+    return CsvText(header, [number for number, _ in lines], [row for _, row in lines])
 
 
-class Table:
+class CsvTable:
     """A table that was read. columns: name -> (N,) float64, or a list of text. line: (N,) int64, in the file from 1."""
 
     def __init__(self, path: str | Path, what: str, header: Sequence[str], line: Sequence[int]) -> None:
@@ -225,7 +228,7 @@ class Table:
 
 def read_table(
     path: str | Path, schema: Schema, required: Sequence[str] = (), is_ragged: bool = False, text: CsvText | None = None
-) -> Table:
+) -> CsvTable:
     """Read the columns of a schema that a CSV has; further columns are ignored.
 
     required: names without which the table is refused. is_ragged: whether lines may have more or fewer cells than the
@@ -234,7 +237,7 @@ def read_table(
     number, out of range.
     """
     header, lines, rows = text or read_csv(path, schema.what)
-    table = Table(path, schema.what, header, lines)
+    table = CsvTable(path, schema.what, header, lines)
     columns = ", ".join(filter(None, header)) or "none"
     if missing := [name for name in required if name not in header]:
         raise InputError(
@@ -257,8 +260,8 @@ def read_table(
     return table
 
 
-def _numbers(table: Table, column: Column, cells: list[str]) -> np.ndarray:
-    """(N,) float64, NaN for an empty cell or `nan`. Raises InputError for a cell that is no number or out of range."""
+def _numbers(table: CsvTable, column: Column, cells: list[str]) -> np.ndarray:
+    """(N,) float64, NaN for an empty cell. Raises InputError for a cell that is no number or out of range."""
     values = parse_numbers(cells)
     is_wrong = np.isinf(values) | (values < column.low) | (values > column.high)
     if not column.may_be_empty:
@@ -272,20 +275,22 @@ def _numbers(table: Table, column: Column, cells: list[str]) -> np.ndarray:
 
 
 def parse_numbers(cells: Sequence[str]) -> np.ndarray:
-    """(N,) float64: NaN for an empty cell or `nan`, infinity for what is no number."""
+    """(N,) float64: NaN for an empty cell, infinity for what is no number, `nan` included."""
     try:
-        if "_" in "".join(cells):  # 1_0 is a number to Python alone
-            raise ValueError
-        return np.array([float(cell) if cell else math.nan for cell in cells], float)
+        values = np.array([float(cell) if cell else math.nan for cell in cells], float)
+        if "_" not in "".join(cells) and np.isnan(values).sum() == cells.count(""):
+            return values
     except ValueError:
-        return np.array([_parse_number(cell) for cell in cells], float)
+        pass
+    return np.array([_parse_number(cell) for cell in cells], float)
 
 
 def _parse_number(cell: str) -> float:
     try:
-        return math.inf if "_" in cell else float(cell) if cell else math.nan
+        value = math.inf if "_" in cell else float(cell or "nan")  # 1_0 is a number to Python alone
     except ValueError:
         return math.inf
+    return math.inf if math.isnan(value) and cell else value
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -293,14 +298,9 @@ def _parse_number(cell: str) -> float:
 
 FRAME = Column("frame", "d", 1, LAST_FRAME, is_whole=True)
 IDENTITY = Column("identity", "d")
-BOX = tuple(
-    Column(name, ".2f", low, FARTHEST, wanted=f"pixels, {words}")
-    for name, low, words in (
-        ("x_px", -FARTHEST, f"{FARTHEST:g} at most"),
-        ("y_px", -FARTHEST, f"{FARTHEST:g} at most"),
-        ("width_px", 1e-3, "0.001 to 1e+09"),
-        ("height_px", 1e-3, "0.001 to 1e+09"),
-    )
+BOX = (
+    *(Column(name, ".2f", -FARTHEST, FARTHEST, wanted="pixels from -1e+09 to 1e+09") for name in ("x_px", "y_px")),
+    *(Column(name, ".2f", 1e-3, FARTHEST, wanted="pixels from 0.001 to 1e+09") for name in ("width_px", "height_px")),
 )
 SCORE = Column("score", ".4f")
 PRECISE_SCORE = replace(SCORE, format=".6g")

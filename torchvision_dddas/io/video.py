@@ -13,8 +13,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.image_bytes import quiet_opencv
-from torchvision_dddas.io.source import Problem
-from torchvision_dddas.types import Frame, is_sampled
+from torchvision_dddas.types import Frame, Problem, is_sampled
 
 # FFmpeg draws any text file as an old terminal would; nobody means that.
 _TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}

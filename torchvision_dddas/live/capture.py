@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from torchvision_dddas.config import LiveParameters
-from torchvision_dddas.io.sources import Problem, open_source
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.io.stream_capture import OpenedStream, Stream, target_of, without_secrets
 from torchvision_dddas.live.capture_log import Diary
 from torchvision_dddas.live.clock import Clock
@@ -12,7 +12,7 @@ from torchvision_dddas.live.frame_queue import Inbox
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.playback import Player
 from torchvision_dddas.live.receiver import OPENING, Receiver
-from torchvision_dddas.types import Frame
+from torchvision_dddas.types import Frame, Problem
 
 # How long a thread is waited for that was told to end.
 _JOIN_S = 1.0

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchvision_dddas.io.sources import Problem
 from torchvision_dddas.live.clock import Clock
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.types import Problem
 
 # What happens again and again is told so often; the counts tell the rest.
 _QUIET_S = 10.0

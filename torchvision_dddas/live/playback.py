@@ -5,13 +5,12 @@ import threading
 import numpy as np
 
 from torchvision_dddas.io.images import ImageSource
-from torchvision_dddas.io.sources import Source
 from torchvision_dddas.io.video import VideoSource
 from torchvision_dddas.live.capture_log import Diary
 from torchvision_dddas.live.clock import Clock
 from torchvision_dddas.live.frame_queue import Inbox
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.types import Frame
+from torchvision_dddas.types import Frame, Source
 
 # A reader that is later than this is not waited for by the clock: its pictures would come in one burst.
 _LATE_S = 1.0

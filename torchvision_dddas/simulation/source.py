@@ -10,7 +10,6 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
-from torchvision_dddas.io.source import Problem
 from torchvision_dddas.simulation.moment import Moment
 from torchvision_dddas.simulation.scenario import Scenario, load
 from torchvision_dddas.simulation.simulator import Simulator
@@ -24,6 +23,7 @@ from torchvision_dddas.types import (
     Frame,
     GroundPicture,
     Landmarks,
+    Problem,
     Telemetry,
     Truth,
     is_sampled,

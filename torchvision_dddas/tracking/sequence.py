@@ -14,7 +14,6 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.geometry import chain
-from torchvision_dddas.io.source import Source
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.tracker import Tracker
 from torchvision_dddas.types import (
@@ -23,6 +22,7 @@ from torchvision_dddas.types import (
     DetectionTable,
     Frame,
     Scene,
+    Source,
     TrackedFrame,
     Tracks,
     is_sampled,

@@ -30,7 +30,7 @@ from torchvision_dddas.evaluation.datasets.own import clip_at, pictures_at
 from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
-from torchvision_dddas.io.csv_text import opened
+from torchvision_dddas.io.detection_tables import read_rows
 from torchvision_dddas.io.position_tables import read_positions
 
 
@@ -77,12 +77,10 @@ def _truth(place: Path, frames: int) -> Truth:
 def _positions(path: Path) -> tuple[Positions, Positions]:
     """The places of the targets that show, and of the ground vehicles, which are the landmarks. Raises InputError."""
     said = read_positions(path)
-    with opened(path, "positions") as (header, lines):
-        if lacking := [name for name in ("kind", "visible_px") if name not in header]:
-            raise InputError(f"positions {path} lacks {', '.join(lacking)}; wanted what `dddas simulate` writes")
-        cells = [line.cells for line in lines]
-    frame, kind, shown = (header.index(name) for name in ("frame", "kind", "visible_px"))
-    cells.sort(key=lambda row: float(row[frame]))  # a stable sort, as that of the reader
+    header, cells = read_rows(path)
+    if lacking := [name for name in ("kind", "visible_px") if name not in header]:
+        raise InputError(f"positions {path} lacks {', '.join(lacking)}; wanted what `dddas simulate` writes")
+    kind, shown = header.index("kind"), header.index("visible_px")
     fleet = np.array([row[kind] == "ugv" for row in cells], bool)
     shows = np.array([row[shown] not in ("", "0") for row in cells], bool)
 

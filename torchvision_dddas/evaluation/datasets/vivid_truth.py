@@ -12,7 +12,7 @@ from torchvision_dddas.evaluation.datasets.pictures import images_in
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.mot_text import FARTHEST
 from torchvision_dddas.evaluation.metrics.truth import Truth, read_mask
-from torchvision_dddas.io.csv_text import opened
+from torchvision_dddas.io.tables import read_csv
 
 
 def vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
@@ -21,13 +21,13 @@ def vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
     Frames without a row are taken as empty up to the last that has one. Raises InputError with file and line.
     """
     rows = []
-    with opened(path, "truth") as (_, lines):
-        for line in lines:
-            where = f"truth {path}, line {line.number}"
-            if len(line.cells) != 7:
-                raise InputError(f"{where}: {len(line.cells)} columns; wanted name,frame,identity,x,y,width,height")
-            row = _numbers(line.cells[1:], where)
-            rows.append([_frame(row[0], frames, where), *row[1:]])
+    _, lines, cells_of = read_csv(path, "truth")
+    for number, cells in zip(lines, cells_of, strict=True):
+        where = f"truth {path}, line {number}"
+        if len(cells) != 7:
+            raise InputError(f"{where}: {len(cells)} columns; wanted name,frame,identity,x,y,width,height")
+        row = _numbers(cells[1:], where)
+        rows.append([_frame(row[0], frames, where), *row[1:]])
     if not rows:
         raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height a line")
     values = np.array(rows)

@@ -16,8 +16,7 @@ from torchvision_dddas.evaluation.studies.rows import Rows, Tick, followed_kept,
 from torchvision_dddas.types import Detections, Frame, Registration, Scene
 
 if TYPE_CHECKING:
-    from torchvision_dddas.io.sources import Source
-    from torchvision_dddas.types import DetectionTable
+    from torchvision_dddas.types import DetectionTable, Source
 
 _SEES = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
 _FOLLOWS = ("track", "paper")
@@ -192,16 +191,16 @@ def true_boxes(clip: Clip, interval: int) -> "DetectionTable":
 def _followed(clip: Clip, table: "DetectionTable", settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
     """A table along the clip's pictures, or alone where it has none."""
     from torchvision_dddas.detection.engine import load_engine
-    from torchvision_dddas.io.table_checks import agreed
+    from torchvision_dddas.io.detection_tables import check_table
     from torchvision_dddas.tracking.sequence import follow_clip, follow_table
 
     if not clip.pictures:
-        notes = agreed(table, interval)
+        notes = check_table(table, interval)
         rows = followed_kept(follow_table(table, settings, interval), tick)
         rows.notes += notes
         return rows
     source = opened(clip)
-    notes = agreed(table, interval, source)
+    notes = check_table(table, interval, source)
     rows = followed_kept(follow_clip(source, table, load_engine(backend, settings), settings, interval), tick)
     rows.notes += [*notes, *map(str, source.problems)]
     return rows

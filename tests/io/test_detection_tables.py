@@ -1,13 +1,24 @@
 """Tables of detections: what may be read, and one line with file and line number for what may not."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.detection_tables import LAST_FRAME, read_detections
-from torchvision_dddas.types import DetectionTable
+from torchvision_dddas.io.detection_tables import (
+    MOT_NAMES,
+    check_birth_score,
+    check_table,
+    read_detections,
+    read_header,
+    read_rows,
+)
+from torchvision_dddas.io.tables import LAST_FRAME
+from torchvision_dddas.types import DetectionTable, is_sampled
 
 
 @pytest.fixture
@@ -125,68 +136,45 @@ def test_the_extent_is_told_by_thirty_likely_boxes_at_least():
     assert boxes(right, bottom, -0.4).extent == boxes(right, bottom, 0.4, own=True).extent == (27, 27)
 
 
-BAD = [
-    ("1,-1,2,3,4,x", "height is 'x'; wanted a finite number"),
-    ("1,-1,2,nan,4,5", "y is 'nan'"),
-    ("1,-1,inf,3,4,5", "x is 'inf'"),
-    ("1,-1,2,3,4,5,nan", "score is 'nan'"),
-    ("1,-1,2,3,4,5,high", "score is 'high'"),
-    ("1,-1,2,3,-4,5", "width is '-4'; wanted pixels, 0.001 at least"),
-    ("1,-1,2,3,4,0", "height is '0'; wanted pixels, 0.001 at least"),
-    ("1,-1,2,3,0.000999,5", "width is '0.000999'; wanted pixels, 0.001 at least"),
-    ("1,-1,1_0,3,4,5", "x is '1_0'; wanted a finite number"),
-    ("1_0,-1,2,3,4,5", "frame is '1_0'; wanted a finite number"),
-    ("1,-1,2,-1e12,4,5", "y is '-1e12'; wanted pixels, 1e+09 at most"),
-    ("1,-1,2,3,1e300,5", "width is '1e300'; wanted pixels"),
-    ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
-    ("-3,-1,2,3,4,5", "frame is '-3'"),
-    ("1.5,-1,2,3,4,5", "frame is '1.5'"),
-    (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
-    ("1e300,-1,2,3,4,5", "frame is '1e300'"),
-    ("nan,-1,2,3,4,5", "frame is 'nan'; wanted a finite number"),
-    (",-1,2,3,4,5", "frame is ''"),
-    ("1,-1,2,3,4", "5 columns; wanted frame,id,x,y,w,h[,score]"),
-    ("1 2 3", "3 columns"),
-    ("7", "1 column; wanted"),
-    ("1;-1;2;3;4;5", "1 column; wanted"),
-]
-
-
-@pytest.mark.parametrize(("row", "says"), BAD)
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("1,-1,2,3,4,x", "height_px is 'x'; wanted pixels from 0.001 to 1e+09"),
+        ("1,-1,2,nan,4,5", "y_px is 'nan'; wanted pixels from -1e+09"),
+        ("1,-1,inf,3,4,5", "x_px is 'inf'"),
+        ("1,-1,2,3,4,5,nan", "score is 'nan'; wanted a finite number"),
+        ("1,-1,2,3,0.000999,5", "width_px is '0.000999'; wanted pixels from 0.001"),
+        ("1,-1,1_0,3,4,5", "x_px is '1_0'"),
+        ("1,-1,2,-1e12,4,5", "y_px is '-1e12'"),
+        ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
+        ("1.5,-1,2,3,4,5", "frame is '1.5'"),
+        (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
+        (",-1,2,3,4,5", "frame is ''"),
+        ("1,-1,2,3,4", "5 columns; wanted frame,id,x,y,w,h[,score]"),
+        ("7", "1 column; wanted"),
+        ("1;-1;2;3;4;5", "1 column; wanted"),
+    ],
+)
 def test_a_bad_row_is_one_line_that_names_file_and_line(table, row, says):
     path = table(f"1,-1,2,3,4,5\n\n{row}\n1,-1,2,3,4,5\n")
     with pytest.raises(InputError) as error:
         read_detections(path)
-    assert says in str(error.value)
-    assert f"{path}, line 3: " in str(error.value)
-    assert "\n" not in str(error.value)
+    assert says in str(error.value) and f"{path}, line 3: " in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("frame,x,y\n1,2,3", "line 1: its columns are frame, x, y; x_px, y_px, width_px, height_px missing"),
-        ("frame,x_px,y_px,width_px,height_px,x_px\n1,2,3,4,5,6", "line 1: column x_px is named twice"),
-        ("frame,x_px,y_px,width_px,height_px,note,note\n1,2,3,4,5,6,7", "line 1: column note is named twice"),
-        ("hello world", "line 1: its columns are hello world"),
+        ("frame,x,y\n1,2,3", "lacks x_px, y_px, width_px, height_px; its columns are frame, x, y"),
+        ("hello world", "its columns are hello world"),
         ("frame,x_px,y_px,width_px,height_px\n1,2,3,4", "line 2: 4 columns; the first line names 5"),
-        ("frame,x_px,y_px,width_px,height_px\n1,2,3,4,wide", "line 2: height is 'wide'"),
+        ("frame,x_px,y_px,width_px,height_px,cut\n1,0,0,5,5,maybe\n", "line 2: cut is 'maybe'; wanted 1 where"),
     ],
 )
-def test_a_bad_csv_is_one_line_that_names_file_and_line(table, text, says):
+def test_a_bad_csv_is_one_line(table, text, says):
     with pytest.raises(InputError, match=r"det\.txt") as error:
         read_detections(table(text))
     assert says in str(error.value)
-
-
-def test_a_file_that_cannot_be_read_is_one_line(tmp_path):
-    with pytest.raises(InputError, match=r"nosuch\.txt cannot be read: No such file"):
-        read_detections(tmp_path / "nosuch.txt")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_detections(tmp_path)
-    (tmp_path / "film.mp4").write_bytes(b"\x00\x00\xff\xfe\x80ftyp")
-    with pytest.raises(InputError, match=r"film\.mp4 is no text"):
-        read_detections(tmp_path / "film.mp4")
 
 
 @given(st.text(max_size=60))
@@ -210,6 +198,84 @@ def test_identities_and_cuts_are_kept_where_a_table_has_them(table):
     assert by_place.cut is None
 
 
-def test_a_cut_that_is_neither_0_nor_1_is_named(table):
-    with pytest.raises(InputError, match="line 2: cut is 'maybe'; wanted 1 where the border cuts it, else 0"):
-        read_detections(table("frame,x_px,y_px,width_px,height_px,cut\n1,0,0,5,5,maybe\n"))
+def test_the_own_words_of_a_table_are_kept_for_a_copy_with_more_columns(table):
+    named = table('frame,note,x_px,y_px,width_px,height_px\n2,b,0,0,5,5\n1,"a, b",0,0,5,5\n')
+    assert read_header(named)[:2] == ["frame", "note"]
+    assert read_rows(named, ("x_px", "y_px")) == (
+        ["frame", "note", "width_px", "height_px"],
+        [["1", "a, b", "5", "5"], ["2", "b", "5", "5"]],
+    )
+    by_place = table("2 1 0 0 5 5 0.50 x\n1 1 0 0 5 5\n")
+    header, rows = read_rows(by_place)
+    assert header == [*MOT_NAMES, "column_8"] and rows[0] == ["1", "1", "0", "0", "5", "5", "", ""]
+    assert read_header(table("")) == []
+
+
+def rows_on(frames, box_px=(10, 10, 5, 5), score=1.0):
+    frames = np.array(frames, int)
+    n = len(frames)
+    boxes = np.broadcast_to(np.array(box_px, float), (n, 4))
+    return DetectionTable("det.txt", frames, boxes, np.full(n, score), np.arange(n) + 1)
+
+
+def clip(count, exact=True):
+    return SimpleNamespace(name="walk.mp4", count=count, exact=exact, size=(64, 48))
+
+
+def test_a_table_that_fits_its_clip_needs_no_note():
+    assert check_table(rows_on([1, 2, 2, 5]), 1, clip(5)) == []
+    assert check_table(rows_on([1, 6, 11]), 5, clip(14)) == []
+
+
+def test_frames_after_the_end_of_a_clip_are_refused_with_the_first_such_line():
+    with pytest.raises(
+        InputError, match=r"det\.txt, line 3: .* frame 9 but walk\.mp4 ends after frame 5 \(2 of 4 rows"
+    ):
+        check_table(rows_on([1, 5, 6, 9]), 1, clip(5))
+
+
+@pytest.mark.parametrize("source", [clip(5, exact=False), clip(None, exact=False), None])
+def test_a_length_that_is_only_guessed_refuses_nothing(source):
+    assert check_table(rows_on([1, 2, 9]), 1, source) == []
+
+
+def test_rows_between_the_frames_looked_at_are_counted():
+    table = rows_on([1, 2, 3, 4, 5, 6, 6])
+    assert is_sampled(table.frame, 5).tolist() == [True, False, False, False, False, True, True]
+    assert check_table(table, 5) == ["4 of 7 rows lie on frames that --interval 5 leaves out"]
+
+
+def test_a_table_of_which_no_row_is_looked_at_is_refused():
+    with pytest.raises(InputError, match=r"no row on frames 1, 6, 11, .* --interval 5 .* first is on frame 5"):
+        check_table(rows_on([5, 10, 15]), 5)
+
+
+def test_rows_on_every_fifth_frame_only_call_for_the_interval():
+    (note,) = check_table(rows_on([1, 6, 21]), 1)
+    assert "--interval 5 if" in note
+    assert check_table(rows_on([1, 6]), 1) == []  # two frames are too few to tell
+
+
+def test_scores_that_are_no_probabilities_own_rows_and_an_empty_table_are_told():
+    (note,) = check_table(rows_on([1, 2, 3], score=43.3), 1)
+    assert "from 43.3 to 43.3 are no probabilities" in note
+    assert check_table(replace(rows_on([1, 2, 3], score=0.5), own=True), 1) == [
+        "all rows are moving targets of dddas detect: every row counts as certain"
+    ]
+    assert check_table(rows_on([]), 1, clip(5)) == ["detections det.txt holds no rows"]
+
+
+@pytest.mark.parametrize("box", [(-9, 10, 9, 5), (64, 10, 5, 5), (10, -5, 5, 5), (10, 48, 5, 5)])
+def test_boxes_wholly_outside_the_picture_are_counted_and_those_at_its_edge_are_not(box):
+    (note,) = check_table(rows_on([1, 2, 3], box), 1, clip(3))
+    assert note.startswith("3 boxes lie wholly outside")
+    x, y, w, h = box
+    assert check_table(rows_on([1, 2, 3], (x - np.sign(x) * 0.5, y - np.sign(y) * 0.5, w, h)), 1, clip(3)) == []
+
+
+def test_scores_too_low_for_any_track_are_noted_and_others_are_not():
+    (note,) = check_birth_score(rows_on([1, 2], score=0.8), 0.95)
+    assert "det.txt reaches track.birth_score = 0.95" in note
+    assert check_birth_score(rows_on([1, 2], score=0.95), 0.95) == []
+    assert check_birth_score(replace(rows_on([1, 2], score=0.8), own=True), 0.95) == []
+    assert check_birth_score(rows_on([]), 0.95) == []
