@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.overlay.detection_overlay import Overlay, drawn
+from torchvision_dddas.io.overlay import OverlayVideo, draw_scene
 
 ENGINES = [
     "mp4v",
@@ -18,7 +18,7 @@ ENGINES = [
 def test_film_has_every_frame_and_even_sizes(tmp_path, scene, monkeypatch, engine, size, grey):
     if engine == "mp4v":
         monkeypatch.setitem(sys.modules, "av", None)
-    film = Overlay(tmp_path, 12.5, drawn)
+    film = OverlayVideo(tmp_path, 12.5, draw_scene)
     for number in range(1, 8):
         film.write(scene(number, targets=3, size=size, grey=grey))
     assert not (tmp_path / "overlay.mp4").exists()
@@ -35,7 +35,7 @@ def test_film_has_every_frame_and_even_sizes(tmp_path, scene, monkeypatch, engin
 def test_the_frame_itself_is_not_drawn_on(scene):
     made = scene(1, targets=2)
     before = made.frame.image.copy()
-    assert not np.array_equal(drawn(made), before)
+    assert not np.array_equal(draw_scene(made), before)
     assert np.array_equal(made.frame.image, before)
 
 
@@ -44,16 +44,16 @@ def test_a_warning_is_visible_and_fits_a_narrow_picture(scene):
         scene(1, size=(120, 90)),
         scene(1, size=(120, 90), reliable=False, cause="9 of 200 inliers − a cut"),
     )
-    assert (drawn(doubtful) != drawn(sound)).any()
-    assert drawn(doubtful).shape == (90, 120, 3)
+    assert (draw_scene(doubtful) != draw_scene(sound)).any()
+    assert draw_scene(doubtful).shape == (90, 120, 3)
 
 
 def test_the_smallest_pictures_can_be_drawn(scene):
-    assert drawn(scene(1, targets=0, size=(3, 2), reliable=False, cause="x")).shape == (2, 3, 3)
+    assert draw_scene(scene(1, targets=0, size=(3, 2), reliable=False, cause="x")).shape == (2, 3, 3)
 
 
 def test_discard_leaves_nothing(tmp_path, scene):
-    film = Overlay(tmp_path, 10, drawn)
+    film = OverlayVideo(tmp_path, 10, draw_scene)
     film.write(scene(1))
     film.discard()
     assert not list(tmp_path.iterdir())
@@ -61,7 +61,7 @@ def test_discard_leaves_nothing(tmp_path, scene):
 
 def test_a_film_that_cannot_be_opened_again_is_no_film(tmp_path, scene, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    film = Overlay(tmp_path, 10, drawn)
+    film = OverlayVideo(tmp_path, 10, draw_scene)
     film.write(scene(1))
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: type("Broken", (), {"isOpened": lambda _: False})())
     with pytest.raises(OSError, match=r"overlay\.mp4 could not be finished"):

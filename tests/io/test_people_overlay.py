@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.overlay.people_overlay import CUT, PERSON, SEARCHED, UNLIKELY, Still, drawn_people
+from torchvision_dddas.io.overlay import OverlayPicture, draw_people
+from torchvision_dddas.io.overlay.layers import CUT, PERSON, SEARCHED, UNLIKELY
 from torchvision_dddas.types import Frame, People, PeopleFrame
 
 
@@ -28,45 +29,45 @@ def shows(picture, colour):
 
 @pytest.mark.parametrize("grey", [False, True])
 def test_a_body_has_its_box_and_a_point_at_its_feet(grey):
-    made = drawn_people(recognized(grey=grey))
+    made = draw_people(recognized(grey=grey))
     assert made.shape == (240, 320, 3)
     assert (made[70:150, 60] == PERSON).all() and (made[60, 60:100] == PERSON).any()
     assert (made[160, 80] == PERSON).all()
 
 
 def test_one_whom_the_border_cuts_has_another_colour():
-    made = drawn_people(recognized([(60, 60, 40, 100), (-20, 60, 60, 140)], cut=(1,)))
+    made = draw_people(recognized([(60, 60, 40, 100), (-20, 60, 60, 140)], cut=(1,)))
     assert shows(made, PERSON) and shows(made, CUT)
-    assert not shows(drawn_people(recognized()), CUT)
+    assert not shows(draw_people(recognized()), CUT)
 
 
 def test_one_who_is_less_likely_than_not_is_grey_without_a_number_and_below_the_others():
-    alone = drawn_people(recognized(score=0.4))
+    alone = draw_people(recognized(score=0.4))
     assert (alone[70:150, 60] == UNLIKELY).all() and not shows(alone, PERSON) and not shows(alone, CUT)
-    assert not shows(drawn_people(recognized(cut=(0,), score=0.4)), CUT)
-    both = drawn_people(recognized([(60, 60, 40, 100), (60, 60, 40, 100)], score=(0.6, 0.4)))
+    assert not shows(draw_people(recognized(cut=(0,), score=0.4)), CUT)
+    both = draw_people(recognized([(60, 60, 40, 100), (60, 60, 40, 100)], score=(0.6, 0.4)))
     assert (both[70:150, 60] == PERSON).all()
 
 
 def test_of_labels_that_overlap_the_best_is_read():
     pair = [(60, 60, 40, 100), (70, 60, 40, 100)]
-    best_first, best_last = (drawn_people(recognized(boxes, score=score)) for boxes, score in (
+    best_first, best_last = (draw_people(recognized(boxes, score=score)) for boxes, score in (
         (pair, (0.99, 0.6)), (pair[::-1], (0.6, 0.99))
     ))  # fmt: skip
     np.testing.assert_array_equal(best_first, best_last)
-    alone = drawn_people(recognized(pair[:1], score=0.99))
+    alone = draw_people(recognized(pair[:1], score=0.99))
     np.testing.assert_array_equal(best_first[40:58, 62:85], alone[40:58, 62:85])
 
 
 def test_regions_are_drawn_where_there_are_some():
-    made = drawn_people(recognized(regions=np.array([[40, 30, 100, 150.0]])))
+    made = draw_people(recognized(regions=np.array([[40, 30, 100, 150.0]])))
     assert (made[100, 40] == SEARCHED).all()
-    assert not shows(drawn_people(recognized(regions=np.zeros((0, 4)))), SEARCHED)
+    assert not shows(draw_people(recognized(regions=np.zeros((0, 4)))), SEARCHED)
 
 
 def test_the_caption_says_how_much_was_searched_and_why_nothing_is_known():
     everywhere, some, unread = (
-        drawn_people(r)[-40:]
+        draw_people(r)[-40:]
         for r in (recognized(), recognized(regions=np.zeros((0, 4))), recognized(cause="the frame could not be read"))
     )
     assert (everywhere != some).any() and (everywhere != unread).any()
@@ -74,17 +75,17 @@ def test_the_caption_says_how_much_was_searched_and_why_nothing_is_known():
 
 @pytest.mark.parametrize("box", [(-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (3, 3, 1e-3, 1e-3)])
 def test_boxes_anywhere_can_be_drawn(box):
-    assert drawn_people(recognized([box], regions=np.array([box]))).shape == (240, 320, 3)
+    assert draw_people(recognized([box], regions=np.array([box]))).shape == (240, 320, 3)
 
 
 def test_the_input_is_not_drawn_on():
     one = recognized()
-    drawn_people(one)
+    draw_people(one)
     assert (one.frame.image == 90).all()
 
 
 def test_a_single_picture_is_saved_whole_or_not_at_all(tmp_path):
-    kept, dropped = Still(tmp_path), Still(tmp_path / "no")
+    kept, dropped = OverlayPicture(tmp_path, draw_people), OverlayPicture(tmp_path / "no", draw_people)
     (tmp_path / "no").mkdir()
     for still in (kept, dropped):
         still.write(recognized())
@@ -92,11 +93,11 @@ def test_a_single_picture_is_saved_whole_or_not_at_all(tmp_path):
     kept.close(complete=True)
     dropped.discard()
     made = cv2.imread(str(tmp_path / "overlay.png"))
-    assert made is not None and np.array_equal(made, drawn_people(recognized()))
+    assert made is not None and np.array_equal(made, draw_people(recognized()))
     assert not list((tmp_path / "no").iterdir())
     assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["overlay.png"]
 
 
 def test_a_run_without_frames_has_no_picture(tmp_path):
-    Still(tmp_path).close(complete=True)
+    OverlayPicture(tmp_path, draw_people).close(complete=True)
     assert not list(tmp_path.iterdir())

@@ -14,7 +14,8 @@ from torchvision_dddas.io.landmark_tables import read_landmarks
 from torchvision_dddas.io.output.landmark_table import MarkTable
 from torchvision_dddas.io.output.pipeline_output import FoundOutput, SurveyOutput
 from torchvision_dddas.io.output.run_log import PROBLEM
-from torchvision_dddas.io.overlay.survey_overlay import STATES, SurveyPictures
+from torchvision_dddas.io.overlay import RunPictures
+from torchvision_dddas.io.overlay.layers import LANDMARK
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -113,21 +114,21 @@ def test_a_run_that_fails_leaves_nothing_that_looks_whole(tmp_path):
 
 
 def test_landmarks_are_drawn_in_the_colour_of_what_became_of_them():
-    picture = SurveyPictures((200, 120), NAMES)(surveyed(1))
+    picture = RunPictures((200, 120), NAMES)(surveyed(1))
     for (u, v), state in (((40, 30), "used"), ((120, 50), "excluded")):
-        ring = np.abs(picture[v - 14 : v + 15, u - 14 : u + 15].astype(int) - STATES[state]).max(axis=2) < 40
+        ring = np.abs(picture[v - 14 : v + 15, u - 14 : u + 15].astype(int) - LANDMARK[state]).max(axis=2) < 40
         assert ring.sum() > 20
 
 
 def test_the_caption_says_why_a_frame_is_not_located():
-    drawer = SurveyPictures((200, 120), NAMES)
+    drawer = RunPictures((200, 120), NAMES)
     good, gap = drawer(surveyed(1)), drawer(surveyed(2, by="", cause="too few", states=("excluded",) * 2))
     red = lambda picture: ((picture[100:, :, 2] > 200) & (picture[100:, :, 1] < 120)).sum()  # noqa: E731
     assert red(gap) > 20 > red(good)
 
 
 def test_a_frame_that_nothing_lays_on_the_ground_is_drawn_with_its_tracks():
-    drawn = SurveyPictures((200, 120), ())(FrameResult(surveyed(1).followed))
+    drawn = RunPictures((200, 120), ())(FrameResult(surveyed(1).followed))
     assert drawn.shape == (120, 200, 3)
     assert cv2.absdiff(drawn, np.full_like(drawn, 128)).any()
 
@@ -281,8 +282,8 @@ def test_a_report_that_is_not_wanted_is_not_made_and_an_old_one_goes(tmp_path):
 
 @pytest.mark.parametrize("kind", ["human", "not_human", "unseen"])
 def test_the_overlay_says_what_a_target_was_told_to_be(kind):
-    plain, told = (SurveyPictures((200, 120), NAMES)(item) for item in (surveyed(1), confirmed(surveyed(1), kind)))
-    others = [SurveyPictures((200, 120), NAMES)(confirmed(surveyed(1), k)) for k in ("human", "not_human", "unseen")]
+    plain, told = (RunPictures((200, 120), NAMES)(item) for item in (surveyed(1), confirmed(surveyed(1), kind)))
+    others = [RunPictures((200, 120), NAMES)(confirmed(surveyed(1), k)) for k in ("human", "not_human", "unseen")]
     assert cv2.absdiff(plain, told)[:40, :60].any()
     assert sum(np.array_equal(told, other) for other in others) == 1
 
@@ -295,7 +296,7 @@ def test_an_order_is_an_arrow_from_the_vehicle_towards_its_goal():
     fix = replace(item.grounded.fix, landmark=np.arange(3), state=("used",) * 3)
     item = replace(item, grounded=replace(item.grounded, marks=marks, fix=fix))
     sent = replace(item, command=Command(orders=(Order("a", np.array([30.0, 0]), 2.0),)))
-    plain, drawn = (SurveyPictures((200, 120), ("a", "b", "c"))(one) for one in (item, sent))
+    plain, drawn = (RunPictures((200, 120), ("a", "b", "c"))(one) for one in (item, sent))
     _, columns = np.nonzero((np.abs(plain.astype(int) - drawn) > 60).any(axis=2)[40:60])
     assert 55 <= columns.min() < 66 and 68 <= columns.max() <= 80
 

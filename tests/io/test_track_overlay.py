@@ -2,8 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.overlay.detection_overlay import Overlay
-from torchvision_dddas.io.overlay.track_overlay import TrackPictures, colour_of
+from torchvision_dddas.io.overlay import OverlayVideo, TrackPictures, identity_colour
 from torchvision_dddas.types import Detections, Frame, TrackedFrame, Tracks
 
 SIZE = (120, 90)
@@ -28,12 +27,14 @@ def test_each_identity_has_its_colour_in_every_frame():
     for number in (1, 2):
         made = pictures(followed(number, [[5, 20, 20, 30], [60, 20, 20, 30]], [3, 11]))
         assert made.shape == (90, 120, 3)
-        assert shows(made, colour_of(3)) and shows(made, colour_of(11)) and not shows(made, colour_of(4))
-        assert (made[20:50, 5] == colour_of(3)).all()
+        assert (
+            shows(made, identity_colour(3)) and shows(made, identity_colour(11)) and not shows(made, identity_colour(4))
+        )
+        assert (made[20:50, 5] == identity_colour(3)).all()
 
 
 def test_the_first_hundred_colours_are_different_and_bright():
-    colours = np.array([colour_of(i) for i in range(1, 101)])
+    colours = np.array([identity_colour(i) for i in range(1, 101)])
     assert len(np.unique(colours, axis=0)) > 90
     assert colours.max(axis=1).min() >= 190
 
@@ -42,7 +43,7 @@ def test_the_way_that_an_identity_came_is_drawn():
     pictures = TrackPictures(SIZE)
     pictures(followed(1, [[5, 5, 10, 10]], [2]))
     made = pictures(followed(2, [[65, 5, 10, 10]], [2]))
-    assert np.abs(made[10, 40].astype(int) - colour_of(2)).max() < 40  # the line is smoothed
+    assert np.abs(made[10, 40].astype(int) - identity_colour(2)).max() < 40  # the line is smoothed
 
 
 def test_detections_without_identity_and_frames_without_picture_are_drawn():
@@ -68,7 +69,7 @@ def test_the_input_is_not_drawn_on():
 
 
 def test_film_has_every_frame(tmp_path):
-    film = Overlay(tmp_path, 2, TrackPictures(SIZE))
+    film = OverlayVideo(tmp_path, 2, TrackPictures(SIZE))
     for number in range(1, 8):
         film.write(followed(number, [[5 + number, 20, 20, 30]], [1], read=number != 3))
     film.close(complete=True)

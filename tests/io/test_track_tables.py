@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.io.output.track_tables import COLUMNS, TrackTables, csv_lines, mot_lines
-from torchvision_dddas.io.overlay.trails import Trails
+from torchvision_dddas.io.overlay.layers import Trails
 from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 

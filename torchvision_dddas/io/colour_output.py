@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.overlay.drawing import label, line_width, rectangle
+from torchvision_dddas.io.overlay import label, rectangle
+from torchvision_dddas.io.overlay.drawing import line_width
 from torchvision_dddas.types import Colours
 
 

@@ -14,7 +14,7 @@ from torchvision_dddas.io.atomic_files import remove, write_whole
 from torchvision_dddas.io.colour_output import colours_toml
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import NAME, Record
-from torchvision_dddas.io.overlay.detection_overlay import Overlay
+from torchvision_dddas.io.overlay import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput
 from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
@@ -195,7 +195,7 @@ class _Frames:
         pass
 
 
-class _Video(Overlay[np.ndarray]):
+class _Video(OverlayVideo[np.ndarray]):
     """clip.mp4, H.264 where PyAV is installed; in place of a dropped frame the one before is there again."""
 
     def __init__(self, folder: Path, rate_hz: float, size: tuple[int, int]) -> None:

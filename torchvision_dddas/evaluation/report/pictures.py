@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, label, whole
+from torchvision_dddas.io.overlay import Colour, colour_picture, drawable, label
 
 HIT: Colour = (233, 180, 86)
 FALSE: Colour = (0, 94, 213)
@@ -131,7 +131,7 @@ def _tint(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: 
 
 def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: Colour, thick: int = 1) -> None:
     """Lines around what is there."""
-    drawn = [whole(contour) for contour in _contours(area, size)]
+    drawn = [drawable(contour) for contour in _contours(area, size)]
     cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
 
 
@@ -143,7 +143,7 @@ def _rings(picture: np.ndarray, true: np.ndarray, found: np.ndarray, size: tuple
         if (high - low).max() < _SMALL:
             x, y = (contour[0, 0] / share).astype(int).tolist()
             colour = HIT if true[y, x] and found[y, x] else TRUE if true[y, x] else FALSE
-            centre = whole((low + high) / 2).tolist()
+            centre = drawable((low + high) / 2).tolist()
             cv2.circle(picture, centre, _RING, (0, 0, 0), 4, cv2.LINE_AA)
             cv2.circle(picture, centre, _RING, colour, 2, cv2.LINE_AA)
 
@@ -156,7 +156,7 @@ def _contours(area: np.ndarray, size: tuple[int, int]) -> list[np.ndarray]:
 
 
 def _box(picture: np.ndarray, box: np.ndarray, colour: Colour, name: str, thick: int = 2) -> None:
-    x, y, right, bottom = whole(np.array([*box[:2], *(box[:2] + box[2:])])).tolist()
+    x, y, right, bottom = drawable(np.array([*box[:2], *(box[:2] + box[2:])])).tolist()
     cv2.rectangle(picture, (x - 1, y - 1), (right + 1, bottom + 1), (0, 0, 0), thick)
     cv2.rectangle(picture, (x, y), (right, bottom), colour, thick)
     if name:
@@ -170,7 +170,7 @@ def _dashed(picture: np.ndarray, box: np.ndarray, colour: Colour) -> None:
         steps = min(max(int(np.abs(end - start).sum() / 6) | 1, 1), 401)
         for shade, thick in (((0, 0, 0), 4), (colour, 2)):
             for k in range(0, steps, 2):
-                a, b = (whole(start + (end - start) * t / steps) for t in (k, k + 1))
+                a, b = (drawable(start + (end - start) * t / steps) for t in (k, k + 1))
                 cv2.line(picture, tuple(a.tolist()), tuple(b.tolist()), shade, thick)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas.io.maps.dateline import Place, cut_line, ring_about, rounded
 from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes, shown
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks
-from torchvision_dddas.io.overlay.track_overlay import colour_of
+from torchvision_dddas.io.overlay import identity_colour
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
@@ -28,7 +28,7 @@ def kml(
     """
     if tracks.lonlat_deg is None:
         raise ValueError("these positions have no longitude and latitude")
-    parts = [_HEAD.format(name=plain(name)), *(_style(f"target-{t}", colour_of(t)) for t in tracks.of)]
+    parts = [_HEAD.format(name=plain(name)), *(_style(f"target-{t}", identity_colour(t)) for t in tracks.of)]
     parts.append(_folder("tracks", [_track(tracks, of, f"target {t}", f"target-{t}") for t, of in tracks.of.items()]))
     parts.append(_folder("95 % ellipses", _ellipses(tracks)))
     if landmarks is not None and landmarks.lonlat_deg is not None:

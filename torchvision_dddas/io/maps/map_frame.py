@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.overlay.drawing import Colour
+from torchvision_dddas.io.overlay import Colour
 
 FINE = 2
 """The map is drawn so many times larger, and then reduced: so thin lines and small letters come out clean."""

@@ -26,8 +26,7 @@ from torchvision_dddas.io.maps.map_frame import (
 )
 from torchvision_dddas.io.maps.map_signs import Signs, draw_look, draw_signs, draw_verdict
 from torchvision_dddas.io.maps.map_symbols import MARK, Labels, dashes, draw_camera, draw_dot, draw_landmark, line
-from torchvision_dddas.io.overlay.drawing import Colour
-from torchvision_dddas.io.overlay.track_overlay import colour_of
+from torchvision_dddas.io.overlay import Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho
 
 VIEW = (0, 130, 240)
@@ -226,5 +225,5 @@ def _legend(
 
 def _dark(target: int) -> Colour:
     """A target's colour as in the overlay, but to be seen on white."""
-    blue, green, red = (round(0.72 * c) for c in colour_of(target))
+    blue, green, red = (round(0.72 * c) for c in identity_colour(target))
     return blue, green, red

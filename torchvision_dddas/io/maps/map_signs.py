@@ -5,7 +5,7 @@ import numpy as np
 
 from torchvision_dddas.io.maps.map_frame import FINE, INK, PAPER, MapFrame
 from torchvision_dddas.io.maps.map_symbols import dashes, fixed
-from torchvision_dddas.io.overlay.drawing import Colour
+from torchvision_dddas.io.overlay import Colour
 
 LETTERS = {"human": "H", "not_human": "N"}
 COLOURS: dict[str, Colour] = {"human": (60, 130, 20), "not_human": (40, 70, 190)}

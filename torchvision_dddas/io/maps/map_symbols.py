@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.io.maps.map_frame import FINE, INK, LEFT, PAPER, RIGHT, TOP, WIDTH, MapFrame, text_width, write
-from torchvision_dddas.io.overlay.drawing import Colour
+from torchvision_dddas.io.overlay import Colour
 
 MARK = (30, 30, 200)
 """The colour of a landmark."""

@@ -14,7 +14,7 @@ from torchvision_dddas.io.masks import NAME as MASK_NAME
 from torchvision_dddas.io.masks import Masks
 from torchvision_dddas.io.output import run_record as journal
 from torchvision_dddas.io.output.run_record import Journal, Record
-from torchvision_dddas.io.overlay.detection_overlay import Overlay, drawn
+from torchvision_dddas.io.overlay import OverlayVideo, draw_scene
 from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import Scene
 
@@ -130,7 +130,7 @@ class Output(RunFolder[Scene]):
         if "masks" in self._save:
             self._sinks.append(Masks(self.folder))
         if "overlay" in self._save:
-            self._sinks.append(Overlay(self.folder, rate_hz, drawn))
+            self._sinks.append(OverlayVideo(self.folder, rate_hz, draw_scene))
         return kept
 
 

@@ -7,8 +7,8 @@ from typing import Any
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.people_tables import PeopleTables
 from torchvision_dddas.io.output.run_record import Record
-from torchvision_dddas.io.overlay.detection_overlay import Overlay
-from torchvision_dddas.io.overlay.people_overlay import LIKELY, Still, drawn_people
+from torchvision_dddas.io.overlay import OverlayPicture, OverlayVideo, draw_people
+from torchvision_dddas.io.overlay.layers import LIKELY
 from torchvision_dddas.types import PeopleFrame
 
 SAVED = ("overlay",)
@@ -73,5 +73,7 @@ class PeopleOutput(RunFolder[PeopleFrame]):
         self._sinks = [kept, PeopleTables(self.folder)]
         kept.overlay = "overlay.png" if single else "overlay.mp4"
         if "overlay" in self._save:
-            self._sinks.append(Still(self.folder) if single else Overlay(self.folder, rate_hz, drawn_people))
+            self._sinks.append(
+                OverlayPicture(self.folder, draw_people) if single else OverlayVideo(self.folder, rate_hz, draw_people)
+            )
         return kept

@@ -17,8 +17,7 @@ from torchvision_dddas.io.output.run_log import WORLD
 from torchvision_dddas.io.output.run_record import Record
 from torchvision_dddas.io.output.track_output import TrackJournal
 from torchvision_dddas.io.output.track_tables import TrackTables
-from torchvision_dddas.io.overlay.detection_overlay import Overlay
-from torchvision_dddas.io.overlay.survey_overlay import Once, SurveyPictures
+from torchvision_dddas.io.overlay import OverlayVideo, RunPictures
 from torchvision_dddas.io.report.run_story import REPORT, RunStory
 from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import FrameResult, Scene, TrackedFrame
@@ -140,9 +139,9 @@ def _found(
 ) -> tuple[RunStory, list[Sink[FrameResult]]]:
     """Tables of what was found and who is who, the overlay, and the log."""
     sinks: list[Sink[FrameResult]] = [_Of(detection_tables(folder), _scene), _Of(TrackTables(folder), _followed)]
-    pictures = Once(SurveyPictures(size, names))
+    pictures = RunPictures(size, names)
     if "overlay" in save:
-        sinks.append(Overlay(folder, rate_hz, pictures))
+        sinks.append(OverlayVideo(folder, rate_hz, pictures))
     shown = pictures if "report" in save else None
     story = RunStory(folder, Path(str(facts.get("input", ""))).name, kept, names, shown)
     return story, [*sinks, story]

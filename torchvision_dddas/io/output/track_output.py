@@ -7,8 +7,7 @@ from typing import Any
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import Record
 from torchvision_dddas.io.output.track_tables import TrackTables
-from torchvision_dddas.io.overlay.detection_overlay import Overlay
-from torchvision_dddas.io.overlay.track_overlay import TrackPictures
+from torchvision_dddas.io.overlay import OverlayVideo, TrackPictures
 from torchvision_dddas.types import TrackedFrame
 
 SAVED = ("overlay",)
@@ -58,5 +57,5 @@ class TrackOutput(RunFolder[TrackedFrame]):
         self.journal = kept = TrackJournal(self.folder, {**facts, "outputs": ["tables", *self._save]})
         self._sinks = [kept, TrackTables(self.folder)]
         if "overlay" in self._save:
-            self._sinks.append(Overlay(self.folder, rate_hz, TrackPictures(size)))
+            self._sinks.append(OverlayVideo(self.folder, rate_hz, TrackPictures(size)))
         return kept

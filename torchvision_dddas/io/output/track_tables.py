@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.io.overlay.trails import Trails
+from torchvision_dddas.io.overlay.layers import Trails
 from torchvision_dddas.io.tables import TextFiles, compass_deg
 from torchvision_dddas.types import TrackedFrame
 

@@ -1,1 +1,20 @@
-"""Clips with results drawn in."""
+"""The overlay of a run: the clip with everything found drawn in."""
+
+from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, drawable, identity_colour, label, rectangle
+from torchvision_dddas.io.overlay.layers import RunPictures, TrackPictures, draw_people, draw_scene
+from torchvision_dddas.io.overlay.video import OverlayPicture, OverlayVideo
+
+__all__ = [
+    "Colour",
+    "OverlayPicture",
+    "OverlayVideo",
+    "RunPictures",
+    "TrackPictures",
+    "colour_picture",
+    "draw_people",
+    "draw_scene",
+    "drawable",
+    "identity_colour",
+    "label",
+    "rectangle",
+]

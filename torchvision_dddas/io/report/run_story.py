@@ -28,7 +28,7 @@ from torchvision_dddas.io.output.run_log import (
     lines,
 )
 from torchvision_dddas.io.output.run_record import Record
-from torchvision_dddas.io.overlay.survey_overlay import Once
+from torchvision_dddas.io.overlay import RunPictures
 from torchvision_dddas.io.report.keyframes import KeyFrames
 from torchvision_dddas.io.report.run_report import RunSummary, Table, format_span, run_report
 from torchvision_dddas.io.report.timelines import RunTimeline
@@ -45,7 +45,9 @@ _DIGITS = re.compile(r"\d+")
 class RunStory:
     """A sink of all that is known of a frame. Its log is always written; a report of its own only by `report`."""
 
-    def __init__(self, folder: Path, name: str, kept: Record, names: Sequence[str], pictures: Once | None) -> None:
+    def __init__(
+        self, folder: Path, name: str, kept: Record, names: Sequence[str], pictures: RunPictures | None
+    ) -> None:
         """name: of the clip. names: of the landmarks. pictures: of the frames, None where no key frames are wanted."""
         self._folder, self._name, self._kept, self._names, self._pictures = folder, name, kept, tuple(names), pictures
         self.log, self.course, self.frames, self.signs = RunLog(), RunTimeline(names), KeyFrames(), Signs()
@@ -196,7 +198,7 @@ class RunStory:
     def _verdicts(self) -> Counter[str]:
         return Counter(self._said.values())
 
-    def _picture(self, surveyed: FrameResult, time_s: float, pictures: Once) -> None:
+    def _picture(self, surveyed: FrameResult, time_s: float, pictures: RunPictures) -> None:
         pictures.show(surveyed)
         number = surveyed.followed.number
         self._waiting += self.log.entries[self._read :]

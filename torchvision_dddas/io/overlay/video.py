@@ -1,78 +1,28 @@
-"""The clip with its targets drawn in: tint and outline, box, heading, and a caption that says when not to trust it."""
+"""overlay.mp4 and overlay.png: pictures of a run, encoded in a thread beside the work that makes them."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Generic, TypeVar
+from queue import Queue
+from threading import Thread
+from typing import Generic, Protocol, TypeVar
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove, temporary
-from torchvision_dddas.io.overlay.drawing import colour_picture, line_width
-from torchvision_dddas.io.video_encoder import Beside, Writer
-from torchvision_dddas.types import Scene
-
-TARGET = (40, 190, 255)  # BGR
-WARNING = (60, 60, 255)
-TEXT = (255, 255, 255)
 
 Item = TypeVar("Item")
 
 
-def drawn(scene: Scene) -> np.ndarray:
-    """The frame with everything found in it, (H, W, 3) uint8 BGR."""
-    picture = colour_picture(scene.frame.image)
-    thick = line_width(picture)
-    foreground = (scene.mask > 0).astype(np.uint8)
-    if foreground.any():
-        where = foreground > 0
-        picture[where] = (0.7 * picture[where] + 0.3 * np.array(TARGET)).astype(np.uint8)
-        outlines = cv2.findContours(foreground, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-        cv2.drawContours(picture, outlines, -1, TARGET, 1)
-    found = scene.detections
-    for box, heading, speed in zip(found.box_px, found.heading_rad, found.speed_px, strict=True):
-        x, y, w, h = (round(float(v)) for v in box)
-        cv2.rectangle(picture, (x, y), (x + w - 1, y + h - 1), TARGET, thick)
-        if not math.isnan(heading):
-            length = 14 * thick + 4 * min(float(np.nan_to_num(speed)), 12.0)
-            middle = np.array([x + w / 2, y + h / 2])
-            tip = middle + length * np.array([math.cos(heading), math.sin(heading)])
-            cv2.arrowedLine(picture, _pixel(middle), _pixel(tip), TEXT, thick, cv2.LINE_AA, tipLength=0.35)
-    lines = [(f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(found)}", TEXT)]
-    if not scene.reliable:
-        lines.append((f"registration unreliable: {scene.cause}", WARNING))
-    caption(picture, lines)
-    return picture
-
-
-def _pixel(point: np.ndarray) -> tuple[int, int]:
-    return round(float(point[0])), round(float(point[1]))
-
-
-def caption(picture: np.ndarray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
-    """Write lines, each with its BGR colour, along the lower edge, made to fit the width."""
-    height, width = picture.shape[:2]
-    scale, row, thick = height / 1000, max(12, round(height / 28)), line_width(picture)
-    top = max(height - row * len(lines) - row // 3, 0)
-    picture[top:] = picture[top:] // 3
-    for i, (line, colour) in enumerate(lines):
-        plain = line.replace("×", "x").replace("−", "-").encode("ascii", "replace").decode()  # OpenCV's font is ASCII
-        size = max(scale, 0.35)
-        while len(plain) > 8 and cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, thick)[0][0] > width - 8:
-            plain = plain.removesuffix("...")[:-1] + "..." if len(plain) > 12 else plain[:-1]
-        cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), 0, size, colour, thick, cv2.LINE_AA)
-
-
-class Overlay(Generic[Item]):
+class OverlayVideo(Generic[Item]):
     """overlay.mp4: H.264, which browsers play, where PyAV is installed (extra `video`); else OpenCV's mp4v."""
 
     def __init__(
         self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray], name: str = "overlay.mp4"
     ) -> None:
-        """draw: makes the picture of a scene or followed frame, a new one each time, (H, W, 3) uint8 BGR."""
+        """draw: returns a new picture of an item, (H, W, 3) uint8 BGR."""
         self._path = folder / name
         self._part = temporary(self._path)
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
@@ -87,16 +37,16 @@ class Overlay(Generic[Item]):
         if height % 2 or width % 2:
             picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         if self._writer is None:
-            self._writer = Beside(open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0])))
+            self._writer = ThreadedWriter(open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0])))
         self._writer.write(picture)
 
     def close(self, complete: bool) -> None:
-        """Finish the film and put it in its place; a clip without frames has none."""
+        """Finish the video and put it in its place; a run without frames has none."""
         if self._writer is None:
             return
         writer, self._writer = self._writer, None
         writer.close()
-        # OpenCV's writer stays silent on a full disk: only a film that can be opened again is whole.
+        # OpenCV's writer stays silent on a full disk: only a video that can be opened again is whole.
         if not cv2.VideoCapture(str(self._part)).isOpened():
             raise OSError(f"{self._path.name} could not be finished")
         self._part.replace(self._path)
@@ -110,8 +60,80 @@ class Overlay(Generic[Item]):
         remove(self._part)
 
 
+class OverlayPicture(Generic[Item]):
+    """overlay.png: the picture of the last item."""
+
+    def __init__(self, folder: Path, draw: Callable[[Item], np.ndarray]) -> None:
+        self._draw = draw
+        self._path = folder / "overlay.png"
+        self._part = temporary(self._path)
+
+    def write(self, item: Item) -> None:
+        """Draw it. Raises OSError if the disk refuses."""
+        _, content = cv2.imencode(".png", self._draw(item))
+        self._part.write_bytes(content.tobytes())
+
+    def close(self, complete: bool) -> None:
+        """Put it in its place, if there is one."""
+        if self._part.exists():
+            self._part.replace(self._path)
+
+    def discard(self) -> None:
+        """Remove what was begun."""
+        remove(self._part)
+
+
+class Writer(Protocol):
+    """Writes pictures into a video file."""
+
+    def write(self, picture: np.ndarray) -> None:
+        """Add a picture, (H, W, 3) uint8 BGR with even H and W."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+class ThreadedWriter:
+    """A writer that works in a thread: on two cores the slower of the two sets the pace.
+
+    A picture must not be changed after it was given. An error of the work is raised by the next call.
+    """
+
+    def __init__(self, writer: Writer, waiting: int = 2) -> None:
+        """waiting: pictures held at most; `write` waits for room."""
+        self._writer = writer
+        self._queue: Queue[np.ndarray | None] = Queue(waiting)
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def write(self, picture: np.ndarray) -> None:
+        """Add a picture."""
+        self._raise()
+        self._queue.put(picture)
+
+    def close(self) -> None:
+        """Finish the file when all pictures are in it."""
+        self._queue.put(None)
+        self._thread.join()
+        self._writer.close()
+        self._raise()
+
+    def _work(self) -> None:
+        while (picture := self._queue.get()) is not None:
+            if self._error is None:
+                try:
+                    self._writer.write(picture)
+                except Exception as error:
+                    self._error = error
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+
 def open_writer(path: Path, rate: Fraction, size: tuple[int, int]) -> Writer:
-    """The best writer at hand for a film of (width, height). Raises OSError if the file cannot be begun."""
+    """A writer of H.264 if PyAV is there, else of mp4v. size: (width, height). Raises OSError if it cannot begin."""
     try:
         import av  # noqa: F401
     except ImportError:
