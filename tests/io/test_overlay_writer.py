@@ -3,7 +3,7 @@ import threading
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.video_encoder import Beside
+from torchvision_dddas.io.overlay.video import ThreadedWriter
 
 
 class Film:
@@ -30,7 +30,7 @@ def level(value):
 def test_every_picture_is_in_the_film_in_order_once_it_is_closed():
     film = Film()
     film.may.clear()
-    beside = Beside(film, waiting=30)
+    beside = ThreadedWriter(film, waiting=30)
     for value in range(20):
         beside.write(level(value))
     assert film.levels == []  # giving does not wait for the work
@@ -40,11 +40,11 @@ def test_every_picture_is_in_the_film_in_order_once_it_is_closed():
 
 
 def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
-    beside = Beside(Film(bad=(0,)))
+    beside = ThreadedWriter(Film(bad=(0,)))
     with pytest.raises(OSError, match="full"):
         list(map(beside.write, [level(0)] * 100))
     film = Film(bad=(1,))
-    beside = Beside(film, waiting=5)
+    beside = ThreadedWriter(film, waiting=5)
     for value in (0, 1):
         beside.write(level(value))
     with pytest.raises(OSError, match="full"):
