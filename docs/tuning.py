@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.simulation.demo import film_into
+from torchvision_dddas.simulation.recording import film_clip
 from torchvision_dddas.tuning.descent import Plan, Step, descend
 from torchvision_dddas.tuning.preparation import prepare
 from torchvision_dddas.tuning.verdict import judge
@@ -22,7 +22,7 @@ def told(step: Step) -> None:
 def main(folder: Path) -> None:
     # 1. Clips whose truth is known: pictures in frames/, and masks of what moves in masks/.
     for seed, name in enumerate(("one", "two", "held")):
-        film_into(folder / "clips" / name, seed, frames=10, size=(240, 180))
+        film_clip(folder / "clips" / name, seed, frames=10, size_px=(240, 180))
     (folder / "study.toml").write_text('[[dataset]]\nkind = "folder"\nfolder = "clips"\n', encoding="utf-8")
 
     # 2. The study with a threshold three times too high, and the clip that nothing is learned from.

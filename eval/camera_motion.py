@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import report
 from footage import film_of, sequences, truth_of
 from simulated_camera import CAMERAS, Filmed, flight, seen, translation
+from synthetic import LEAST_PX, SIZE, render
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.detector import run, scenes
@@ -31,7 +32,6 @@ from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import ONE_TARGET_LEAST
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.simulation.scene import LEAST_PX, SIZE, render
 from torchvision_dddas.tracking.sequence import Follower, follow_clip, follow_scenes
 from torchvision_dddas.types import DetectionTable, Frame, Scene, TrackedFrame, Tracks
 

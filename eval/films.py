@@ -43,7 +43,7 @@ def clips(arguments: list[str], sizes: list[Size], frames: int = 40) -> Iterator
 
 def scene(size: Size, frames: int) -> list[np.ndarray]:
     """The project's own scene, filmed at a size."""
-    from torchvision_dddas.simulation.scene import render
+    from synthetic import render
 
     return render(seed=0, frames=frames, size=size).images
 

@@ -28,6 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads must n
 import cv2
 import numpy as np
 import onnxruntime
+from synthetic import render
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.io.sources import open_source
@@ -36,7 +37,6 @@ from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.onnx_scorer import OnnxScorer, opened
 from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.runtime import SHIPPED
-from torchvision_dddas.simulation.scene import render
 from torchvision_dddas.types import Part
 
 KNOBS = PeopleParameters(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)

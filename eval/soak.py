@@ -20,8 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-from torchvision_dddas.simulation.scene import render
+from synthetic import render
 
 PERIOD = 40
 ROWS = 12

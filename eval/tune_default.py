@@ -16,11 +16,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import draws
 import report
+from synthetic import film_into
 from tune_recovery import f
 
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.evaluation.datasets import folder
-from torchvision_dddas.simulation.demo import film_into
 
 BEFORE = {"difference.threshold": 4.0, "difference.gradient_share": 0.15, "refine.spatial_px": 60.0}
 # Far from the seeds of other studies, of which none was looked at when the values were chosen.

@@ -20,6 +20,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import report
+from synthetic import film_into
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.detector import run
@@ -30,7 +31,6 @@ from torchvision_dddas.evaluation.metrics import segmentation
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
-from torchvision_dddas.simulation.demo import film_into
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.masks import Masks
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters

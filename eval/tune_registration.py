@@ -20,14 +20,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import report
 from registration_error import distance
+from synthetic import RATE_HZ, flight
 from tune_recovery import BASE, FRAMES, SIZE, f, filmed
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.stages import opened
-from torchvision_dddas.simulation.camera import flight
-from torchvision_dddas.simulation.scene import RATE_HZ
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, family

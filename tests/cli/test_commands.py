@@ -4,13 +4,14 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import progress as progress_module
-from torchvision_dddas.simulation.demo import film_into
 
 
 def test_help_loads_nothing_heavy():
@@ -118,25 +119,15 @@ def test_metrics_that_cannot_be_written_are_one_line(dddas, engine, clip, tmp_pa
 
 
 def test_demo_films_detects_and_scores_twice_into_the_same_folder(dddas, engine, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.simulation.demo.film_into.__defaults__", (0, 3, (160, 120)))
+    monkeypatch.setattr(
+        "torchvision_dddas.simulation.recording.film_clip", partial(film_into, frames=3, size=(160, 120))
+    )
     for _ in range(2):
         result = dddas("demo", "--out", tmp_path / "demo")
         assert result.exit_code == 0, result.output
     assert "Look at" in result.stdout
     for name in ("overlay.mp4", "detections.csv", "metrics.json", "clip/frames/000003.jpg", "clip/masks/000003.png"):
         assert (tmp_path / "demo" / name).is_file()
-
-
-def test_the_demo_clip_on_disk_is_the_scene(tmp_path):
-    from torchvision_dddas.simulation.scene import render
-
-    film_into(tmp_path, seed=1, frames=2, size=(160, 120))
-    made = render(1, 2, (160, 120))
-    read, mask = cv2.imread(str(tmp_path / "frames/000002.jpg")), cv2.imread(str(tmp_path / "masks/000002.png"), -1)
-    assert read is not None
-    assert mask is not None
-    assert np.abs(read.astype(int) - made.images[1]).mean() < 3
-    assert np.array_equal(mask, made.masks[1])
 
 
 def test_progress_away_from_a_terminal_is_a_plain_line_now_and_then(capsys, monkeypatch):

@@ -9,17 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.synthetic_clip import film_into
 from tests.tuning.test_colours import scene
 from torchvision_dddas.io.colour_files import read_colours
-from torchvision_dddas.simulation import demo
+from torchvision_dddas.simulation import recording
 from torchvision_dddas.tuning import descent
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, capsys) -> None:
-    film, plan = demo.film_into, descent.Plan
-    monkeypatch.setattr(demo, "film_into", lambda folder, seed, **_: film(folder, seed, frames=6, size=(160, 120)))
+    plan = descent.Plan
+    monkeypatch.setattr(recording, "film_clip", lambda folder, seed, **_: film_into(folder, seed, 6, (160, 120)))
     monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2, look_every=1))
     runpy.run_path(str(DOCS / "tuning.py"))["main"](tmp_path)
     told = capsys.readouterr().out
@@ -51,7 +52,7 @@ def test_the_ten_lines_of_the_text_run_as_they_are(tmp_path, monkeypatch, capsys
     code = code_of("As a library")
     assert len([line for line in code.splitlines() if line]) <= 10
     for seed, name in enumerate(("one", "held")):
-        demo.film_into(tmp_path / "clips" / name, seed, frames=6, size=(160, 120))
+        film_into(tmp_path / "clips" / name, seed, frames=6, size=(160, 120))
     (tmp_path / "study.toml").write_text('[[dataset]]\nkind = "folder"\nfolder = "clips"\n')
     plan = descent.Plan
     monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2))

@@ -13,18 +13,16 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the clip and everything found in it.")] = Path("demo-out"),
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
 ) -> None:
-    """Film a small scene of walkers and cars from a moving camera, detect them, and compare with the truth."""
+    """Film a short scenario of walkers and cars from a moving camera, detect them, and compare with the truth."""
     from torchvision_dddas.cli.detect import detect_clip, summary
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import SAVED
-    from torchvision_dddas.simulation.demo import film_into, make_room
-    from torchvision_dddas.simulation.scene import FRAMES, SIZE
+    from torchvision_dddas.simulation.recording import film_clip
 
-    make_room(out / "clip")
     if not quiet:
-        typer.echo(f"filming {FRAMES} frames of {SIZE[0]}×{SIZE[1]} into {out / 'clip'}", err=True)
-    clip = film_into(out / "clip")
+        typer.echo(f"filming the scenario demo into {out / 'clip'}", err=True)
+    clip = film_clip(out / "clip")
     journal = detect_clip(str(clip / "frames"), out, load_config(), "auto", SAVED, quiet=quiet)
     report = score(clip / "masks", out, None, out)
     if not quiet:

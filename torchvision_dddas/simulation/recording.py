@@ -1,7 +1,7 @@
 """What the instruments of a simulated run give, as files that the tools take: pictures, telemetry, reports, poses."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,13 +10,15 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
 from torchvision_dddas.io.colour_output import colours_toml
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.overlay import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput
+from torchvision_dddas.simulation.scenario import Scenario, load
+from torchvision_dddas.simulation.source import simulator_of
+from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput, moving_only
 from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
 
 SAVED = ("frames", "video", "masks", "ground")
@@ -241,6 +243,49 @@ class _Ground:
     def discard(self) -> None:
         for poses in self._poses.values():
             poses.discard()
+
+
+def film(
+    scenario: Scenario, seed: int | None = None, frames: int | None = None, size_px: tuple[int, int] | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The images (H, W, 3) uint8 BGR and masks (H, W) uint16 of a scenario; a mask numbers the targets that move.
+
+    seed, frames, size_px (width, height): in place of the scenario's own. A dropped frame is left out.
+    """
+    changed: dict[str, Any] = {}
+    if seed is not None:
+        changed["seed"] = seed
+    if size_px is not None:
+        width, height = size_px
+        changed["camera"] = scenario.camera.model_copy(update={"width_px": width, "height_px": height})
+    simulator = simulator_of(scenario.model_copy(update=changed))
+    for _ in range(simulator.frames if frames is None else min(frames, simulator.frames)):
+        shot = simulator.next()
+        if shot is not None and shot.frame is not None:
+            yield shot.frame.image, moving_only(shot.truth)
+
+
+def film_clip(
+    folder: Path,
+    seed: int | None = None,
+    frames: int | None = None,
+    size_px: tuple[int, int] | None = None,
+    scenario: str = "demo",
+) -> Path:
+    """Film a scenario into frames/000001.jpg ... and masks/000001.png ... of a folder, which is returned.
+
+    The rest as in `film`. Raises InputError if there is no such scenario or the disk refuses.
+    """
+    try:
+        for part in ("frames", "masks"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        for number, (image, mask) in enumerate(film(load(scenario), seed, frames, size_px), 1):
+            png = cv2.imencode(".png", mask.astype(np.uint8))[1]
+            write_whole(folder / "frames" / f"{number:06d}.jpg", jpeg(image))
+            write_whole(folder / "masks" / f"{number:06d}.png", png.tobytes())
+    except OSError as error:
+        raise cannot_write(Path(error.filename or folder), error) from error
+    return folder
 
 
 def jpeg(image: np.ndarray) -> bytes:

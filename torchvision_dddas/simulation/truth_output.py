@@ -91,9 +91,7 @@ class TruthOutput:
             )
             gathered.add(positions, truth.time_s, found.velocity_m_s[which])
         if self._masks is not None:
-            still = [target for target, moving in moves.items() if not moving]
-            kept = np.where(np.isin(truth.mask, still), 0, truth.mask) if still else truth.mask
-            self._masks.add(truth.frame, kept)
+            self._masks.add(truth.frame, moving_only(truth))
 
     def close(self, complete: bool) -> None:
         """Put the tables in their places and write the map. Raises OSError if they cannot be written."""
@@ -139,6 +137,13 @@ def targets_of(bodies: Bodies) -> Targets:
     kind = bodies.kind[first]
     people = np.where(kind == "person", count, 0)
     return Targets(target, kind, people, place / count[:, None], velocity / count[:, None], fastest)
+
+
+def moving_only(truth: Truth) -> np.ndarray:
+    """(H, W) uint16, the mask of a frame without the targets that stand."""
+    found = targets_of(truth.bodies)
+    still = found.target[found.fastest_m_s < STANDS_M_S]
+    return np.where(np.isin(truth.mask, still), 0, truth.mask) if len(still) else truth.mask
 
 
 def boxes_of(labels: np.ndarray) -> dict[int, tuple[int, int, int, int, int]]:
