@@ -21,7 +21,7 @@ from torchvision_dddas.detection.detector import run
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.metrics import segmentation
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import FrameResult, TrackedFrame, Tracks
 
 KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}

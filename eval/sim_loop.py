@@ -32,9 +32,8 @@ from torchvision_dddas.control.mission_api import Begun, mission_of
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.pipeline import survey
-from torchvision_dddas.simulation.scenario import load as load_scenario
-from torchvision_dddas.simulation.scenario import settings_of
-from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.simulation import SimulatorSource, scenario_settings
+from torchvision_dddas.simulation import load_scenario as load_scenario
 from torchvision_dddas.types import Command, Frame
 
 OPEN: Case = {"steering.on": False, "interval.rule": False}
@@ -92,7 +91,7 @@ def work(case: Case) -> Case:
     scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
     source = SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"])
     parameters = {name: value for name, value in case["set"].items() if name != "every"}
-    settings = with_parameters(load_config(CONFIG, (), settings_of(source.scenario)), parameters)
+    settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
     timed = Timed(source, case["set"].get("every", 1))
     begun = Begun(timed)
     mission = mission_of(begun, settings, "onboard")

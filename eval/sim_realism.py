@@ -33,15 +33,15 @@ from torchvision_dddas.detection.keypoint_grid import cell_side
 from torchvision_dddas.detection.opencv_registration import keypoints
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.simulation.scenario import (
+from torchvision_dddas.simulation import (
     AircraftParameters,
     CameraParameters,
     ClipParameters,
     Scenario,
+    SimulatorSource,
     TeamParameters,
     WorldParameters,
 )
-from torchvision_dddas.simulation.source import SimulatorSource
 from torchvision_dddas.types import Frame
 
 FLIGHTS = ((50.0, 90.0, 0), (50.0, 45.0, 1), (100.0, 60.0, 2), (200.0, 90.0, 3), (20.0, 35.0, 4))

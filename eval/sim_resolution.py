@@ -24,7 +24,7 @@ from sim_scenes import Kept, walking
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection.detector import Loop
 from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Frame
 
 SIZES = ((320, 240), (640, 480), (800, 600), (960, 720), (1280, 720), (1920, 1080))

@@ -20,10 +20,9 @@ from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.geo import Locator, Site, Targets, Watch, gathered, local, site_of
 from torchvision_dddas.geo.elevation import about
 from torchvision_dddas.geo.solvers import load_colours, load_solver
-from torchvision_dddas.simulation.camera import view_of
-from torchvision_dddas.simulation.receiver import SIGMAS_95, Receivers
-from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Scenario, settings_of
-from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
+from torchvision_dddas.simulation.drawing import view_from_pose
+from torchvision_dddas.simulation.sensor_errors import SIGMAS_95, Receivers
 from torchvision_dddas.types import (
     Colours,
     Command,
@@ -58,7 +57,7 @@ class Way:
 
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
     """What `dddas run sim:` takes, and more."""
-    return with_parameters(fitted(load_config(CONFIG, (), settings_of(source.scenario)), source), more or {})
+    return with_parameters(fitted(load_config(CONFIG, (), scenario_settings(source.scenario)), source), more or {})
 
 
 class OnceAFrame:
@@ -121,7 +120,7 @@ class Eye:
         bodies = truth.bodies
         crowds = [bodies.target == number for number in np.unique(bodies.target[bodies.kind == "person"])]
         middle = np.array([bodies.place_m[rows].mean(axis=0) for rows in crowds])
-        pixel = view_of(truth.pose, self._source.camera).project(middle)
+        pixel = view_from_pose(truth.pose, self._source.camera).project(middle)
         width, height = self._source.size
         inside = ((pixel >= 0) & (pixel <= (width - 1, height - 1))).all(axis=1)
         if not fix.by or not inside.any():

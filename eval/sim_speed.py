@@ -26,13 +26,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.aerial import AerialCamera
-from torchvision_dddas.simulation.agents import Agents
-from torchvision_dddas.simulation.groundview import GroundCamera
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import Scenario
-from torchvision_dddas.simulation.simulator import Simulator
-from torchvision_dddas.simulation.world import World
+from torchvision_dddas.simulation import Scenario, Simulator, World
+from torchvision_dddas.simulation.aerial_camera import AerialCamera
+from torchvision_dddas.simulation.agents import Agents, Moment
+from torchvision_dddas.simulation.ground_camera import GroundCamera
 
 SIZES = ((640, 480), (1280, 720))
 LOOKS = ((50.0, 90.0), (50.0, 45.0), (200.0, 90.0), (200.0, 45.0))

@@ -27,9 +27,8 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics.segmentation import ratio
 from torchvision_dddas.geo.colour_calibration import hsv_of, hue_apart, pooled, ranges_of, standing_out
 from torchvision_dddas.geo.opencv_colours import OpenCVColourFinder
-from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Fault, Scenario
-from torchvision_dddas.simulation.simulator import Shot, Simulator
-from torchvision_dddas.simulation.team import plates
+from torchvision_dddas.simulation import CarPlan, CrowdPlan, Fault, Scenario, Shot, Simulator
+from torchvision_dddas.simulation.ground_vehicles import marker_plates
 from torchvision_dddas.tuning.colours import fit_colours
 from torchvision_dddas.types import Colours
 
@@ -73,7 +72,7 @@ def main() -> None:
 
 def ways(learned: Sequence[Seen], steps: int) -> dict[str, Colours]:
     """Ranges by the way they were found."""
-    names, _, own = plates(TEAM)
+    names, _, own = marker_plates(TEAM)
     pictures, labels = [one.image for one in learned], [one.labels for one in learned]
     clicked = unlabelled(pictures, own)
     found = {"as `dddas colours` does": clicked} if clicked is not None else {}

@@ -26,8 +26,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.scorer import load_scorer
-from torchvision_dddas.simulation.recording import film
-from torchvision_dddas.simulation.scenario import load
+from torchvision_dddas.simulation import film, load_scenario
 from torchvision_dddas.types import Frame
 
 WARM_UP = 10
@@ -36,7 +35,7 @@ WARM_UP = 10
 def pictures(clip: str | None, size: tuple[int, int], count: int) -> Iterator[np.ndarray]:
     """Decoded frames, the clip forwards and backwards for as long as it takes."""
     if clip is None:
-        held = [image for image, _ in film(load("demo"), 0, 20, size)]
+        held = [image for image, _ in film(load_scenario("demo"), 0, 20, size)]
     else:
         held = [frame.image for frame in islice(open_source(clip), 40)]
     period = max(2 * len(held) - 2, 1)

@@ -125,7 +125,7 @@ def _pyramid(seed: int) -> list[np.ndarray]:
         middle = round(x), round(y)
         cv2.circle(ground, (middle[0] + 5, middle[1] + 3), round(radius), (60, 66, 70), -1, cv2.LINE_AA)
         cv2.circle(ground, middle, round(radius), (tone, tone + 40, tone + 30), -1, cv2.LINE_AA)
-    levels = [ground]
+    levels: list[np.ndarray] = [ground]
     while len(levels) < 5:
         levels.append(cv2.pyrDown(levels[-1]))
     return levels

@@ -87,16 +87,16 @@ def test_the_record_says_how_good_it_was(made):
 
 
 def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dddas, monkeypatch):
-    from torchvision_dddas.simulation.closed_loop_output import FlownOutput
+    from torchvision_dddas.simulation import SimulatedRunOutput
 
-    survey = FlownOutput.survey
+    survey = SimulatedRunOutput.survey
 
     def short(self, item):
         survey(self, item)
         if item.followed.number == 6:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(FlownOutput, "survey", short)
+    monkeypatch.setattr(SimulatedRunOutput, "survey", short)
     out = tmp_path / "out"
     path = scenario(tmp_path / "tiny.toml")
     result = dddas("run", f"sim:{path}", "--out", out, "--save", "truth", "--quiet", "--set", "steering.sampling=false")

@@ -17,7 +17,7 @@ from torchvision_dddas.io.landmark_tables import read_landmarks
 from torchvision_dddas.io.position_tables import read_positions
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.simulation.scenario import load, names
+from torchvision_dddas.simulation import load_scenario, scenario_names
 
 FAULTS = ({"what": "dropped", "time_s": 0.5, "seconds": 0.15}, {"what": "gps_dropout", "time_s": 1.0, "seconds": 0.55})
 
@@ -55,7 +55,7 @@ def test_the_film_has_a_picture_for_every_frame(made):
 
 def test_the_scenario_is_written_as_it_was_run(made):
     folder, _ = made
-    assert load(folder / "scenario.toml") == load(folder.parent / "tiny.toml")
+    assert load_scenario(folder / "scenario.toml") == load_scenario(folder.parent / "tiny.toml")
 
 
 def test_reports_are_read_and_true(made):
@@ -100,14 +100,14 @@ def test_camera_and_colours_are_read(made):
 def test_the_elevation_is_that_of_the_world(made):
     pytest.importorskip("rasterio")
     from torchvision_dddas.io.elevation import read_elevation
-    from torchvision_dddas.simulation.relief import up
-    from torchvision_dddas.simulation.source import simulator_of
+    from torchvision_dddas.simulation import open_simulator
+    from torchvision_dddas.simulation.relief import height_at
 
     folder, _ = made
-    scenario = load(folder / "scenario.toml")
+    scenario = load_scenario(folder / "scenario.toml")
     places = np.random.default_rng(0).uniform(-25, 25, (50, 2))
     read = read_elevation(folder / "dem.tif", places, scenario.world.origin_deg, 10.0)
-    np.testing.assert_allclose(up(read, places), simulator_of(scenario).world.up_m(places), atol=0.02)
+    np.testing.assert_allclose(height_at(read, places), open_simulator(scenario).world.up_m(places), atol=0.02)
     assert read.base_m == pytest.approx(scenario.world.above_sea_m, abs=0.05)
 
 
@@ -193,7 +193,7 @@ def test_what_is_not_to_be_saved_is_not(made, dddas, tmp_path):
 def test_without_a_name_it_lists_the_scenarios(dddas):
     result = dddas("simulate")
     assert result.exit_code == 0
-    assert [line.split()[0] for line in result.stdout.splitlines()] == names()
+    assert [line.split()[0] for line in result.stdout.splitlines()] == scenario_names()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.control.mission_api import Begun, Mission, mission_of
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.pipeline import survey
-from torchvision_dddas.simulation.source import SimulatorSource
+from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Command, FrameResult
 
 FROZEN = {"what": "frozen", "time_s": 2.0, "seconds": 0.5}

@@ -124,7 +124,7 @@ def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
     from torchvision_dddas.config import load_config
     from torchvision_dddas.evaluation.studies.axes import on_grid
     from torchvision_dddas.evaluation.studies.goals import goal_of
-    from torchvision_dddas.simulation.scenario import load as load_scenario
+    from torchvision_dddas.simulation import load_scenario as load_scenario
 
     program, name, *words = command.split()
     options = [word for word in words if word.startswith("--")]

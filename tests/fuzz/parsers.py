@@ -187,7 +187,7 @@ def _settings(path: Path) -> None:
 
 def _overrides(path: Path) -> None:
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.simulation.scenario import load as load_scenario
+    from torchvision_dddas.simulation import load_scenario as load_scenario
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     load_scenario("four", [f"settings.{words}"])
@@ -195,11 +195,11 @@ def _overrides(path: Path) -> None:
 
 
 def _scenario(path: Path) -> None:
-    from torchvision_dddas.simulation.scenario import as_toml, load
+    from torchvision_dddas.simulation import load_scenario, scenario_toml
 
-    found = load(path)
-    path.write_text(as_toml(found), encoding="utf-8")
-    assert load(path) == found, "a scenario that is written is read as another one"
+    found = load_scenario(path)
+    path.write_text(scenario_toml(found), encoding="utf-8")
+    assert load_scenario(path) == found, "a scenario that is written is read as another one"
 
 
 def _telemetry(path: Path) -> None:
@@ -261,11 +261,11 @@ def _video(path: Path) -> None:
 def _input_name(path: Path) -> None:
     """A device or an address is not tried: what may be behind it is not this test's."""
     from torchvision_dddas.io.sources import open_source
-    from torchvision_dddas.simulation import scenario
+    from torchvision_dddas.simulation import load_scenario
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     if words.startswith("sim:"):  # without its world, which takes seconds to be made
-        scenario.load(words[4:])
+        load_scenario(words[4:])
         return
     if (
         not (words.startswith("camera:") and words[7:].isdigit())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.geo.sun import BODY_WIDTH_M, feet_below, shadow_m, sun_at
-from torchvision_dddas.simulation.camera import axes, view_of
+from torchvision_dddas.simulation.drawing import camera_axes, view_from_pose
 from torchvision_dddas.types import Camera, CameraPose
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
@@ -40,8 +40,8 @@ def test_shadows_fall_away_from_the_sun_as_long_as_it_is_low_and_are_not_counted
 def test_the_feet_of_a_strip_of_body_and_one_of_shadow_are_found_from_the_mean_of_their_pixels(pitch_deg):
     pitch = np.radians(pitch_deg)
     back = 50 / np.tan(pitch) if pitch_deg < 90 else 0.0
-    pose = CameraPose(np.array([0.0, -back, 50.0]), axes(0.0, pitch, 0.0))
-    view, height = view_of(pose, CAMERA), 1.7
+    pose = CameraPose(np.array([0.0, -back, 50.0]), camera_axes(0.0, pitch, 0.0))
+    view, height = view_from_pose(pose, CAMERA), 1.7
     foot, shade = np.array([6.0, 4.0, 0.0]), np.append(shadow_m(SUN, height), 0.0)
     share = np.linspace(0, 1, 2001)[:, None]
     body, cast = view.project(foot + share * (0, 0, height)), view.project(foot + share * shade)

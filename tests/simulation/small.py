@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from torchvision_dddas.simulation.scenario import Scenario
+from torchvision_dddas.simulation import Scenario
 
 WORLD = {"side_m": 60.0, "texel_m": 0.25, "buildings": 0, "bushes_per_ha": 10.0, "trees_per_ha": 0.0}
 
@@ -25,7 +25,7 @@ def small(**tables):
 
 def as_file(path, scenario):
     """The same as a file, whose path is returned."""
-    from torchvision_dddas.simulation.scenario import as_toml
+    from torchvision_dddas.simulation import scenario_toml
 
-    path.write_text(as_toml(scenario))
+    path.write_text(scenario_toml(scenario))
     return path

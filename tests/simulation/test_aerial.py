@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.aerial import AerialCamera
-from torchvision_dddas.simulation.camera import axes, view_of
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import CameraParameters, Scenario, WorldParameters
-from torchvision_dddas.simulation.world import World, build
+from torchvision_dddas.simulation import CameraParameters, Scenario, World, WorldParameters, build_world
+from torchvision_dddas.simulation.aerial_camera import AerialCamera
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.drawing import camera_axes, view_from_pose
 from torchvision_dddas.types import Bodies, CameraPose, Elevation
 
 SIDE_M = 120.0
@@ -29,7 +28,7 @@ CLEAR = {
 def bare() -> World:
     """Grey ground with some relief and nothing on it."""
     parameters = WorldParameters(side_m=SIDE_M, relief_m=4, bushes_per_ha=0, trees_per_ha=0, buildings=0)
-    world = build(parameters, seed=1)
+    world = build_world(parameters, seed=1)
     return replace(world, albedo=np.full_like(world.albedo, 120), surface=np.zeros_like(world.surface))
 
 
@@ -58,7 +57,7 @@ def vehicle(kind: str, place: tuple[float, float], world: World, hidden: bool = 
 
 def moment(world: World, bodies: Bodies, altitude=50.0, pitch=90.0, number=1, velocity=(0, 0, 0), turn=(0, 0, 0)):
     """The camera looks at the origin, with its upper edge towards 25 degrees."""
-    turned = axes(np.radians(25), np.radians(pitch), np.radians(2))
+    turned = camera_axes(np.radians(25), np.radians(pitch), np.radians(2))
     place = -turned[:, 2] * altitude / np.sin(np.radians(pitch))
     return Moment(
         number, number / 10, bodies, CameraPose(place, turned), np.array(velocity, float), np.array(turn, float), None,
@@ -101,7 +100,7 @@ def test_a_point_of_the_ground_appears_where_the_camera_projects_it(bare, pitch,
     camera = AerialCamera(marked(bare, PLACES), scenario())
     now = moment(bare, nobody(bare), altitude, pitch)
     image, _, _ = camera.take(now)
-    expected = view_of(now.pose, camera.camera).project(np.c_[PLACES, bare.up_m(PLACES)])
+    expected = view_from_pose(now.pose, camera.camera).project(np.c_[PLACES, bare.up_m(PLACES)])
     assert np.abs(spots(image, expected) - expected).max() < 0.1
 
 
@@ -110,7 +109,7 @@ def test_a_rolling_shutter_shifts_each_row_by_what_the_camera_did_until_it_was_r
     still = moment(world, nobody(world), 60)
     moving = moment(world, nobody(world), 60, velocity=(8.0, -5.0, 1.0), turn=(0.1, -0.2, 0.3))
     camera = AerialCamera(world, scenario(readout_s=0.03))
-    view = view_of(still.pose, camera.camera)
+    view = view_from_pose(still.pose, camera.camera)
     points = np.c_[PLACES, world.up_m(PLACES)]
     expected = []
     for point in points:
@@ -119,7 +118,7 @@ def test_a_rolling_shutter_shifts_each_row_by_what_the_camera_did_until_it_was_r
             lag = (row / 479 - 0.5) * 0.03
             turned, _ = cv2.Rodrigues(moving.turn_rad_s * lag)
             pose = CameraPose(moving.pose.place_m + lag * moving.velocity_m_s, turned @ moving.pose.axes)
-            pixel = view_of(pose, camera.camera).project(point[None])[0]
+            pixel = view_from_pose(pose, camera.camera).project(point[None])[0]
             row = pixel[1]
         expected.append(pixel)
     assert np.abs(np.array(expected) - view.project(points)).max() > 1
@@ -146,7 +145,7 @@ def test_vibration_moves_rows_aside_anew_in_each_picture_and_only_while_the_shut
     world = marked(bare, PLACES)
     camera = AerialCamera(world, scenario(readout_s=0.015, vibration_px=2))
     calm = moment(world, nobody(world), 60)
-    steady = view_of(calm.pose, camera.camera).project(np.c_[PLACES, world.up_m(PLACES)])
+    steady = view_from_pose(calm.pose, camera.camera).project(np.c_[PLACES, world.up_m(PLACES)])
     offs = []
     for number in (1, 2):
         image, _, _ = camera.take(replace(calm, number=number))
@@ -175,7 +174,7 @@ def test_the_mask_of_a_crowd_lies_where_its_people_are(bare, altitude, pitch):
     _, targets, bodies = camera.take(now)
     assert set(np.unique(targets)) == {0, 1}
     assert ((targets > 0) == (bodies > 0)).all()
-    middle = view_of(now.pose, camera.camera).project(crowd.place_m + np.array([0, 0, 0.95]))
+    middle = view_from_pose(now.pose, camera.camera).project(crowd.place_m + np.array([0, 0, 0.95]))
     seen = np.array([np.argwhere(bodies == number).mean(axis=0)[::-1] for number in crowd.number])
     assert np.abs((seen - middle).mean(axis=0)).max() < 0.6
     assert np.linalg.norm(seen - middle, axis=1).max() < 2.5
@@ -203,11 +202,11 @@ def test_people_behind_a_building_are_hidden_and_those_in_front_of_it_are_not(ba
     # The camera looks north: behind is where it cannot see.
     crowd = people(np.array([[0.0, 6.0], [0.0, 1.0], [0.0, 14.0]]), world)
     now = moment(world, crowd, 40, 45)
-    turned = axes(0.0, np.radians(45), 0.0)
+    turned = camera_axes(0.0, np.radians(45), 0.0)
     now = replace(now, pose=CameraPose(-turned[:, 2] * 40 * np.sqrt(2), turned))
     _, _, bodies = AerialCamera(world, scenario()).take(now)
     assert set(np.unique(bodies)) == {0, 2, 3}
-    down = replace(now, pose=CameraPose(np.array([0, 0, 40.0]), axes(0.0, np.pi / 2, 0.0)))
+    down = replace(now, pose=CameraPose(np.array([0, 0, 40.0]), camera_axes(0.0, np.pi / 2, 0.0)))
     _, _, bodies = AerialCamera(world, scenario()).take(down)
     assert set(np.unique(bodies)) == {0, 1, 2, 3}
 
@@ -224,7 +223,7 @@ def test_the_top_of_a_building_appears_where_the_camera_projects_it(bare, pitch)
     now = moment(world, nobody(world), 60, pitch)
     image, _, _ = camera.take(now)
     corners = np.array([[-4, -3, 6], [8, -3, 6], [8, 3, 6], [-4, 3, 6.0]])
-    outline = view_of(now.pose, camera.camera).project(corners)
+    outline = view_from_pose(now.pose, camera.camera).project(corners)
     expected = cv2.fillConvexPoly(np.zeros(image.shape[:2], np.uint8), np.round(outline * 16).astype(np.int32), 1, 8, 4)
     # The walls are darker than the roof, as the sun does not shine along it.
     roof_seen = image[..., 0] > 200
@@ -273,7 +272,7 @@ def test_vehicles_have_their_length_and_lie_along_their_heading(bare, kind):
 
 
 def test_a_picture_depends_on_the_seed_and_its_moment_alone(bare):
-    world = build(WorldParameters(side_m=SIDE_M), seed=2)
+    world = build_world(WorldParameters(side_m=SIDE_M), seed=2)
     parameters = Scenario(seed=7)
     crowd = people(np.array([[0.0, 1.0], [2.0, 2.0]]), world)
     first, second = AerialCamera(world, parameters), AerialCamera(world, parameters)
@@ -290,7 +289,7 @@ def test_nothing_is_left_to_see_where_a_hill_lies_between(bare):
     up[12:14, :] = 12.0  # a ridge from west to east, just north of the middle
     ridge = replace(bare, relief=Elevation(up, (-SIDE_M / 2,) * 2, SIDE_M / 24))
     crowd = people(np.array([[0.0, 14.0], [0.0, -8.0]]), ridge)
-    turned = axes(0.0, np.radians(30), 0.0)
+    turned = camera_axes(0.0, np.radians(30), 0.0)
     now = replace(moment(ridge, crowd), pose=CameraPose(np.array([0.0, -35.0, 22.0]), turned))
     _, _, bodies = AerialCamera(ridge, scenario()).take(now)
     assert set(np.unique(bodies)) == {0, 2}
@@ -319,7 +318,7 @@ def test_a_long_exposure_blurs_the_ground_along_the_flight_and_a_car_along_its_o
 
 def test_rays_above_the_horizon_show_the_air_and_no_ground(bare):
     now = moment(bare, nobody(bare))
-    low = replace(now, pose=CameraPose(np.array([0, 0, 60.0]), axes(0.0, np.radians(10), 0.0)))
+    low = replace(now, pose=CameraPose(np.array([0, 0, 60.0]), camera_axes(0.0, np.radians(10), 0.0)))
     image, _, _ = AerialCamera(bare, scenario()).take(low)
     assert (image[0] == image[0, 0]).all()
     assert (image[0].astype(int) > image[-1].astype(int) + 40).all()

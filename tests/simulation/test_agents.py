@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas import geometry
-from torchvision_dddas.simulation.agents import Agents
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import (
+from torchvision_dddas.simulation import (
     AircraftParameters,
     CarPlan,
     ClipParameters,
@@ -21,6 +19,7 @@ from torchvision_dddas.simulation.scenario import (
     TeamParameters,
     WorldParameters,
 )
+from torchvision_dddas.simulation.agents import Agents, Moment
 from torchvision_dddas.types import Command, Order
 
 

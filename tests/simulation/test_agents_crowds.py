@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.cars import RADIUS_M, Cars
+from torchvision_dddas.simulation import CarPlan, CrowdPlan, Happening
 from torchvision_dddas.simulation.crowds import FASTEST_M, SLOWEST_M, UNIT_S, Crowds
-from torchvision_dddas.simulation.neighbours import pairs
-from torchvision_dddas.simulation.obstacles import Obstacles
-from torchvision_dddas.simulation.scenario import CarPlan, CrowdPlan, Happening
+from torchvision_dddas.simulation.ground_vehicles import RADIUS_M, Cars
+from torchvision_dddas.simulation.movement import Obstacles, near_pairs
 
 NOBODY = np.zeros((0, 2))
 NOTHING = np.zeros((0, 5))
@@ -177,7 +176,7 @@ def test_people_make_way_for_vehicles() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2, 300])
 def test_the_grid_finds_the_pairs_that_a_search_of_all_finds(count: int) -> None:
     place = np.random.default_rng(count).uniform(-6, 6, (count, 2))
-    first, second = pairs(place, 0.9)
+    first, second = near_pairs(place, 0.9)
     found = {(min(a, b), max(a, b)) for a, b in zip(first.tolist(), second.tolist(), strict=True)}
     away = np.linalg.norm(place[:, None] - place, axis=2)
     assert found == {(int(a), int(b)) for a, b in zip(*np.nonzero(np.triu(away < 0.9, 1)), strict=True)}

@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.aircraft import Aircraft, Swaying, Telemetry
-from torchvision_dddas.simulation.camera import view_of
-from torchvision_dddas.simulation.obstacles import Obstacles
-from torchvision_dddas.simulation.receiver import Receivers
-from torchvision_dddas.simulation.scenario import AircraftParameters, TeamParameters
-from torchvision_dddas.simulation.team import ACCELERATION_M_S2, TURN_RAD_S, Team, plates
-from torchvision_dddas.simulation.ways import Way
+from torchvision_dddas.simulation import AircraftParameters, TeamParameters
+from torchvision_dddas.simulation.drawing import view_from_pose
+from torchvision_dddas.simulation.ground_vehicles import ACCELERATION_M_S2, TURN_RAD_S, Team, marker_plates
+from torchvision_dddas.simulation.movement import Obstacles, Waypoints
+from torchvision_dddas.simulation.sensor_errors import Receivers
+from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, Swaying
 from torchvision_dddas.types import Camera, CameraPose
 
 NOBODY = np.zeros((0, 2))
@@ -164,7 +163,7 @@ def test_planned_waypoints_are_where_the_vehicles_come_by(patrol: str) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 4, 12])
 def test_colours_of_plates_are_each_in_their_own_range_alone(count: int) -> None:
-    names, bgr, colours = plates(count)
+    names, bgr, colours = marker_plates(count)
     assert len(names) == len(bgr) == len(colours) == count
     if count:
         hsv = cv2.cvtColor(np.round(bgr).astype(np.uint8)[None], cv2.COLOR_BGR2HSV)[0]
@@ -184,7 +183,7 @@ def of_ranges(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("light", [0.45, 0.8, 1.1])
 def test_plates_keep_their_colours_in_shade_noise_and_compression(light: float) -> None:
     rng = np.random.default_rng(0)
-    _, bgr, colours = plates(12)
+    _, bgr, colours = marker_plates(12)
     for k in range(12):
         picture = np.full((48, 48, 3), (105.0, 130.0, 150.0))
         picture[16:32, 16:32] = bgr[k] * light
@@ -222,7 +221,7 @@ def test_the_point_of_the_way_is_in_the_middle_of_the_picture(pitch_deg: float) 
     aircraft = calm(pitch_deg=pitch_deg, heading_deg=30.0, start_m=(5.0, -3.0), way_m=((65.0, -3.0),))
     for second, (pose, _, _) in enumerate(fly(aircraft, 20, 0.1)[9::10]):
         point = np.array([[5.0 + 2.0 * (second + 1), -3.0, 0.0]])
-        assert view_of(pose, CAMERA).project(point)[0] == pytest.approx(CAMERA.centre_px, abs=0.5)
+        assert view_from_pose(pose, CAMERA).project(point)[0] == pytest.approx(CAMERA.centre_px, abs=0.5)
         heading, pitch, roll = np.degrees(pose.angles_rad)
         assert pitch == pytest.approx(pitch_deg, abs=0.1)
         if pitch_deg < 90:
@@ -296,7 +295,7 @@ def test_steered_it_reaches_the_place_the_height_and_the_sight_asked_for() -> No
     found = fly(aircraft, 60, 0.1, 3.0)
     pose = found[-1][0]
     assert pose.place_m == pytest.approx((*goal, 80.0), abs=0.3)
-    assert view_of(pose, CAMERA).project(np.array([[*seen, 0.0]]))[0] == pytest.approx(CAMERA.centre_px, abs=1.0)
+    assert view_from_pose(pose, CAMERA).project(np.array([[*seen, 0.0]]))[0] == pytest.approx(CAMERA.centre_px, abs=1.0)
     speed = np.linalg.norm([one for _, one, _ in found], axis=1)
     assert speed.max() <= 8.0 + 1e-6
     assert speed.max() > 7.0
@@ -329,7 +328,7 @@ def test_its_telemetry_errs_lastingly_by_what_the_knobs_say() -> None:
     )
     errors = []
     for seed in range(800):
-        telemetry = Telemetry(parameters, seed)
+        telemetry = ReportedPose(parameters, seed)
         errors.append([telemetry.errors(0.1) for _ in range(2)])
     found = np.array(errors)
     sigma = np.array([np.radians(1), np.radians(1), np.radians(3), 0.02, 1.43, 1.43])
@@ -338,7 +337,7 @@ def test_its_telemetry_errs_lastingly_by_what_the_knobs_say() -> None:
 
 
 def test_a_way_goes_there_and_back_at_its_speed() -> None:
-    way = Way(np.array([[0.0, 0], [10, 0], [10, 0], [10, 5]]), 2.0)
+    way = Waypoints(np.array([[0.0, 0], [10, 0], [10, 0], [10, 5]]), 2.0)
     for time, place, velocity in (
         (0.0, (0, 0), (2, 0)),
         (4.0, (8, 0), (2, 0)),
@@ -350,7 +349,7 @@ def test_a_way_goes_there_and_back_at_its_speed() -> None:
         at, going = way.at(time)
         assert at == pytest.approx(place)
         assert going == pytest.approx(velocity)
-    assert Way(np.zeros((1, 2)), 2.0).at(3.0)[1] == pytest.approx((0, 0))
+    assert Waypoints(np.zeros((1, 2)), 2.0).at(3.0)[1] == pytest.approx((0, 0))
 
 
 def test_the_pose_tells_a_camera_not_mirrored() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.blur import smeared, streak
+from torchvision_dddas.simulation.shutter import motion_blur, streak_kernel
 
 
 def dot() -> np.ndarray:
@@ -22,7 +22,7 @@ def spread(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("way", [(12.0, 0.0), (0.0, -7.5), (9.0, 5.0)])
 def test_a_way_common_to_all_draws_out_by_its_length_and_moves_nothing(way):
-    blurred = smeared(dot(), np.broadcast_to(np.float32(way), (3, 3, 2)))
+    blurred = motion_blur(dot(), np.broadcast_to(np.float32(way), (3, 3, 2)))
     (before, own), (after, now) = spread(dot()), spread(blurred)
     assert np.abs(after - before).max() < 0.1
     assert now - own == pytest.approx(np.square(way) / 12, abs=0.6)
@@ -31,7 +31,7 @@ def test_a_way_common_to_all_draws_out_by_its_length_and_moves_nothing(way):
 def test_where_ways_differ_each_part_is_drawn_out_by_its_own():
     way = np.zeros((3, 3, 2), np.float32)
     way[..., 0] = [0.0, 10.0, 20.0]
-    blurred = smeared(dot(), way)
+    blurred = motion_blur(dot(), way)
     (before, own), (after, now) = spread(dot()), spread(blurred)
     assert np.abs(after - before).max() < 0.6
     assert (now - own)[0] == pytest.approx(100 / 12, rel=0.15)
@@ -39,13 +39,13 @@ def test_where_ways_differ_each_part_is_drawn_out_by_its_own():
 
 
 def test_a_way_shorter_than_the_lens_shows_changes_nothing():
-    assert smeared(dot(), np.full((3, 3, 2), 0.3, np.float32)) is not None
-    assert np.array_equal(smeared(dot(), np.full((3, 3, 2), 0.3, np.float32)), dot())
+    assert motion_blur(dot(), np.full((3, 3, 2), 0.3, np.float32)) is not None
+    assert np.array_equal(motion_blur(dot(), np.full((3, 3, 2), 0.3, np.float32)), dot())
 
 
 @pytest.mark.parametrize("way", [(0.0, 0.0), (3.3, -8.1), (1.0, 0.0)])
 def test_a_streak_keeps_the_light_and_its_middle(way):
-    kernel = streak(np.array(way))
+    kernel = streak_kernel(np.array(way))
     v, u = np.mgrid[: len(kernel), : len(kernel)] - len(kernel) // 2
     assert kernel.sum() == pytest.approx(1)
     assert abs((kernel * u).sum()) < 1e-5

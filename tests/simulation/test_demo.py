@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app
-from torchvision_dddas.simulation.demo import film_into
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def blocks(language: str) -> list[str]:
 
 
 def test_the_demo_finds_most_movers_and_leaves_the_parked_car_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.simulation.demo.film_into.__defaults__", (0, 16, (480, 360)))
+    monkeypatch.setattr("torchvision_dddas.simulation.film_clip.__defaults__", (None, 16, (480, 360), "demo"))
     result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "demo")])
     assert result.exit_code == 0, result.output
     scores = json.loads((tmp_path / "demo/metrics.json").read_text())["clips"]["demo"]

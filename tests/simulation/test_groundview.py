@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.groundview import GroundCamera
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import GpsParameters, Scenario, TeamParameters, WorldParameters
-from torchvision_dddas.simulation.world import World, build
+from torchvision_dddas.simulation import GpsParameters, Scenario, TeamParameters, World, WorldParameters, build_world
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.ground_camera import GroundCamera
 from torchvision_dddas.types import Bodies, CameraPose
 
 BARE = WorldParameters(side_m=80, texel_m=0.1, relief_m=0, bushes_per_ha=0, trees_per_ha=0, buildings=0)
@@ -17,7 +16,7 @@ SMALL = Scenario(seed=3, world=BARE, team=TeamParameters(width_px=320, height_px
 
 @pytest.fixture(scope="module")
 def bare() -> World:
-    return build(BARE, 3)
+    return build_world(BARE, 3)
 
 
 def moment(*people: tuple[float, float], kinds: str = "person", number: int = 1, up: float = 0.0) -> Moment:
@@ -134,7 +133,7 @@ def test_what_is_almost_at_the_camera_is_drawn_without_breaking_off(bare: World,
 
 
 def test_sky_is_above_and_ground_below_and_plants_stand_between(bare: World) -> None:
-    grown = build(BARE.model_copy(update={"bushes_per_ha": 300.0}), 3)
+    grown = build_world(BARE.model_copy(update={"bushes_per_ha": 300.0}), 3)
     empty, full = (GroundCamera(world, SMALL).look(moment(), 0).image.astype(float) for world in (bare, grown))
     blue, red = empty[:40, :, 0].mean(), empty[:40, :, 2].mean()
     assert blue > red + 30

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.scenario import CameraParameters
+from torchvision_dddas.simulation import CameraParameters
 from torchvision_dddas.simulation.sensor import Sensor
 
 SIZE = (320, 240)

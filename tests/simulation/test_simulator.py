@@ -8,8 +8,7 @@ import pytest
 
 from tests.simulation.small import small
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation.simulator import Simulator
-from torchvision_dddas.simulation.world import build
+from torchvision_dddas.simulation import Simulator, build_world
 from torchvision_dddas.types import Command, Elevation, Order
 
 
@@ -142,7 +141,7 @@ def tall(monkeypatch):
     name = "torchvision_dddas.simulation.simulator.build"
 
     def raised(*args):
-        world = build(*args)
+        world = build_world(*args)
         surface = world.surface.copy()
         row, column = (int(v / world.surface_texel_m) for v in (30.0, 35.0))
         surface[row - 2 : row + 3, column - 2 : column + 3] = 12.0

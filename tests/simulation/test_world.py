@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation import world as worlds
-from torchvision_dddas.simulation.scenario import WorldParameters
-from torchvision_dddas.simulation.sunlight import above_ground, on_slopes, towards
-from torchvision_dddas.simulation.world import build
+from torchvision_dddas.simulation import WorldParameters, build_world
+from torchvision_dddas.simulation.relief import light_on_slopes, shadow_above_ground, sun_direction
 from torchvision_dddas.types import Elevation, Ortho
 
 KNOBS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
@@ -17,7 +15,7 @@ BARE = WorldParameters(side_m=60, bushes_per_ha=0, trees_per_ha=0, buildings=0, 
 
 @pytest.fixture(scope="module")
 def world():
-    return build(KNOBS, seed=3)
+    return build_world(KNOBS, seed=3)
 
 
 def texel_of(world, east_north_m):
@@ -31,7 +29,7 @@ def texel_of(world, east_north_m):
 
 
 def test_same_seed_gives_the_same_world_and_another_seed_another(world):
-    again, other = build(KNOBS, seed=3), build(KNOBS, seed=4)
+    again, other = build_world(KNOBS, seed=3), build_world(KNOBS, seed=4)
     assert np.array_equal(world.albedo, again.albedo)
     assert np.array_equal(world.surface, again.surface)
     assert np.array_equal(world.relief.up_m, again.relief.up_m)
@@ -41,9 +39,9 @@ def test_same_seed_gives_the_same_world_and_another_seed_another(world):
 
 @pytest.mark.parametrize("parameters", [KNOBS, BARE])
 def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, parameters):
-    whole = build(parameters, seed=3).albedo.astype(int)
-    monkeypatch.setattr(worlds, "_AT_ONCE", 72 * 600)
-    off = np.abs(build(parameters, seed=3).albedo.astype(int) - whole)
+    whole = build_world(parameters, seed=3).albedo.astype(int)
+    monkeypatch.setattr("torchvision_dddas.simulation.world._AT_ONCE", 72 * 600)
+    off = np.abs(build_world(parameters, seed=3).albedo.astype(int) - whole)
     # Rounding of a filter that begins elsewhere.
     assert off.max() <= 1
     assert np.mean(off > 0) < 0.01
@@ -51,7 +49,7 @@ def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, par
 
 @pytest.mark.parametrize(("side_m", "texel_m"), [(60.0, 0.1), (41.3, 0.17), (100.0, 2.0), (40.0, 0.05)])
 def test_texture_and_surface_span_the_world(side_m, texel_m):
-    made = build(KNOBS.model_copy(update={"side_m": side_m, "texel_m": texel_m}), seed=0)
+    made = build_world(KNOBS.model_copy(update={"side_m": side_m, "texel_m": texel_m}), seed=0)
     assert made.albedo.dtype == np.uint8
     assert made.albedo.shape == (*made.albedo.shape[:1] * 2, 3)
     assert made.albedo.shape[0] * made.texel_m == pytest.approx(side_m)
@@ -62,16 +60,16 @@ def test_texture_and_surface_span_the_world(side_m, texel_m):
 
 
 def test_relief_is_as_high_as_asked_and_level_at_the_origin():
-    hilly = build(BARE.model_copy(update={"side_m": 300.0, "texel_m": 0.5, "relief_m": 12.0}), seed=1)
+    hilly = build_world(BARE.model_copy(update={"side_m": 300.0, "texel_m": 0.5, "relief_m": 12.0}), seed=1)
     assert np.ptp(hilly.relief.up_m) == pytest.approx(12)
     assert hilly.up_m(np.zeros((1, 2))) == pytest.approx([0])
     assert hilly.relief.base_m == 1300
-    level = build(BARE, seed=1)
+    level = build_world(BARE, seed=1)
     assert np.ptp(level.relief.up_m) == 0
 
 
 def test_height_is_bilinear_and_mirrored_at_the_edges():
-    hilly = build(BARE.model_copy(update={"relief_m": 5.0}), seed=1)
+    hilly = build_world(BARE.model_copy(update={"relief_m": 5.0}), seed=1)
     relief = hilly.relief
     nodes = np.array(relief.corner_m) + relief.step_m * np.array([[3, 5], [4, 5], [3, 6], [4, 6]])
     heights = relief.up_m[[5, 5, 6, 6], [3, 4, 3, 4]]
@@ -86,7 +84,7 @@ def test_height_is_bilinear_and_mirrored_at_the_edges():
 def test_a_given_elevation_replaces_the_hills():
     north, east = np.mgrid[-60:61:5.0, -50:51:5.0]
     given = Elevation(0.05 * east - 0.02 * north + 7, (-50.0, -60.0), 5.0, base_m=1200.0)
-    made = build(BARE, seed=0, elevation=given)
+    made = build_world(BARE, seed=0, elevation=given)
     places = np.random.default_rng(0).uniform(-30, 30, (40, 2))
     assert made.up_m(places) == pytest.approx(places @ [0.05, -0.02], abs=1e-3)
     assert made.relief.base_m == pytest.approx(1207, abs=1e-3)
@@ -100,13 +98,13 @@ def test_an_elevation_that_does_not_cover_the_world_is_refused(hole):
     given = Elevation(up_m, (-60.0, -60.0) if hole else (0.0, -60.0), 3.0)
     share = "9[0-9]" if hole else "5[01]"
     with pytest.raises(InputError, match=rf"covers {share} % of the world: it has heights from .* m east"):
-        build(BARE, seed=0, elevation=given)
+        build_world(BARE, seed=0, elevation=given)
 
 
 def test_a_world_of_too_many_pixels_is_refused_with_the_texel_that_would_do():
     parameters = BARE.model_copy(update={"side_m": 4000.0})
     with pytest.raises(InputError, match=r"40000 of them .* set world.texel_m to 0.334 or more"):
-        build(parameters, seed=0)
+        build_world(parameters, seed=0)
 
 
 def test_things_stand_where_the_list_says_and_nowhere_else(world):
@@ -127,13 +125,13 @@ def test_nothing_stands_near_the_places_kept_clear():
     dense = KNOBS.model_copy(update={"bushes_per_ha": 800.0})
     places = np.array([[0.0, 0.0], [12.0, -9.0], [-20, 15]])
     for keep_clear, near in ((None, True), ((places, 4.0), False)):
-        made = build(dense, seed=2, keep_clear=keep_clear)
+        made = build_world(dense, seed=2, keep_clear=keep_clear)
         apart = np.hypot(*(made.things.east_north_m[:, None] - places).T) - made.things.radius_m
         assert (apart.min() < 4) == near
 
 
 def test_crowns_and_roofs_are_seen_in_the_texture(world):
-    soil = build(KNOBS.model_copy(update={"bushes_per_ha": 0.0, "trees_per_ha": 0.0, "buildings": 0}), seed=3)
+    soil = build_world(KNOBS.model_copy(update={"bushes_per_ha": 0.0, "trees_per_ha": 0.0, "buildings": 0}), seed=3)
     changed = np.abs(world.albedo.astype(int) - soil.albedo).max(axis=2) > 12
     rows, columns = texel_of(world, world.things.east_north_m)
     big = world.things.radius_m > 0.5
@@ -143,10 +141,10 @@ def test_crowns_and_roofs_are_seen_in_the_texture(world):
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 215.0])
 def test_shadows_fall_away_from_the_sun_as_long_as_it_is_low(azimuth_deg):
-    to_sun = towards(azimuth_deg, 40)
+    to_sun = sun_direction(azimuth_deg, 40)
     heights = np.zeros((161, 161), np.float32)
     heights[79:82, 79:82] = 5  # a pole in pixels of 0.25 m
-    over = above_ground(heights, 0.25, to_sun)
+    over = shadow_above_ground(heights, 0.25, to_sun)
     way = -to_sun[:2] / np.hypot(*to_sun[:2])
     length = 5 / np.tan(np.radians(40))
 
@@ -161,15 +159,15 @@ def test_shadows_fall_away_from_the_sun_as_long_as_it_is_low(azimuth_deg):
 
 def test_slopes_towards_the_sun_are_brighter_and_level_ground_is_as_it_is():
     east = np.tile(np.arange(20.0), (20, 1))
-    to_sun = towards(90, 35)
-    assert on_slopes(0.2 * east, 1.0, to_sun).max() < 0.95
-    assert on_slopes(-0.2 * east, 1.0, to_sun).min() > 1.05
-    assert on_slopes(0 * east, 1.0, to_sun) == pytest.approx(np.ones((20, 20)))
+    to_sun = sun_direction(90, 35)
+    assert light_on_slopes(0.2 * east, 1.0, to_sun).max() < 0.95
+    assert light_on_slopes(-0.2 * east, 1.0, to_sun).min() > 1.05
+    assert light_on_slopes(0 * east, 1.0, to_sun) == pytest.approx(np.ones((20, 20)))
 
 
 def test_ground_in_shadow_is_darker_and_bluer():
     parameters = BARE.model_copy(update={"buildings": 1, "sun_height_deg": 30.0})
-    lit, shaded = build(BARE.model_copy(update={"sun_height_deg": 30.0}), seed=5), build(parameters, seed=5)
+    lit, shaded = build_world(BARE.model_copy(update={"sun_height_deg": 30.0}), seed=5), build_world(parameters, seed=5)
     (place,), (radius,), (height,) = shaded.things.east_north_m, shaded.things.radius_m, shaded.things.height_m
     assert height > 2
     way = -lit.to_sun[:2] / np.hypot(*lit.to_sun[:2])
@@ -183,7 +181,7 @@ def test_ground_in_shadow_is_darker_and_bluer():
 
 @pytest.mark.parametrize("width_m", [0.1, 0.35])
 def test_keypoints_are_found_everywhere(width_m):
-    made = build(BARE.model_copy(update={"side_m": 120.0}), seed=6)
+    made = build_world(BARE.model_copy(update={"side_m": 120.0}), seed=6)
     grey = cv2.cvtColor(made.albedo, cv2.COLOR_BGR2GRAY)
     seen = cv2.resize(grey, None, fx=0.1 / width_m, fy=0.1 / width_m, interpolation=cv2.INTER_AREA)
     cell = 48
@@ -204,7 +202,7 @@ def photo_of(side_px, pixel_m, image=None):
 
 def test_a_photo_on_the_same_grid_is_the_texture():
     photo = photo_of(600, 0.1)
-    assert np.array_equal(build(BARE, seed=0, photo=photo).albedo, photo.image)
+    assert np.array_equal(build_world(BARE, seed=0, photo=photo).albedo, photo.image)
 
 
 def test_a_photo_turned_and_finer_lies_where_its_matrix_says():
@@ -213,7 +211,7 @@ def test_a_photo_turned_and_finer_lies_where_its_matrix_says():
     turn, pixel_m = np.radians(30), 0.08
     turned = pixel_m * np.array([[np.cos(turn), np.sin(turn)], [np.sin(turn), -np.cos(turn)]])
     matrix = np.c_[turned, -turned @ [750, 750]]
-    made = build(BARE, seed=0, photo=Ortho(image, matrix))
+    made = build_world(BARE, seed=0, photo=Ortho(image, matrix))
     rows, columns = np.nonzero(made.albedo[..., 2] > 150)
     east, north = (columns.mean() + 0.5) * 0.1 - 30, 30 - (rows.mean() + 0.5) * 0.1
     assert (east, north) == pytest.approx(matrix @ [950, 550, 1], abs=0.05)
@@ -223,7 +221,7 @@ def test_a_photo_turned_and_finer_lies_where_its_matrix_says():
 def test_holes_of_a_photo_are_filled_with_soil_of_its_colour(empty):
     image = np.random.default_rng(1).integers(60, 120, (600, 600, 3), np.uint8)
     image[:200] = empty
-    made = build(BARE, seed=0, photo=photo_of(600, 0.1, image)).albedo
+    made = build_world(BARE, seed=0, photo=photo_of(600, 0.1, image)).albedo
     assert np.array_equal(made[220:], image[220:])
     assert made[:190].mean() == pytest.approx(90, rel=0.25)
     assert 20 < np.percentile(made[:190], 0.5) < np.percentile(made[:190], 99.5) < 200
@@ -233,7 +231,7 @@ def test_holes_of_a_photo_are_filled_with_soil_of_its_colour(empty):
 def test_a_coarse_photo_gets_fine_structure_and_keeps_its_colours():
     coarse = np.random.default_rng(1).integers(60, 180, (60, 60, 3), np.uint8)
     photo = photo_of(60, 1.0, coarse)
-    made = build(BARE, seed=0, photo=photo).albedo
+    made = build_world(BARE, seed=0, photo=photo).albedo
     plain = cv2.resize(coarse, made.shape[:2], interpolation=cv2.INTER_LINEAR)
     assert cv2.Laplacian(made, cv2.CV_32F).std() > 2 * cv2.Laplacian(plain, cv2.CV_32F).std()
     back = cv2.resize(made, (60, 60), interpolation=cv2.INTER_AREA).astype(float)
@@ -243,4 +241,4 @@ def test_a_coarse_photo_gets_fine_structure_and_keeps_its_colours():
 def test_a_photo_of_elsewhere_is_refused():
     away = Ortho(np.full((50, 50, 3), 90, np.uint8), np.array([[0.1, 0, 500], [0, -0.1, 40]]))
     with pytest.raises(InputError, match="shows nothing of the world: it lies from 500 m to 505 m east"):
-        build(BARE, seed=0, photo=away)
+        build_world(BARE, seed=0, photo=away)

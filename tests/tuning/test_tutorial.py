@@ -12,7 +12,6 @@ import pytest
 from tests.synthetic_clip import film_into
 from tests.tuning.test_colours import scene
 from torchvision_dddas.io.colour_files import read_colours
-from torchvision_dddas.simulation import recording
 from torchvision_dddas.tuning import descent
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -20,7 +19,9 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, capsys) -> None:
     plan = descent.Plan
-    monkeypatch.setattr(recording, "film_clip", lambda folder, seed, **_: film_into(folder, seed, 6, (160, 120)))
+    monkeypatch.setattr(
+        "torchvision_dddas.simulation.film_clip", lambda folder, seed, **_: film_into(folder, seed, 6, (160, 120))
+    )
     monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2, look_every=1))
     runpy.run_path(str(DOCS / "tuning.py"))["main"](tmp_path)
     told = capsys.readouterr().out

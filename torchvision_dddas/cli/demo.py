@@ -18,7 +18,7 @@ def demo(
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import SAVED
-    from torchvision_dddas.simulation.recording import film_clip
+    from torchvision_dddas.simulation import film_clip
 
     if not quiet:
         typer.echo(f"filming the scenario demo into {out / 'clip'}", err=True)

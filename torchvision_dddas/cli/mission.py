@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.control.mission_api import Mission
     from torchvision_dddas.evaluation.metrics.crowds import CrowdScore
     from torchvision_dddas.io.output.run_record import Record
-    from torchvision_dddas.simulation.source import SimulatorSource
+    from torchvision_dddas.simulation import SimulatorSource
 
 SIMULATED = "sim:"
 """What names of scenarios begin with."""
@@ -43,11 +43,11 @@ def fly(
     """
     from torchvision_dddas.cli.run import summary
     from torchvision_dddas.io.output import saved
-    from torchvision_dddas.simulation.closed_loop_output import SAVED
+    from torchvision_dddas.simulation import SAVED_WITH_TRUTH
 
     if useless := [name for name, given in files.items() if given is not None]:
         raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
-    names = saved(save, SAVED)
+    names = saved(save, SAVED_WITH_TRUTH)
     journal, score = fly_into(folder, scenario, config, overrides, scene, seed, backend, names, quiet)
     if not quiet:
         first, *others = summary(journal, folder, True, names)
@@ -69,18 +69,17 @@ def fly_into(
     quiet: bool = False,
 ) -> "tuple[Record, CrowdScore]":
     """As `fly`, but returns the record of the run and its score, and says nothing at its end."""
-    from torchvision_dddas.simulation.closed_loop_output import FlownOutput
+    from torchvision_dddas.simulation import SimulatedRunOutput
 
-    with FlownOutput(folder, save) as output:
+    with SimulatedRunOutput(folder, save) as output:
         from torchvision_dddas import geometry
         from torchvision_dddas.config import load_config
         from torchvision_dddas.control.mission_api import Begun, mission_of
         from torchvision_dddas.detection.engine import load_engine
         from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
         from torchvision_dddas.pipeline import survey
-        from torchvision_dddas.simulation.scenario import load as load_scenario
-        from torchvision_dddas.simulation.scenario import settings_of
-        from torchvision_dddas.simulation.source import SimulatorSource, named
+        from torchvision_dddas.simulation import SimulatorSource, name_scenario_in_errors, scenario_settings
+        from torchvision_dddas.simulation import load_scenario as load_scenario
 
         chosen = load_scenario(scenario, scene, seed)
         if chosen.clip.located_by == "nothing":
@@ -88,10 +87,10 @@ def fly_into(
                 f"scenario {scenario} is located by nothing, and where nothing is located nothing can be steered; add "
                 "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
             )
-        own = settings_of(chosen)
+        own = scenario_settings(chosen)
         own.setdefault("landmarks.common_sigma_m", chosen.gps.common_m)
         settings = load_config(config or CONFIG, overrides, own)
-        with named(scenario):
+        with name_scenario_in_errors(scenario):
             simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = Begun(simulated)
         mission = mission_of(source, settings, backend, chosen.clip.located_by == "landmarks")

@@ -14,9 +14,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.io.output.run_record import Record
-    from torchvision_dddas.simulation.recording import Filmed, Heard
-    from torchvision_dddas.simulation.scenario import Scenario
-    from torchvision_dddas.simulation.simulator import Shot, Simulator
+    from torchvision_dddas.simulation import RadioReport, RecordedFrame, Scenario, Shot, Simulator
 
 
 @explained
@@ -46,17 +44,16 @@ def simulate(
     ground/ as `dddas people` and `dddas locate ground` do, truth/ as `dddas evaluate` does, scenario.toml and run.json.
     """
     from torchvision_dddas.io.output import saved
-    from torchvision_dddas.simulation.recording import SAVED
-    from torchvision_dddas.simulation.scenario import load, names
+    from torchvision_dddas.simulation import RECORDED, load_scenario, scenario_names
 
     if scenario is None:
-        for name in names():
-            typer.echo(f"{name:12s} {load(name).about}")
+        for name in scenario_names():
+            typer.echo(f"{name:12s} {load_scenario(name).about}")
         return
     if frames is not None and frames < 1:
         raise InputError(f"--frames is {frames}; wanted 1 or more")
-    chosen = load(scenario, set_ or [], seed)
-    kinds = saved(save, SAVED)
+    chosen = load_scenario(scenario, set_ or [], seed)
+    kinds = saved(save, RECORDED)
     journal = simulate_into(out, chosen, kinds, frames, quiet, scenario)
     if not quiet:
         for line in summary(journal, out, chosen):
@@ -76,13 +73,11 @@ def simulate_into(
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas import geometry
-    from torchvision_dddas.simulation.recording import FilmedOutput
-    from torchvision_dddas.simulation.scenario import as_toml
-    from torchvision_dddas.simulation.source import named, simulator_of
+    from torchvision_dddas.simulation import RecordingOutput, name_scenario_in_errors, open_simulator, scenario_toml
 
-    with FilmedOutput(folder, save) as output:
-        with named(name):
-            simulator = simulator_of(scenario)
+    with RecordingOutput(folder, save) as output:
+        with name_scenario_in_errors(name):
+            simulator = open_simulator(scenario)
         count = min(simulator.frames, frames or simulator.frames)
         facts = {
             "scenario": scenario.model_dump(mode="json"),
@@ -94,7 +89,7 @@ def simulate_into(
             scenario.clip.rate_hz,
             simulator.camera,
             simulator.colours,
-            as_toml(scenario),
+            scenario_toml(scenario),
             lambda metres: geometry.lonlat(metres, origin),
         )
         with progress(Path(name).stem, count, quiet) as tick:
@@ -110,14 +105,13 @@ def simulate_into(
     return journal
 
 
-def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
+def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[RecordedFrame]":
     """The frames of a run that nobody steers. ground: whether ground vehicles take pictures, all at once."""
     from torchvision_dddas.config import Settings, with_parameters
-    from torchvision_dddas.simulation.recording import Filmed
-    from torchvision_dddas.simulation.scenario import settings_of
+    from torchvision_dddas.simulation import RecordedFrame, scenario_settings
 
     scenario = simulator.scenario
-    apart_s = with_parameters(Settings(), settings_of(scenario)).steering.picture_s
+    apart_s = with_parameters(Settings(), scenario_settings(scenario)).steering.picture_s
     apart = max(1, round(apart_s * scenario.clip.rate_hz))
     while True:
         begun = time.perf_counter()
@@ -128,7 +122,7 @@ def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
         looks = ground and (shot.truth.frame - 1) % apart == 0
         seen = [simulator.picture(name) for name in simulator.names] if looks else []
         seconds = {"air": drawn - begun} | ({"ground": time.perf_counter() - drawn} if looks else {})
-        yield Filmed(
+        yield RecordedFrame(
             shot.truth,
             None if shot.frame is None else shot.frame.image,
             tuple((moment.time_s, moment.flight) for moment in shot.said if moment.flight is not None),
@@ -138,13 +132,13 @@ def _filmed(simulator: "Simulator", ground: bool) -> "Iterator[Filmed]":
         )
 
 
-def _heard(shot: "Shot", names: tuple[str, ...]) -> "Iterator[Heard]":
-    from torchvision_dddas.simulation.recording import Heard
+def _heard(shot: "Shot", names: tuple[str, ...]) -> "Iterator[RadioReport]":
+    from torchvision_dddas.simulation import RadioReport
 
     for moment in shot.said:
         for report in moment.reports:
             name = names[report.vehicle]
-            yield Heard(name, report.frame, report.lonlat_deg, report.sigma_m, report.planned)
+            yield RadioReport(name, report.frame, report.lonlat_deg, report.sigma_m, report.planned)
 
 
 def write_dem(path: Path, simulator: "Simulator") -> list[str]:

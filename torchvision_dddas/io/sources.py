@@ -26,7 +26,7 @@ def open_source(
     if full_scale is not None and not 1 <= full_scale <= 65535:
         raise InputError(f"a full scale of {full_scale} will not do; wanted 1 to 65535")
     if text.startswith("sim:"):
-        from torchvision_dddas.simulation.source import open_scenario
+        from torchvision_dddas.simulation import open_scenario
 
         if rate_hz is not None:
             raise InputError(f"{text} says how many frames a second it has (clip.rate_hz): leave --rate out")

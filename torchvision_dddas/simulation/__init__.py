@@ -1,1 +1,70 @@
-"""Worlds whose truth is known: what the demo shows and what the tests measure against."""
+"""A simulated team above and on a piece of desert, with known truth: scenarios, the simulator, its recordings."""
+
+from torchvision_dddas.simulation.recording import (
+    RECORDED,
+    RadioReport,
+    RecordedFrame,
+    RecordingOutput,
+    film,
+    film_clip,
+)
+from torchvision_dddas.simulation.scenario import (
+    AircraftParameters,
+    CameraParameters,
+    CarPlan,
+    ClipParameters,
+    CrowdPlan,
+    Fault,
+    GpsParameters,
+    Happening,
+    Scenario,
+    TeamParameters,
+    WorldParameters,
+)
+from torchvision_dddas.simulation.scenario_file import (
+    check_scenario,
+    load_scenario,
+    scenario_names,
+    scenario_settings,
+    scenario_toml,
+)
+from torchvision_dddas.simulation.simulator import Shot, Simulator
+from torchvision_dddas.simulation.source import SimulatorSource, name_scenario_in_errors, open_scenario, open_simulator
+from torchvision_dddas.simulation.truth import SAVED_WITH_TRUTH, SimulatedRunOutput, TruthOutput
+from torchvision_dddas.simulation.world import World, build_world
+
+__all__ = [
+    "RECORDED",
+    "SAVED_WITH_TRUTH",
+    "AircraftParameters",
+    "CameraParameters",
+    "CarPlan",
+    "ClipParameters",
+    "CrowdPlan",
+    "Fault",
+    "GpsParameters",
+    "Happening",
+    "RadioReport",
+    "RecordedFrame",
+    "RecordingOutput",
+    "Scenario",
+    "Shot",
+    "SimulatedRunOutput",
+    "Simulator",
+    "SimulatorSource",
+    "TeamParameters",
+    "TruthOutput",
+    "World",
+    "WorldParameters",
+    "build_world",
+    "check_scenario",
+    "film",
+    "film_clip",
+    "load_scenario",
+    "name_scenario_in_errors",
+    "open_scenario",
+    "open_simulator",
+    "scenario_names",
+    "scenario_settings",
+    "scenario_toml",
+]

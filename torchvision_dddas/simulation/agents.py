@@ -1,25 +1,64 @@
-"""All that moves in a simulated world, step by step, and what the vehicles say of it.
+"""One moment of a simulated world: where everything is, and what the vehicles say of it."""
 
-Plain arrays, not objects of an agent framework: the same thousand people, with the same rules, take 55 ms a step as
-agents in Mesa 3.3's continuous space and 1.2 ms here (a ratio of 45; the least of 30 and of 200 steps on one core), and
-nothing of such a framework (schedulers, collectors, a browser's view) is of use in a loop with a camera.
-"""
-
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.simulation.aircraft import Aircraft, Telemetry, rotation
-from torchvision_dddas.simulation.cars import CAR_HALF_M, Cars
 from torchvision_dddas.simulation.crowds import Crowds
-from torchvision_dddas.simulation.faults import Faults, Wrong
-from torchvision_dddas.simulation.moment import Moment, Report
-from torchvision_dddas.simulation.obstacles import Obstacles, Things
-from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.ground_vehicles import CAR_HALF_M, UGV_HALF_M, Cars, Team, marker_plates
+from torchvision_dddas.simulation.movement import Obstacles, Things
 from torchvision_dddas.simulation.scenario import Scenario
-from torchvision_dddas.simulation.team import UGV_HALF_M, Team, plates
+from torchvision_dddas.simulation.sensor_errors import ActiveFaults, Faults, Receivers
+from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, rotation_matrix
 from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a ground vehicle says by radio. vehicle: its row in the team, from 0. frame: may be broken.
+
+    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was; plans are told
+    anew each second, and of two waypoints for one frame the one that was told last counts. sigma_m: along each axis, of
+    what the receivers do not share.
+    """
+
+    vehicle: int
+    frame: float
+    lonlat_deg: np.ndarray
+    sigma_m: float
+    planned: bool = False
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The world at a frame of the aerial camera.
+
+    pose: of the camera in the middle of the exposure of the picture's middle row, true; velocity_m_s, turn_rad_s: (3,)
+    its rates about east, north, up. flight: what the UAV reports of itself, longitude and latitude; None while silent.
+    reports: of the ground vehicles since the frame before. The ground vehicles' own cameras: heading_rad (K,) whither
+    they truly look; said_lonlat_deg (K, 2), NaN where silent, and said_heading_rad (K,) what they say of it. Their
+    places are those of the bodies of kind ugv, in the same order. picture: "", frozen or dropped. events: in words.
+    """
+
+    number: int
+    time_s: float
+    bodies: Bodies
+    pose: CameraPose
+    velocity_m_s: np.ndarray
+    turn_rad_s: np.ndarray
+    flight: Flight | None
+    reports: tuple[Report, ...]
+    heading_rad: np.ndarray
+    said_lonlat_deg: np.ndarray
+    said_heading_rad: np.ndarray
+    picture: str = ""
+    events: tuple[str, ...] = ()
+
+
+# All that moves in a simulated world, step by step, and what the vehicles say of it.
+
 
 _TICK_S = 0.1
 _PLANNED_S = 5
@@ -55,9 +94,9 @@ class Agents:
         self._crowds = Crowds(scenario.crowd, scenario.happening, world.side_m, obstacles, seed, many + cars + ugvs + 1)
         self._cars = Cars(scenario.car, world.side_m, obstacles, seed)
         self._team = Team(scenario.team, scenario.uav, world.side_m, obstacles, seed)
-        self._plates = plates(ugvs)[1]
+        self._plates = marker_plates(ugvs)[1]
         self._aircraft = Aircraft(scenario.uav, world.side_m / 2, world.up_m, seed)
-        self._telemetry = Telemetry(scenario.uav, seed)
+        self._telemetry = ReportedPose(scenario.uav, seed)
         self._telemetry_errors = self._telemetry.errors(0.0)
         gps = scenario.gps
         rng = np.random.default_rng([seed, 40])
@@ -171,7 +210,7 @@ class Agents:
                     self._reports.append(Report(k, round(time * self._rate + 1, 6), said[k], self._gps.sigma_m))
             self._reported += 1
 
-    def _jumped(self, wrong: Wrong) -> np.ndarray:
+    def _jumped(self, wrong: ActiveFaults) -> np.ndarray:
         """(K, 2) by how much the receivers are off."""
         off = np.zeros((len(self._team), 2))
         for k, size in wrong.jumped.items():
@@ -226,7 +265,7 @@ class Agents:
         wrong, place = self._telemetry_errors, pose.place_m
         ground = float(self._world.up_m(place[None, :2])[0])
         high = (place[2] - ground) * (1 + wrong[3])
-        said = CameraPose(place, rotation(wrong[:3]) @ pose.axes)
+        said = CameraPose(place, rotation_matrix(wrong[:3]) @ pose.axes)
         heading, pitch, roll = said.angles_rad
         longitude, latitude = lonlat_deg.tolist()
         hfov = float(np.radians(self._scenario.camera.hfov_deg))
@@ -241,7 +280,7 @@ class Agents:
             hfov,
         )
 
-    def _bodies(self, wrong: Wrong) -> Bodies:
+    def _bodies(self, wrong: ActiveFaults) -> Bodies:
         crowds, cars, team = self._crowds, self._cars, self._team
         people, machines, ugvs = len(crowds), len(cars), len(team)
         total = people + machines + ugvs

@@ -15,7 +15,7 @@ _TRIES = 20
 
 
 @dataclass(frozen=True)
-class Things:
+class StandingObjects:
     """What stands in the world. kind: (K,) bush, tree or building. east_north_m: (K, 2) middles.
 
     radius_m: (K,) of the circle about all of it. height_m: (K,). colour: (K, 3) BGR. Buildings are boxes: half_m (K, 2)
@@ -34,14 +34,14 @@ class Things:
         return len(self.kind)
 
 
-def scatter(
+def scatter_objects(
     counts: tuple[int, int, int],
     side_m: float,
     wished: np.ndarray,
     built: np.ndarray,
     clear: tuple[np.ndarray, float],
     rng: np.random.Generator,
-) -> Things:
+) -> StandingObjects:
     """So many bushes, trees and buildings on free places.
 
     wished, built: (h, w) pictures of the world, row 0 the north edge: how well plants and buildings stand there, from
@@ -77,13 +77,13 @@ def scatter(
     chosen = places[np.arange(total), np.argmax(good, axis=1)]
     colour = np.array([_TINTS[name][rng.integers(len(_TINTS[name]))] for name in kind]).reshape(-1, 3)
     colour = np.clip(colour * rng.uniform(0.85, 1.15, (total, 1)), 0, 255)
-    return Things(*(field[stands] for field in (kind, chosen, radius, height, colour, half, heading)))
+    return StandingObjects(*(field[stands] for field in (kind, chosen, radius, height, colour, half, heading)))
 
 
 class Crowns:
     """Shapes of things as seen from above, on any grid."""
 
-    def __init__(self, things: Things, side_m: float, seed: int) -> None:
+    def __init__(self, things: StandingObjects, side_m: float, seed: int) -> None:
         self.things, self.side_m, self.seed = things, side_m, seed
         rng = np.random.default_rng([seed, 21])
         self._moulds = [_mould(rng) for _ in range(16)]

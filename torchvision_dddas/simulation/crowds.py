@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from torchvision_dddas.simulation.neighbours import pairs
-from torchvision_dddas.simulation.obstacles import Obstacles
+from torchvision_dddas.simulation.movement import Obstacles, near_pairs
 from torchvision_dddas.simulation.scenario import CrowdPlan, Happening
 
 UNIT_S = 2.0
@@ -137,7 +136,7 @@ class Crowds:
     def _free(self, place: np.ndarray) -> np.ndarray:
         """Places outside of all that stands, and no two in one place."""
         for _ in range(30):
-            place = self._obstacles.outside(_apart(place, pairs(place, BODY_M), 0.55))
+            place = self._obstacles.outside(_apart(place, near_pairs(place, BODY_M), 0.55))
         return place
 
     def step(self, time_s: float, seconds: float, vehicles: np.ndarray) -> list[str]:
@@ -160,7 +159,7 @@ class Crowds:
         kept = np.exp(-seconds / _STRAY_S)
         self._stray = kept * self._stray + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._stray.shape)
         wanted = wanted + np.where(started, *_STRAY_M_S)[mine, None] * self._stray
-        near = pairs(self.place, _PERSONAL_M)
+        near = near_pairs(self.place, _PERSONAL_M)
         wanted = self._obstacles.steer(self.place, wanted, 0.5)
         wanted = wanted + self._give_way(near) + self._past(vehicles)
         velocity = wanted + (self.velocity - wanted) * np.exp(-seconds / 0.35)

@@ -16,12 +16,13 @@ from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.overlay import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.simulation.scenario import Scenario, load
-from torchvision_dddas.simulation.source import simulator_of
-from torchvision_dddas.simulation.truth_output import LonLat, TruthOutput, moving_only
+from torchvision_dddas.simulation.scenario import Scenario
+from torchvision_dddas.simulation.scenario_file import load_scenario
+from torchvision_dddas.simulation.source import open_simulator
+from torchvision_dddas.simulation.truth import LonLat, TruthOutput, moving_mask
 from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
 
-SAVED = ("frames", "video", "masks", "ground")
+RECORDED = ("frames", "video", "masks", "ground")
 """What --save may name. The tables are always written."""
 
 PLAIN = ("frames", "masks", "ground")
@@ -37,7 +38,7 @@ QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Heard:
+class RadioReport:
     """A report of a ground vehicle: its name, frame (may be broken), longitude and latitude, standard deviation."""
 
     vehicle: str
@@ -48,7 +49,7 @@ class Heard:
 
 
 @dataclass(frozen=True)
-class Filmed:
+class RecordedFrame:
     """All that a frame of a simulated run gives. image: None where the camera dropped it.
 
     flights: what the UAV said since the frame before, and when. heard: what the ground vehicles did.
@@ -58,12 +59,12 @@ class Filmed:
     truth: Truth
     image: np.ndarray | None
     flights: tuple[tuple[float, Flight], ...] = ()
-    heard: tuple[Heard, ...] = ()
+    heard: tuple[RadioReport, ...] = ()
     ground: tuple[GroundPicture, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class FilmedOutput(RunFolder[Filmed]):
+class RecordingOutput(RunFolder[RecordedFrame]):
     """Everything that `dddas simulate` writes. Raises InputError as RunFolder does."""
 
     files: ClassVar[tuple[str, ...]] = (
@@ -111,7 +112,7 @@ class _Kept:
         self._events: list[dict[str, Any]] = []
         record.counts = {"events": self._events, "dropped": 0}
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         truth = item.truth
         self._events += [{"frame": truth.frame, "time_s": truth.time_s, "what": what} for what in truth.events]
         self._record.counts["dropped"] += item.image is None
@@ -132,7 +133,7 @@ class _Texts:
         self._folder, self._texts = folder, texts
         self._begun = False
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         if not self._begun:
             for name, text in self._texts.items():
                 write_whole(self._folder / name, text.encode())
@@ -153,7 +154,7 @@ class _Reports:
         self._files = TextFiles({folder / name: ",".join(columns) + "\n" for name, columns in content.items()})
         self._plans: dict[tuple[str, float], str] = {}
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         said = [_flight_line(time_s, flight) for time_s, flight in item.flights]
         self._plans |= {(h.vehicle, round(h.frame, 6)): _report_line(h) for h in item.heard if h.planned}
         heard = [_report_line(h) for h in item.heard if not h.planned]
@@ -170,11 +171,11 @@ class _Reports:
 class _Truth:
     """truth/, of the frames that are there or were dropped."""
 
-    def __init__(self, output: FilmedOutput, lonlat: LonLat) -> None:
+    def __init__(self, output: RecordingOutput, lonlat: LonLat) -> None:
         self._sink = TruthOutput(output.folder, lonlat, output.masks)
         self.close, self.discard = self._sink.close, self._sink.discard
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         self._sink.write(item.truth)
 
 
@@ -185,10 +186,10 @@ class _Frames:
         self._folder = folder
         self._last = 0
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._last = item.truth.frame
-        write_whole(self._folder / f"{self._last:06d}.jpg", b"" if item.image is None else jpeg(item.image))
+        write_whole(self._folder / f"{self._last:06d}.jpg", b"" if item.image is None else encode_jpeg(item.image))
 
     def close(self, complete: bool) -> None:
         clear_after(self._folder, self._last)
@@ -218,7 +219,7 @@ class _Ground:
         self._count = dict.fromkeys(names, 0)
         self._poses: dict[str, TextFiles] = {}
 
-    def write(self, item: Filmed) -> None:
+    def write(self, item: RecordedFrame) -> None:
         for picture in item.ground:
             name, camera = picture.vehicle, picture.camera
             folder = self._folders[name]
@@ -227,7 +228,7 @@ class _Ground:
                 write_whole(folder / "camera.toml", camera_toml(camera, standing=True).encode())
                 self._poses[name] = TextFiles({folder / "poses.csv": ",".join(POSES) + "\n"})
             number = self._count[name] = self._count[name] + 1
-            write_whole(folder / f"{number:06d}.jpg", jpeg(picture.image))
+            write_whole(folder / f"{number:06d}.jpg", encode_jpeg(picture.image))
             angles = f"{math.degrees(camera.heading_rad) % 360:.4f},{math.degrees(camera.pitch_rad):.4f}"
             place = f"{camera.place[0]:.9f},{camera.place[1]:.9f}"
             self._poses[name].write(f"{number},{place},{angles},{picture.frame}\n")
@@ -258,11 +259,11 @@ def film(
     if size_px is not None:
         width, height = size_px
         changed["camera"] = scenario.camera.model_copy(update={"width_px": width, "height_px": height})
-    simulator = simulator_of(scenario.model_copy(update=changed))
+    simulator = open_simulator(scenario.model_copy(update=changed))
     for _ in range(simulator.frames if frames is None else min(frames, simulator.frames)):
         shot = simulator.next()
         if shot is not None and shot.frame is not None:
-            yield shot.frame.image, moving_only(shot.truth)
+            yield shot.frame.image, moving_mask(shot.truth)
 
 
 def film_clip(
@@ -279,16 +280,16 @@ def film_clip(
     try:
         for part in ("frames", "masks"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-        for number, (image, mask) in enumerate(film(load(scenario), seed, frames, size_px), 1):
+        for number, (image, mask) in enumerate(film(load_scenario(scenario), seed, frames, size_px), 1):
             png = cv2.imencode(".png", mask.astype(np.uint8))[1]
-            write_whole(folder / "frames" / f"{number:06d}.jpg", jpeg(image))
+            write_whole(folder / "frames" / f"{number:06d}.jpg", encode_jpeg(image))
             write_whole(folder / "masks" / f"{number:06d}.png", png.tobytes())
     except OSError as error:
         raise cannot_write(Path(error.filename or folder), error) from error
     return folder
 
 
-def jpeg(image: np.ndarray) -> bytes:
+def encode_jpeg(image: np.ndarray) -> bytes:
     """A picture as a JPEG that adds next to nothing to it. Raises OSError where it cannot be encoded."""
     ok, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
@@ -330,7 +331,7 @@ def camera_toml(camera: Camera, standing: bool = False) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _report_line(heard: Heard) -> str:
+def _report_line(heard: RadioReport) -> str:
     """A line of landmarks.csv."""
     lon, lat = heard.lonlat_deg
     return f"{_short(heard.frame, 6)},{heard.vehicle},{lon:.9f},{lat:.9f},{heard.sigma_m:.6g},{heard.planned:d}\n"

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.moment import Moment
+from torchvision_dddas.simulation.agents import Moment
 from torchvision_dddas.types import Camera
 
 _LOWEST = 0.004  # rays sink at least so much for each metre along the axis: those above the horizon never land
@@ -46,14 +47,14 @@ class Shutter:
         steady_px = image_px - self.aside_px(moment.number, image_px[:, 1])
         flat = (steady_px - np.array(camera.centre_px)) / focal
         lag = self.lag_s(image_px[:, 1])[:, None]
-        way = turned(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
+        way = rotate_vectors(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
         return pose.place_m + lag * moment.velocity_m_s, way
 
     def ways(self, moment: Moment, places_m: np.ndarray, exposure_s: float) -> np.ndarray:
         """Pixels (N, 2) that points (N, 3) which stand still move in the picture during an exposure."""
         ends = []
         for lag in (-exposure_s / 2, exposure_s / 2):
-            axes = turned(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
+            axes = rotate_vectors(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
             pose = replace(moment.pose, place_m=moment.pose.place_m + lag * moment.velocity_m_s, axes=axes)
             ends.append(self.project(replace(moment, pose=pose), places_m)[0])
         return ends[1] - ends[0]
@@ -65,7 +66,7 @@ class Shutter:
         camera, pose = self.camera, moment.pose
         focal, centre = np.array(camera.focal_px) * pose.focal, np.array(camera.centre_px)
         # Where it is for the camera at a lag is a polynomial of the lag: its terms are found once.
-        once = across(-moment.turn_rad_s)
+        once = cross_matrix(-moment.turn_rad_s)
         away, slide = points_m - pose.place_m, np.asarray(velocity_m_s - moment.velocity_m_s)
         terms = [away @ pose.axes]
         if self.readout_s > 0:
@@ -91,22 +92,22 @@ def _phases(seed: int, number: int) -> np.ndarray:
     return np.random.default_rng([seed, 79, number]).uniform(0, 2 * np.pi, 2)
 
 
-def turned(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
+def rotate_vectors(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
     """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
     if not np.any(lag_s) or not np.any(turn_rad_s):
         return vectors
-    matrix = across(turn_rad_s)
+    matrix = cross_matrix(turn_rad_s)
     once = lag_s * (vectors @ matrix)
     return vectors + once + lag_s / 2 * (once @ matrix)
 
 
-def across(turn_rad_s: np.ndarray) -> np.ndarray:
+def cross_matrix(turn_rad_s: np.ndarray) -> np.ndarray:
     """(3, 3) by which row vectors are multiplied for their cross product with a turn."""
     x, y, z = turn_rad_s
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]).T
 
 
-def landing(
+def meet_ground(
     start_m: np.ndarray, way: np.ndarray, up_m: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far along their way (N,) rays (N, 3) meet the ground, and the height (N,) there; up_m: of places (N, 2).
@@ -131,3 +132,51 @@ def landing(
         before = far, over
         far = np.clip(far + step, 0.0, _FURTHEST_M)
     return far, up
+
+
+# What moves while the shutter is open is drawn out along its way.
+
+
+LEAST_PX = 0.7  # shorter ways are lost in the lens's own blur
+_MOST = 40  # pictures that are averaged for one that is blurred
+
+
+def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
+    """A picture (H, W, C) uint8 whose parts moved so far while it was exposed.
+
+    way_px: (r, c, 2) float32 from the beginning to the end, at points that span the picture from corner to corner.
+    """
+    longest = float(np.linalg.norm(way_px, axis=-1).max())
+    if longest < LEAST_PX:
+        return picture
+    if np.ptp(way_px.reshape(-1, 2), axis=0).max() < LEAST_PX:
+        return np.asarray(
+            cv2.filter2D(picture, -1, streak_kernel(way_px.mean(axis=(0, 1))), borderType=cv2.BORDER_REPLICATE)
+        )
+    height, width = picture.shape[:2]
+    rows, columns = way_px.shape[:2]
+    # The points are at the corners: pixel 0 is at the first of them and the last pixel at the last.
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    across, down = u * np.float32((columns - 1) / (width - 1)), v * np.float32((rows - 1) / (height - 1))
+    way = [cv2.remap(np.ascontiguousarray(way_px[..., k], np.float32), across, down, cv2.INTER_LINEAR) for k in (0, 1)]
+    count = min(int(np.ceil(longest)) + 1, _MOST)
+    total = np.zeros(picture.shape, np.float32)
+    for share in ((np.arange(count, dtype=np.float32) + 0.5) / count - 0.5).astype(np.float32):
+        moved = cv2.remap(picture, u + share * way[0], v + share * way[1], cv2.INTER_LINEAR,
+                          borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+        cv2.accumulate(moved, total)
+    return np.round(total / count).astype(np.uint8)
+
+
+def streak_kernel(way_px: np.ndarray) -> np.ndarray:
+    """(K, K) float32 kernel of a way (2,) across the picture, its middle in the middle; the sum is 1."""
+    reach = int(np.ceil(np.abs(way_px).max() / 2)) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    count = 4 * reach + 1
+    for u, v in (((np.arange(count) + 0.5) / count - 0.5)[:, None] * way_px + reach).tolist():
+        x, y = int(u), int(v)
+        for column, wide in ((x, 1 - (u - x)), (x + 1, u - x)):
+            for row, high in ((y, 1 - (v - y)), (y + 1, v - y)):
+                if wide * high > 0:
+                    kernel[row, column] += wide * high
+    return kernel / kernel.sum()

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.noise import band, bumps, enlarged, fractal, sparks
-
 COARSE = 8
 """Pixels of the texture to a cell of the broad patterns."""
 
@@ -32,7 +30,7 @@ _TUFTS = ((2.5, 0.12, 0.9), (0.35, 0.28, 1.0))
 
 
 @dataclass(frozen=True)
-class Lie:
+class GroundPatterns:
     """Broad patterns of the ground, each (h, w) float32 on the coarse grid of cell_m, row 0 the north edge.
 
     tone: (3, h, w) BGR of the soil. grass: how much of it grows, 0 to 1; green: how much of that is green, not dry.
@@ -53,7 +51,7 @@ class Lie:
     trail_m: np.ndarray
 
 
-def lie(side_m: float, light: np.ndarray, seed: int) -> Lie:
+def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> GroundPatterns:
     """Where soils, creeks, road and trails of a world lie. light: (h, h) on the coarse grid, as in Lie."""
     cells = len(light)
     rng = np.random.default_rng([seed, 11])
@@ -62,7 +60,7 @@ def lie(side_m: float, light: np.ndarray, seed: int) -> Lie:
     east, north = np.meshgrid(middle.astype(np.float32), -middle.astype(np.float32))
 
     def patches(widest_m: float, fall: float = 0.6) -> np.ndarray:
-        return fractal(rng, shape, max(widest_m / cell, 1), 1, fall)
+        return fractal_noise(rng, shape, max(widest_m / cell, 1), 1, fall)
 
     tone = np.empty((3, *shape), np.float32)
     tone[:] = _TAN[:, None, None]
@@ -85,7 +83,7 @@ def lie(side_m: float, light: np.ndarray, seed: int) -> Lie:
     wash, half = np.full(shape, 1e3, np.float32), np.ones(shape, np.float32)
     for size in (1.0, 0.5, 0.35, 0.3)[: max(1, min(4, round(side_m / 100)))]:
         distance = np.abs(course(9 * size**0.5, 110 * size**0.5) + ripple)
-        width = size * np.clip(2.6 + 0.8 * bumps(rng, shape, max(30 / cell, 1)), 1, 4.5)
+        width = size * np.clip(2.6 + 0.8 * noise_bumps(rng, shape, max(30 / cell, 1)), 1, 4.5)
         nearer = distance / width < wash / half
         wash, half = np.where(nearer, distance, wash), np.where(nearer, width, half)
     road = course(14, 260)
@@ -97,10 +95,12 @@ def lie(side_m: float, light: np.ndarray, seed: int) -> Lie:
     green = np.clip(0.45 + 0.35 * patches(20, 0.7) + 0.4 * np.exp(-np.clip(wash - half, 0, None) / 3), 0, 1)
     gravel = np.clip(1 + 0.35 * patches(18, 0.7), 0.3, 2)
     fields = [np.asarray(field, np.float32) for field in (grass, green, gravel, light, wash, half, road, trail)]
-    return Lie(cell, tone, *fields)
+    return GroundPatterns(cell, tone, *fields)
 
 
-def soil(ground: Lie, rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray) -> np.ndarray:
+def soil_rows(
+    ground: GroundPatterns, rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray
+) -> np.ndarray:
     """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, in the sun."""
     columns = ground.grass.shape[1] * COARSE
     # What the sun's light strikes beside a pixel matters to it: so many more rows, which are cut off at the end.
@@ -109,19 +109,19 @@ def soil(ground: Lie, rows: tuple[int, int], texel_m: float, seed: int, to_sun: 
 
     def fine(key: int, width_m: float) -> np.ndarray:
         """Noise with bumps of a width; those within a pixel even out."""
-        noise = band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
+        noise = noise_band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
         return noise if width_m >= texel_m else noise * np.float32(width_m / texel_m)
 
     def strewn(key: int, each_m2: float, radius_m: float) -> np.ndarray:
         spread = max(0.6 * radius_m / texel_m, 0.4)
         reach = int(3 * spread) + 2
-        drawn = sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
+        drawn = noise_sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
         full = min(7 * spread**2, (radius_m / texel_m) ** 2 * 6)  # what is smaller than a pixel fills it in part
         return np.minimum(cv2.GaussianBlur(drawn, (0, 0), spread)[reach:-reach] * np.float32(full), 1)
 
     # Where the nearest trail changes, its side may too: no trail is there.
-    trail = np.abs(enlarged(ground.trail_m, wide, COARSE, smooth=True))
-    trail = np.maximum(trail, enlarged(np.abs(ground.trail_m), wide, COARSE) - 0.5 * ground.cell_m)
+    trail = np.abs(enlarge_rows(ground.trail_m, wide, COARSE, smooth=True))
+    trail = np.maximum(trail, enlarge_rows(np.abs(ground.trail_m), wide, COARSE) - 0.5 * ground.cell_m)
     grain = fine(3, 0.1)
     # A camera near the ground sees what is finer, too.
     for key, width_m in ((5, 0.05), (6, 0.025)):
@@ -136,14 +136,14 @@ def soil(ground: Lie, rows: tuple[int, int], texel_m: float, seed: int, to_sun: 
         "stones": sum(bright * strewn(k, each_m2, radius_m) for k, (each_m2, radius_m, bright) in enumerate(_STONES)),
         "tufts": sum(dense * strewn(10 + k, each_m2, radius) for k, (each_m2, radius, dense) in enumerate(_TUFTS)),
         "trail": trail,
-        "road": np.abs(enlarged(ground.road_m, wide, COARSE, smooth=True)),
-        "wash": enlarged(ground.wash_m, wide, COARSE, smooth=True),
+        "road": np.abs(enlarge_rows(ground.road_m, wide, COARSE, smooth=True)),
+        "wash": enlarge_rows(ground.wash_m, wide, COARSE, smooth=True),
         **{
-            name: enlarged(getattr(ground, name), wide, COARSE)
+            name: enlarge_rows(getattr(ground, name), wide, COARSE)
             for name in ("wash_half_m", "grass", "green", "gravel", "light")
         },
     }
-    tone = [enlarged(plane, wide, COARSE) for plane in ground.tone]
+    tone = [enlarge_rows(plane, wide, COARSE) for plane in ground.tone]
     image = np.empty((3, rows[1] - rows[0], columns), np.float32)
     # Tiles that fit the processor's cache, most of which hold no creek, road or trail: thrice as fast as whole rows.
     for left in range(0, columns, _TILE):
@@ -212,3 +212,81 @@ def _coloured(
         plane = plane + clumps * (_STRAW[k] + green * (_GREEN[k] - _STRAW[k]) - plane)
         planes.append((plane + stones) * light)
     return planes
+
+
+# Noise of which a landscape is made: smooth bumps of a width, and sums of them.
+
+
+_BLOCK = 64  # rows of noise that share a seed
+_FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
+_SPREAD = 1.35  # makes up for what interpolation between independent numbers takes from their spread, and more
+
+
+def noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
+    """(H, W) float32 of mean 0 and standard deviation about 1: smooth noise whose bumps are about width_px wide."""
+    if width_px <= 1:
+        return rng.standard_normal(shape, np.float32)
+    cells = [int(np.ceil(n / width_px)) + 3 for n in shape]
+    small = rng.standard_normal(cells, np.float32)
+    large = cv2.resize(small, None, fx=width_px, fy=width_px, interpolation=cv2.INTER_CUBIC)
+    # A cell is left out at the edges, where the enlargement repeats the outermost value.
+    first = int(width_px)
+    return large[first : first + shape[0], first : first + shape[1]] * np.float32(_SPREAD)
+
+
+def fractal_noise(
+    rng: np.random.Generator, shape: tuple[int, int], widest_px: float, narrowest_px: float, fall: float = 0.5
+) -> np.ndarray:
+    """(H, W) float32 of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
+    total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, widest_px
+    while width >= narrowest_px or power == 0:
+        total += np.float32(height) * noise_bumps(rng, shape, width)
+        power, height, width = power + height**2, height * fall, width / 2
+    return total / np.float32(np.sqrt(power))
+
+
+def noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
+    """Rows [first, last) of an endless (_, columns) noise with spread about 1 whose bumps are width_px wide."""
+    first, last = rows[0] // width_px - 2, -(-rows[1] // width_px) + 2
+    cells = -(-columns // width_px) + 4
+    small = _white(seed, first, last, cells)
+    if width_px == 1:
+        return small[2:-2, 2 : 2 + columns]
+    large = cv2.resize(small, None, fx=width_px, fy=width_px, interpolation=cv2.INTER_CUBIC) * np.float32(_SPREAD)
+    skip = rows[0] - first * width_px
+    return large[skip : skip + rows[1] - rows[0], 2 * width_px : 2 * width_px + columns]
+
+
+def noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
+    """Rows [first, last) of an endless picture that is 0 but for a share of its pixels, which are in (0.3, 1]."""
+    first = rows[0] // _BLOCK
+    drawn = np.zeros((((rows[1] - 1) // _BLOCK + 1 - first) * _BLOCK, columns), np.float32)
+    for block in range(first, first + len(drawn) // _BLOCK):
+        rng = np.random.default_rng([*seed, block + _FIRST])
+        at = rng.integers(0, _BLOCK * columns, rng.poisson(min(share, 1) * _BLOCK * columns))
+        drawn[(block - first) * _BLOCK :][:_BLOCK].reshape(-1)[at] = 1 - 0.7 * rng.random(len(at), np.float32)
+    skip = rows[0] - first * _BLOCK
+    return drawn[skip : skip + rows[1] - rows[0]]
+
+
+def enlarge_rows(coarse: np.ndarray, rows: tuple[int, int], factor: int, smooth: bool = False) -> np.ndarray:
+    """Rows [first, last) of a coarse field (h, w) enlarged `factor` times, the same however it is cut.
+
+    smooth: without creases, and three times as slow.
+    """
+    first, last = rows[0] // factor - 3, -(-rows[1] // factor) + 3
+    at = np.clip(np.arange(first, last), 0, len(coarse) - 1)
+    how = cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR
+    large = cv2.resize(coarse[at], None, fx=factor, fy=factor, interpolation=how)
+    skip = rows[0] - first * factor
+    return large[skip : skip + rows[1] - rows[0]]
+
+
+def _white(seed: tuple[int, ...], first: int, last: int, columns: int) -> np.ndarray:
+    """Rows [first, last) of an endless (_, columns) picture of independent numbers, even in +-1.73: spread 1."""
+    parts = []
+    for block in range(first // _BLOCK, (last - 1) // _BLOCK + 1):
+        part = np.random.default_rng([*seed, block + _FIRST]).integers(0, 256, (_BLOCK, columns), np.uint8)
+        parts.append(part[max(first - block * _BLOCK, 0) : last - block * _BLOCK])
+    # Bytes are drawn ten times as fast as normal numbers; their spread is 256 / sqrt(12).
+    return (np.concatenate(parts) - np.float32(127.5)) * np.float32(12**0.5 / 256)

@@ -10,10 +10,11 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.scenario import Scenario, load
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.scenario import Scenario
+from torchvision_dddas.simulation.scenario_file import load_scenario
 from torchvision_dddas.simulation.simulator import Simulator
-from torchvision_dddas.simulation.vehicles import UGV_HEIGHT_M
+from torchvision_dddas.simulation.vehicle_shapes import UGV_HEIGHT_M
 from torchvision_dddas.types import (
     Camera,
     Colours,
@@ -47,7 +48,7 @@ class SimulatorSource:
     def __init__(self, scenario: Scenario, name: str = "simulation") -> None:
         """Raises InputError where the scenario cannot be, or a raster that it names cannot be read."""
         self.scenario, self.name = scenario, name
-        self._simulator = simulator = simulator_of(scenario)
+        self._simulator = simulator = open_simulator(scenario)
         self.camera: Camera = simulator.camera
         self.colours: Colours = simulator.colours
         self.elevation: Elevation = simulator.world.relief
@@ -188,7 +189,7 @@ class Rows:
         return self._table[: self._count]
 
 
-def simulator_of(scenario: Scenario) -> Simulator:
+def open_simulator(scenario: Scenario) -> Simulator:
     """A run of a scenario, with the rasters of the ground that it names. Raises InputError."""
     world = scenario.world
     ends = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]) * world.side_m / 2
@@ -203,13 +204,13 @@ def simulator_of(scenario: Scenario) -> Simulator:
 
 def open_scenario(spec: str, overrides: Sequence[str] = (), seed: int | None = None) -> SimulatorSource:
     """A scenario by its name or file, as `simulation.scenario.load` takes it. Raises InputError with one line."""
-    scenario = load(spec, overrides, seed)
-    with named(spec):
+    scenario = load_scenario(spec, overrides, seed)
+    with name_scenario_in_errors(spec):
         return SimulatorSource(scenario, Path(spec).stem)
 
 
 @contextmanager
-def named(spec: str) -> Iterator[None]:
+def name_scenario_in_errors(spec: str) -> Iterator[None]:
     """Say before each InputError of which scenario it speaks."""
     try:
         yield

@@ -11,7 +11,7 @@ from tests.evaluation.datasets.layouts import clip, complaint, mask, pictures, r
 from tests.evaluation.studies.scored_clips import found_of
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.simulation.truth_output import COLUMNS
+from torchvision_dddas.simulation.truth import COLUMNS
 
 PLACES = (
     ",".join(COLUMNS) + "\n"

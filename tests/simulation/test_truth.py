@@ -8,7 +8,8 @@ import pytest
 
 from torchvision_dddas.evaluation.metrics import truth as read
 from torchvision_dddas.io.position_tables import read_positions
-from torchvision_dddas.simulation.truth_output import FEWEST_PX, TruthOutput, boxes_of, targets_of
+from torchvision_dddas.simulation import TruthOutput
+from torchvision_dddas.simulation.truth import FEWEST_PX, gather_targets, label_boxes
 from torchvision_dddas.types import Bodies, CameraPose, Truth
 
 
@@ -145,12 +146,12 @@ def test_a_world_without_anything_that_moves_has_empty_tables(tmp_path):
     folder = written(tmp_path, item)
     assert (folder / "gt.txt").read_text() == ""
     assert len((folder / "positions.csv").read_text().splitlines()) == 1
-    assert len(targets_of(nobody).target) == 0
+    assert len(gather_targets(nobody).target) == 0
 
 
 def test_boxes_hold_every_pixel_of_a_number():
     labels = np.random.default_rng(0).integers(0, 5, (30, 40)) * (np.random.default_rng(1).random((30, 40)) > 0.9)
-    found = boxes_of(labels)
+    found = label_boxes(labels)
     for number, (x, y, w, h, px) in found.items():
         v, u = np.nonzero(labels == number)
         assert (x, y, x + w - 1, y + h - 1, px) == (u.min(), v.min(), u.max(), v.max(), len(u))

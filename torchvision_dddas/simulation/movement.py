@@ -73,7 +73,7 @@ class Obstacles:
         near = self._near(place) if len(self.place) else np.zeros((len(place), 0), np.int64)
         if not (near >= 0).any():
             return velocity
-        return round_discs(place, velocity, self._places[near], self._radii[near] + clear_m)
+        return steer_round_discs(place, velocity, self._places[near], self._radii[near] + clear_m)
 
     def outside(self, place: np.ndarray, clear_m: float = 0.3) -> np.ndarray:
         """(N, 2) the places, moved out of trees and buildings."""
@@ -94,7 +94,7 @@ class Obstacles:
         return moved
 
 
-def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """(N, 2) velocities that pass the first of (N, M) discs that lie ahead along its tangent.
 
     place, velocity: (N, 2). centre: (N, M, 2); radius: (N, M), clearance included.
@@ -121,3 +121,62 @@ def round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, rad
     turned = velocity.copy()
     turned[row] = speed[row, None] * way
     return turned
+
+
+# Who is near whom, by a grid of cells: the time grows with the number of bodies, not with its square.
+
+
+def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs (P,), (P,) of rows of places (N, 2) that are nearer to one another than reach_m, each once."""
+    none = np.zeros(0, np.int64)
+    if len(place) < 2:
+        return none, none
+    cell = np.floor((place - place.min(axis=0)) / reach_m).astype(np.int64) + 1
+    across = int(cell[:, 0].max()) + 2
+    key = cell[:, 1] * across + cell[:, 0]
+    order = np.argsort(key, kind="stable")
+    ranked = key[order]
+    # Neighbours later in the same row of cells, and in the three cells of the row above, which lie in a row as well.
+    rank = np.arange(len(place))
+    spans = [
+        (rank + 1, np.searchsorted(ranked, ranked + 1, side="right")),
+        (np.searchsorted(ranked, ranked + across - 1), np.searchsorted(ranked, ranked + across + 1, side="right")),
+    ]
+    firsts, seconds = [], []
+    for begin, end in spans:
+        many = np.maximum(end - begin, 0)
+        total = int(many.sum())
+        first = np.repeat(rank, many)
+        seconds.append(np.arange(total) - np.repeat(np.cumsum(many) - many, many) + np.repeat(begin, many))
+        firsts.append(first)
+    first, second = order[np.concatenate(firsts)], order[np.concatenate(seconds)]
+    near = ((place[first] - place[second]) ** 2).sum(axis=1) < reach_m**2
+    return first[near], second[near]
+
+
+# Ways through places, there and back again.
+
+
+class Waypoints:
+    """A point that goes through places (P, 2) one after the other at a constant speed, and back, without end."""
+
+    def __init__(self, places_m: np.ndarray, speed_m_s: float) -> None:
+        self._places = np.asarray(places_m, float).reshape(-1, 2)
+        self._speed = speed_m_s
+        steps = np.linalg.norm(np.diff(self._places, axis=0), axis=1)
+        self._at = np.concatenate([[0.0], np.cumsum(steps)])
+
+    def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Place (2,) and velocity (2,)."""
+        length = self._at[-1]
+        if length <= 0 or self._speed <= 0:
+            return self._places[0].copy(), np.zeros(2)
+        gone = (self._speed * max(time_s, 0.0)) % (2 * length)
+        back = gone >= length
+        gone = 2 * length - gone if back else gone
+        leg = int(np.clip(np.searchsorted(self._at, gone, side="right") - 1, 0, len(self._at) - 2))
+        # Places twice in a row make legs of no length.
+        while self._at[leg + 1] <= self._at[leg]:
+            leg += 1 if leg + 2 < len(self._at) else -1
+        ahead = (self._places[leg + 1] - self._places[leg]) / (self._at[leg + 1] - self._at[leg])
+        return self._places[leg] + (gone - self._at[leg]) * ahead, ahead * self._speed * (-1 if back else 1)

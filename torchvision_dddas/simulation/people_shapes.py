@@ -6,15 +6,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.bodies import Canvas
-from torchvision_dddas.simulation.camera import View
+from torchvision_dddas.simulation.drawing import SUBPIXEL_BITS, Canvas, View
 
 _TROUSERS = ((92, 66, 48), (40, 38, 36), (70, 70, 72), (84, 112, 132), (56, 74, 96), (120, 124, 128), (62, 48, 40))
 _SKIN = ((142, 172, 214), (104, 140, 188), (78, 108, 156), (52, 74, 112))
 _HAIR = ((22, 24, 28), (34, 48, 66), (60, 82, 110), (110, 112, 116))
 _SHOES = np.array([34.0, 36, 42])
 _ROUND = np.stack([np.cos(np.linspace(0, np.pi, 8)), np.sin(np.linspace(0, np.pi, 8))], axis=1)
-_BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _UP = np.array([0.0, 0.0, 1.0])
 _LEAST_WRINKLED_PX = 30
 
@@ -50,7 +48,7 @@ class Figures(NamedTuple):
     colour: np.ndarray
 
 
-def dress(colour: np.ndarray, seed: int, number: int) -> Dress:
+def choose_dress(colour: np.ndarray, seed: int, number: int) -> Dress:
     """What the person of a number wears, in a shirt of that colour; the same at each call."""
     rng = np.random.default_rng([seed, 61, number])
     chance = rng.uniform(size=7)
@@ -67,7 +65,7 @@ def dress(colour: np.ndarray, seed: int, number: int) -> Dress:
     )
 
 
-def figures(
+def pose_figures(
     feet_m: np.ndarray,
     facing_rad: np.ndarray,
     height_m: np.ndarray,
@@ -147,7 +145,7 @@ def figures(
     return Figures(ends, radius, np.clip(np.stack([row[4] for row in rows], axis=1), 0, 255))
 
 
-def outlines(
+def limb_outlines(
     ends_m: np.ndarray, radius_m: np.ndarray, view: View, widen: float = 1.0, aside: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
     """(L, 16, 2) pixels of limbs (L, 2, 3), (L, 2), so much wider, moved aside by shares of their radius."""
@@ -189,16 +187,16 @@ def draw_figure(
     side = float(np.sign(view.image_from_world[2, 1] * to_sun[0] - view.image_from_world[2, 0] * to_sun[1]))
     # Seen from the sun's side all of it is lit, from the other only its edge.
     front = max(facing, 0.0)
-    whole = outlines(ends_m, radius_m, view)
-    part = outlines(ends_m, radius_m, view, 0.66 + 0.2 * front, (side * 0.32 * (1 - abs(facing)), -0.12))
+    whole = limb_outlines(ends_m, radius_m, view)
+    part = limb_outlines(ends_m, radius_m, view, 0.66 + 0.2 * front, (side * 0.32 * (1 - abs(facing)), -0.12))
     dark, bright = (np.clip(colour * tone, 0, 255).tolist() for tone in (0.62 + 0.12 * front, 0.82 + 0.25 * front))
     fixed_whole, fixed_part = (
-        list(np.round(np.clip(one, -3e4, 3e4) * 2**_BITS).astype(np.int32)) for one in (whole, part)
+        list(np.round(np.clip(one, -3e4, 3e4) * 2**SUBPIXEL_BITS).astype(np.int32)) for one in (whole, part)
     )
     for k in np.argsort(-away).tolist():
-        cv2.fillConvexPoly(canvas.picture, fixed_whole[k], dark[k], cv2.LINE_AA, _BITS)
-        cv2.fillConvexPoly(canvas.mask, fixed_whole[k], value, cv2.LINE_8, _BITS)
-        cv2.fillConvexPoly(canvas.picture, fixed_part[k], bright[k], cv2.LINE_AA, _BITS)
+        cv2.fillConvexPoly(canvas.picture, fixed_whole[k], dark[k], cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(canvas.mask, fixed_whole[k], value, cv2.LINE_8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(canvas.picture, fixed_part[k], bright[k], cv2.LINE_AA, SUBPIXEL_BITS)
     _wrinkle(whole, canvas, value)
     return whole
 
@@ -235,7 +233,7 @@ def _folds() -> np.ndarray:
     return np.clip(128 * (1 + 0.09 * pattern), 0, 255).astype(np.uint8)
 
 
-def shadow(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: np.ndarray) -> np.ndarray:
+def limb_shadows(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: np.ndarray) -> np.ndarray:
     """(L, 16, 3) outlines of limbs' shadows on level ground of a height, local metres."""
     worn = np.isfinite(radius_m).all(axis=1)
     reach = -to_sun[:2] / max(float(to_sun[2]), 0.15)

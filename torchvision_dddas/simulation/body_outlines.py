@@ -4,12 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchvision_dddas.simulation import vehicles
-from torchvision_dddas.simulation.figures import Dress, dress, figures
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.runs import runs
+from torchvision_dddas.simulation.aerial_ground import equal_runs
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.people_shapes import Dress, choose_dress, pose_figures
+from torchvision_dddas.simulation.relief import SHADE_BGR
 from torchvision_dddas.simulation.shutter import Shutter
-from torchvision_dddas.simulation.sunlight import SHADE_BGR
+from torchvision_dddas.simulation.vehicle_shapes import COVERED_BGR, car_faces, place_faces, ugv_faces
 from torchvision_dddas.simulation.world import World
 
 _SKYLIGHT = 0.45  # how bright a face is that the sun does not reach
@@ -33,7 +33,7 @@ class Outlines(NamedTuple):
     @property
     def runs(self) -> list[tuple[int, int]]:
         """The first row of each body and the one after its last."""
-        return list(runs(self.body))
+        return list(equal_runs(self.body))
 
 
 class Shapes:
@@ -106,10 +106,10 @@ class Shapes:
         for row in rows:
             number = int(bodies.number[row])
             if number not in self._dress:
-                self._dress[number] = dress(bodies.colour[row], self._seed, number)
+                self._dress[number] = choose_dress(bodies.colour[row], self._seed, number)
         if not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 3))
-        shape = figures(
+        shape = pose_figures(
             bodies.place_m[rows], bodies.facing_rad[rows], bodies.height_m[rows],
             np.linalg.norm(bodies.velocity_m_s[rows], axis=1), bodies.phase[rows],
             [self._dress[int(n)] for n in bodies.number[rows]],
@@ -131,11 +131,11 @@ class Shapes:
         bodies, sun = moment.bodies, self._world.to_sun
         parts = []
         for row in rows:
-            faces = vehicles.car() if bodies.kind[row] == "car" else vehicles.ugv()
-            corners, normal = vehicles.placed(faces, bodies.place_m[row], float(bodies.facing_rad[row]))
+            faces = car_faces() if bodies.kind[row] == "car" else ugv_faces()
+            corners, normal = place_faces(faces, bodies.place_m[row], float(bodies.facing_rad[row]))
             light = np.where(faces.lit, _SKYLIGHT + (1.05 - _SKYLIGHT) * np.maximum(normal @ sun, 0) / sun[2], 1)
             plate = bodies.plate[row]
-            plate = vehicles.COVERED if bodies.hidden[row] or np.isnan(plate).any() else plate
+            plate = COVERED_BGR if bodies.hidden[row] or np.isnan(plate).any() else plate
             colour = faces.colour + faces.paint[:, None] * bodies.colour[row] + faces.plate[:, None] * plate
             middle = corners.mean(axis=1)
             if bodies.kind[row] != "car":

@@ -1,26 +1,20 @@
 """Bushes and trees as pictures that stand upright, buildings and vehicles, as a camera near the ground sees them."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.backdrop import HAZE
-from torchvision_dddas.simulation.bodies import Canvas
-from torchvision_dddas.simulation.camera import View
-from torchvision_dddas.simulation.cover import Things
-from torchvision_dddas.simulation.vehicles import COVERED, Faces, placed, ugv
+from torchvision_dddas.simulation.cover import StandingObjects
+from torchvision_dddas.simulation.drawing import NEAR_M, SUBPIXEL_BITS, Canvas, View, fill_outline
+from torchvision_dddas.simulation.ground_backdrop import HAZE
+from torchvision_dddas.simulation.vehicle_shapes import COVERED_BGR, Faces, place_faces
 from torchvision_dddas.types import Bodies
 
 _SHAPES = 6  # different bushes, and different trees
 _SIZE_PX = (160, 160)  # width, height of a drawn plant
 _DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
-_WHEEL_M = (0.7, 0.3, 0.33)  # from the middle to a wheel's, its width, its radius
-_SPOKES = 12
-_BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _CLEAR = np.array([[-1.0, 0, 1]] * 3)  # of what is covered: what is not, three times
-NEAR_M = 0.4  # what is nearer to the camera, in depth, is not drawn
 
 
 @dataclass(frozen=True)
@@ -30,7 +24,7 @@ class Plant:
     layers: tuple[np.ndarray, ...]
 
 
-def plants(seed: int) -> dict[str, list[Plant]]:
+def draw_plants(seed: int) -> dict[str, list[Plant]]:
     """Drawn bushes and trees, lit from the upper right."""
     rng = np.random.default_rng([seed, 62])
     return {"bush": [_bush(rng) for _ in range(_SHAPES)], "tree": [_tree(rng) for _ in range(_SHAPES)]}
@@ -63,7 +57,7 @@ def draw_plant(
 
 
 def draw_building(
-    things: Things, k: int, foot_m: float, colour: np.ndarray, view: View, canvas: Canvas, to_sun: np.ndarray
+    things: StandingObjects, k: int, foot_m: float, colour: np.ndarray, view: View, canvas: Canvas, to_sun: np.ndarray
 ) -> None:
     """Draw a building's walls and roof, with a door and windows, that stands at a height."""
     along = np.array([np.sin(things.heading_rad[k]), np.cos(things.heading_rad[k])])
@@ -80,7 +74,7 @@ def draw_building(
         def panel(first: float, last: float, low: float, high: float, tone: np.ndarray) -> None:
             ends = start + first * way, start + last * way  # noqa: B023 (used at once)
             corners = np.array([[*ends[0], low], [*ends[1], low], [*ends[1], high], [*ends[0], high]])
-            fill(corners, np.clip(tone, 0, 255), 0, view, canvas)
+            fill_outline(corners, np.clip(tone, 0, 255), 0, view, canvas)
 
         panel(0, 1, foot_m - 0.5, top, light * colour)
         panel(0, 1, top - 0.25, top, 0.8 * light * colour)
@@ -91,66 +85,17 @@ def draw_building(
             low, high, side = (0.0, 2.1, 0.45) if door else (1.0, 2.0, 0.5)
             panel(middle - side / length, middle + side / length, foot_m + low, foot_m + high, light * _DARK)
     if view.position_m[2] > top:
-        fill(np.c_[outline, np.full(4, top)], np.clip(colour * (0.5 + 0.5 * to_sun[2]), 0, 255), 0, view, canvas)
-
-
-@cache
-def rover() -> Faces:
-    """A ground vehicle as `vehicles.ugv` has it, seen from near: round wheels behind skirts, and a slender mast."""
-    plain = ugv()
-    # The wheels come first, and nothing else has their grey; the mast alone has none of the paint, but for the marker.
-    kept = (plain.colour != plain.colour[0]).any(axis=1) & (plain.paint + plain.plate > 0)
-    turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
-    ring = np.stack([np.cos(turn), np.zeros(_SPOKES), np.sin(turn)], axis=1)
-    corners, normals, tones = [], [], []
-    for along in (-0.82, 0.0, 0.82):
-        for hand in (-1.0, 1.0):
-            aside = hand * np.array([0.0, 1.0, 0.0])
-            middle = np.array([along, 0.0, _WHEEL_M[2]]) + _WHEEL_M[0] * aside
-            half, rim = _WHEEL_M[1] / 2 * aside, middle + _WHEEL_M[2] * ring
-            for k in range(_SPOKES):
-                a, b = rim[k], rim[(k + 1) % _SPOKES]
-                tread = np.array([a + half, b + half, b - half, a - half])
-                corners.append(np.pad(tread, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
-                normals.append(ring[k] + ring[(k + 1) % _SPOKES])
-                tones.append(30.0 + 8 * (k % 2))
-            corners += [rim + half, middle + 0.55 * (rim - middle) + 1.02 * half]
-            normals += [aside, aside]
-            tones += [36.0, 50.0]
-    for hand in (-1.0, 1.0):
-        y = hand * (_WHEEL_M[0] + 0.54 * _WHEEL_M[1])
-        skirt = np.array([[-1.2, y, 0.42], [1.2, y, 0.42], [1.15, y, 0.78], [-1.15, y, 0.78]])
-        corners.append(np.pad(skirt, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
-        normals.append(np.array([0.0, hand, 0.0]))
-        tones.append(14.0)
-    for low, high, half_long, half_wide in ((0.75, 1.2, 0.015, 0.015), (1.2, 1.27, 0.05, 0.06)):
-        block = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (half_long, half_wide) + (1.05, 0.0)
-        for k in range(4):
-            (x0, y0), (x1, y1) = block[k], block[(k + 1) % 4]
-            side = np.array([[x0, y0, low], [x1, y1, low], [x1, y1, high], [x0, y0, high]])
-            corners.append(np.pad(side, ((0, _SPOKES - 4), (0, 0)), mode="edge"))
-            normals.append(np.array([y1 - y0, x0 - x1, 0.0]))
-            tones.append(44.0)
-    paint = np.array([0.85 if tone == 14 else 0.0 for tone in tones])
-    hull = np.pad(plain.corners_m[kept], ((0, 0), (0, _SPOKES - plain.corners_m.shape[1]), (0, 0)), mode="edge")
-    normal = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
-    added = len(tones)
-    return Faces(
-        np.concatenate([hull, np.array(corners)]),
-        np.concatenate([plain.normal[kept], normal]),
-        np.concatenate([plain.colour[kept], np.repeat(np.array(tones)[:, None], 3, axis=1)]),
-        np.concatenate([plain.paint[kept], paint]),
-        np.concatenate([plain.plate[kept], np.zeros(added)]),
-        np.ones(kept.sum() + added, bool),
-    )
+        fill_outline(
+            np.c_[outline, np.full(4, top)], np.clip(colour * (0.5 + 0.5 * to_sun[2]), 0, 255), 0, view, canvas
+        )
 
 
 def draw_vehicle(
     faces: Faces, bodies: Bodies, k: int, haze: float, view: View, canvas: Canvas, to_sun: np.ndarray
 ) -> None:
     """Draw the faces of a car or a ground vehicle that look at the camera."""
-    corners, normal = placed(faces, bodies.place_m[k], float(bodies.facing_rad[k]))
-    plate = COVERED if bodies.hidden[k] or not np.isfinite(bodies.plate[k]).all() else bodies.plate[k]
+    corners, normal = place_faces(faces, bodies.place_m[k], float(bodies.facing_rad[k]))
+    plate = COVERED_BGR if bodies.hidden[k] or not np.isfinite(bodies.plate[k]).all() else bodies.plate[k]
     colour = faces.colour + faces.paint[:, None] * bodies.colour[k] + faces.plate[:, None] * plate
     light = np.where(faces.lit, 0.55 + 0.45 * np.maximum(normal @ to_sun, 0), 1)[:, None]
     colour = np.clip(colour * light, 0, 255)
@@ -164,36 +109,12 @@ def draw_vehicle(
     seen = corners @ matrix[:, :3].T + matrix[:, 3]
     if seen[..., 2].min() < NEAR_M:
         for n in order:
-            fill(corners[n], colour[n], value, view, canvas)
+            fill_outline(corners[n], colour[n], value, view, canvas)
         return
-    px = np.round(np.clip(seen[..., :2] / seen[..., 2:], -3e4, 3e4) * 2**_BITS).astype(np.int32)
+    px = np.round(np.clip(seen[..., :2] / seen[..., 2:], -3e4, 3e4) * 2**SUBPIXEL_BITS).astype(np.int32)
     for n in order:
-        cv2.fillConvexPoly(canvas.picture, px[n], colour[n].tolist(), cv2.LINE_AA, _BITS)
-        cv2.fillConvexPoly(canvas.mask, px[n], value, cv2.LINE_8, _BITS)
-
-
-def fill(points_m: np.ndarray, colour: np.ndarray, value: int, view: View, canvas: Canvas) -> None:
-    """Fill a convex outline (N, 3) of which what is behind the camera is cut off."""
-    matrix = view.image_from_world
-    seen = points_m @ matrix[:, :3].T + matrix[:, 3]
-    depth = seen[:, 2]
-    if depth.min() < NEAR_M:
-        kept = []
-        for k in range(len(seen)):
-            a, b = depth[k], depth[(k + 1) % len(seen)]
-            if a >= NEAR_M:
-                kept.append(seen[k])
-            if (a >= NEAR_M) != (b >= NEAR_M):
-                kept.append(seen[k] + (NEAR_M - a) / (b - a) * (seen[(k + 1) % len(seen)] - seen[k]))
-        if len(kept) < 3:
-            return
-        seen = np.array(kept)
-    px = seen[:, :2] / seen[:, 2:]
-    low, high = px.min(axis=0), px.max(axis=0)
-    height, width = canvas.picture.shape[:2]
-    if (high > 0).all() and low[0] < width and low[1] < height:
-        # OpenCV counts pixels in 16 bits where it counts them in sixteenths.
-        canvas.fill(np.clip(px, -3e4, 3e4), colour, value)
+        cv2.fillConvexPoly(canvas.picture, px[n], colour[n].tolist(), cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(canvas.mask, px[n], value, cv2.LINE_8, SUBPIXEL_BITS)
 
 
 def _bush(rng: np.random.Generator) -> Plant:

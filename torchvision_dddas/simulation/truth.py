@@ -1,9 +1,11 @@
 """What is true of a simulated run, as the tools that judge results read it: masks, boxes, identities, places."""
 
+import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -11,8 +13,11 @@ from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
 from torchvision_dddas.io.maps.geojson import encoded, geojson
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks
 from torchvision_dddas.io.masks import Masks
+from torchvision_dddas.io.output.detection_output import uninterrupted
+from torchvision_dddas.io.output.pipeline_output import ALL, SurveyOutput
+from torchvision_dddas.io.output.pipeline_output import SAVED as MADE
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.types import Bodies, Positions, Truth
+from torchvision_dddas.types import Bodies, FrameResult, Positions, Truth
 
 COLUMNS = (
     *("frame", "target", "kind", "people", "east_m", "north_m", "longitude_deg", "latitude_deg"),
@@ -51,9 +56,9 @@ class TruthOutput:
     def write(self, truth: Truth) -> None:
         """Add a frame. Raises OSError if the disk refuses."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        found = targets_of(truth.bodies)
-        shown = boxes_of(truth.mask)
-        people = boxes_of(truth.people)
+        found = gather_targets(truth.bodies)
+        shown = label_boxes(truth.mask)
+        people = label_boxes(truth.people)
         fleet = found.kind == "ugv"
         moves = dict(zip(found.target.tolist(), (found.fastest_m_s >= STANDS_M_S).tolist(), strict=True))
         rows = []
@@ -91,7 +96,7 @@ class TruthOutput:
             )
             gathered.add(positions, truth.time_s, found.velocity_m_s[which])
         if self._masks is not None:
-            self._masks.add(truth.frame, moving_only(truth))
+            self._masks.add(truth.frame, moving_mask(truth))
 
     def close(self, complete: bool) -> None:
         """Put the tables in their places and write the map. Raises OSError if they cannot be written."""
@@ -126,7 +131,7 @@ class Targets(NamedTuple):
     fastest_m_s: np.ndarray
 
 
-def targets_of(bodies: Bodies) -> Targets:
+def gather_targets(bodies: Bodies) -> Targets:
     """The targets that bodies are, or are part of."""
     target, first, row, count = np.unique(bodies.target, return_index=True, return_inverse=True, return_counts=True)
     place, velocity = (np.zeros((len(target), 2)) for _ in range(2))
@@ -139,14 +144,14 @@ def targets_of(bodies: Bodies) -> Targets:
     return Targets(target, kind, people, place / count[:, None], velocity / count[:, None], fastest)
 
 
-def moving_only(truth: Truth) -> np.ndarray:
+def moving_mask(truth: Truth) -> np.ndarray:
     """(H, W) uint16, the mask of a frame without the targets that stand."""
-    found = targets_of(truth.bodies)
+    found = gather_targets(truth.bodies)
     still = found.target[found.fastest_m_s < STANDS_M_S]
     return np.where(np.isin(truth.mask, still), 0, truth.mask) if len(still) else truth.mask
 
 
-def boxes_of(labels: np.ndarray) -> dict[int, tuple[int, int, int, int, int]]:
+def label_boxes(labels: np.ndarray) -> dict[int, tuple[int, int, int, int, int]]:
     """Number -> x, y of the top left pixel, width, height of the box about its pixels, and how many they are."""
     v, u = np.nonzero(labels)
     numbers, row, count = np.unique(labels[v, u], return_inverse=True, return_counts=True)
@@ -174,3 +179,64 @@ def _ranked(fleet: GroundTracks) -> GroundTracks:
 
 def _names(fleet: GroundTracks) -> tuple[str, ...]:
     return tuple(f"ugv{k + 1}" for k in range(len(np.unique(fleet.target))))
+
+
+# The folder of a run in a simulated world: what a run of the whole path leaves, and the truth beside it.
+
+
+SAVED_WITH_TRUTH = (*MADE, "truth")
+"""What --save may name. The tables and run.json are always written."""
+
+
+class SimulatedRunOutput(SurveyOutput):
+    """As SurveyOutput, with truth/ for `dddas evaluate`: the tables of TruthOutput, without masks."""
+
+    files: ClassVar[tuple[str, ...]] = (*ALL, *TruthOutput.files)
+
+    def knows(self, lonlat: LonLat) -> None:
+        """After `also`. lonlat: (N, 2) longitudes and latitudes of (N, 2) metres of the world."""
+        self._truth = TruthOutput(self.folder, lonlat, masks=False) if "truth" in self._save else None
+        self._ahead: deque[Truth] = deque()
+
+    def true(self, truth: Truth) -> None:
+        """What is true of a frame, before it is surveyed: it is written then, so that both end at one frame."""
+        if self._truth is not None:
+            self._ahead.append(truth)
+
+    def survey(self, item: FrameResult) -> None:
+        """Write a frame and what is true until then. Raises InputError if the disk refuses."""
+        with uninterrupted():
+            super().survey(item)
+            self._write(item.followed.number)
+
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, as SurveyOutput; the truth of an earlier run here goes."""
+        with uninterrupted():
+            with self._refusals():
+                if self._truth is None:
+                    _without(self.folder)
+                else:
+                    if complete:
+                        self._write(math.inf)
+                    self._truth.close(complete)
+            super().close(complete)
+
+    def discard(self) -> None:
+        """Leave only what is whole."""
+        with uninterrupted():
+            truth = getattr(self, "_truth", None)
+            if truth is not None:
+                truth.discard()
+            super().discard()
+
+    def _write(self, until: float) -> None:
+        """The truths that wait, up to a frame."""
+        with self._refusals():
+            while self._truth is not None and self._ahead and self._ahead[0].frame <= until:
+                self._truth.write(self._ahead.popleft())
+
+
+def _without(folder: Path) -> None:
+    """Remove an earlier run's truth."""
+    for name in TruthOutput.files:
+        remove(folder / name)

@@ -10,7 +10,8 @@ from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.simulation.source import KEPT, Rows, SimulatorSource
+from torchvision_dddas.simulation import SimulatorSource
+from torchvision_dddas.simulation.source import KEPT, Rows
 from torchvision_dddas.types import Command, Order
 
 

@@ -1,8 +1,58 @@
-"""What goes wrong, when, and how it is said."""
+"""What satellite receivers say of their places: errors that last, errors that are new each time."""
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from torchvision_dddas.simulation.scenario import Fault
+
+SIGMAS_95 = 2.4477
+"""Radius that holds 95 % of a circular normal distribution, in standard deviations along each axis."""
+
+
+class Receivers:
+    """The errors of K receivers, from one report to the next.
+
+    Of the variance, white_share is new in each report. The rest is a Gauss-Markov process: it lasts for about
+    correlation_s and starts as it goes on. On top of that all share one more, of standard deviation common_m.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        error95_m: float,
+        white_share: float,
+        correlation_s: float,
+        common_m: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self.sigma_m = error95_m / SIGMAS_95
+        self._white = self.sigma_m * np.sqrt(white_share)
+        self._slow = self.sigma_m * np.sqrt(1 - white_share)
+        self._correlation_s, self._common, self._rng = correlation_s, common_m, rng
+        # The last row is what all share.
+        self._state = rng.standard_normal((count + 1, 2))
+        self._new = rng.standard_normal((count, 2))
+
+    def advance(self, seconds: float) -> None:
+        """On to the next report, so much later."""
+        kept = np.exp(-seconds / self._correlation_s)
+        self._state = kept * self._state + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._state.shape)
+        self._new = self._rng.standard_normal(self._new.shape)
+
+    @property
+    def lasting_m(self) -> np.ndarray:
+        """(K, 2) east, north: the part of the errors that the next report still has, what all share included."""
+        return self._slow * self._state[:-1] + self._common * self._state[-1]
+
+    @property
+    def error_m(self) -> np.ndarray:
+        """(K, 2) east, north: the errors of this report."""
+        return self.lasting_m + self._white * self._new
+
+
+# What goes wrong, when, and how it is said.
+
 
 _WORDS = {
     "ugv_lost": ("{who} is lost", "{who} is back"),
@@ -17,7 +67,7 @@ _WORDS = {
 
 
 @dataclass(frozen=True)
-class Wrong:
+class ActiveFaults:
     """What is wrong at a moment; vehicles by their rows, from 0. jumped: metres, by vehicle."""
 
     lost: frozenset[int] = frozenset()
@@ -34,7 +84,7 @@ class Faults:
     def __init__(self, faults: tuple[Fault, ...]) -> None:
         self._faults = faults
 
-    def at(self, time_s: float) -> Wrong:
+    def at(self, time_s: float) -> ActiveFaults:
         """What is wrong at a time."""
         now = [fault for fault in self._faults if _on(fault, time_s)]
 
@@ -42,7 +92,7 @@ class Faults:
             return frozenset(fault.vehicle - 1 for fault in now if fault.what == what)
 
         kinds = {fault.what for fault in now}
-        return Wrong(
+        return ActiveFaults(
             vehicles("ugv_lost"),
             vehicles("gps_dropout"),
             vehicles("landmark_hidden"),

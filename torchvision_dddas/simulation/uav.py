@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchvision_dddas.simulation.receiver import Receivers
+from torchvision_dddas.simulation.movement import Waypoints
 from torchvision_dddas.simulation.scenario import AircraftParameters
-from torchvision_dddas.simulation.ways import Way
+from torchvision_dddas.simulation.sensor_errors import Receivers
 from torchvision_dddas.types import CameraPose
 
 ACCELERATION_M_S2 = 3.0
@@ -80,7 +80,7 @@ class Aircraft:
         self, parameters: AircraftParameters, half_m: float, up_m: Callable[[np.ndarray], np.ndarray], seed: int
     ) -> None:
         self._parameters, self._half, self._up = parameters, half_m, up_m
-        self._way = Way(np.array([parameters.start_m, *parameters.way_m], float), parameters.speed_m_s)
+        self._way = Waypoints(np.array([parameters.start_m, *parameters.way_m], float), parameters.speed_m_s)
         self._altitude = parameters.altitude_m
         self._fly_to: np.ndarray | None = None
         self._look_at: np.ndarray | None = None
@@ -171,7 +171,7 @@ class Aircraft:
         right = _cross(forward, np.array([np.sin(heading), np.cos(heading), 0.0]))
         right /= np.linalg.norm(right)
         hung = np.stack([right, _cross(forward, right), forward], axis=1)
-        shaken = rotation(self._shaken.value + ahead_s * self._shaken.rate)
+        shaken = rotation_matrix(self._shaken.value + ahead_s * self._shaken.rate)
         return craft + self._blown.value + ahead_s * self._blown.rate, hung @ shaken
 
     def pose(self) -> tuple[CameraPose, np.ndarray, np.ndarray]:
@@ -183,7 +183,7 @@ class Aircraft:
         return CameraPose(place, hung), self._craft.velocity + self._blown.rate, turn
 
 
-class Telemetry:
+class ReportedPose:
     """What the UAV says of itself: lasting errors of the knobs' standard deviations, and a tenth of it anew.
 
     Angles near straight down are what they are: a heading that swings with a tiny tilt, and a roll that undoes it.
@@ -212,7 +212,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
-def rotation(vector: np.ndarray) -> np.ndarray:
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
     """(3, 3) that turns by the length of a vector (3,), in radians, about it (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:

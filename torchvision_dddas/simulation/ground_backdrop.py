@@ -5,8 +5,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.camera import View
-from torchvision_dddas.simulation.runs import runs
+from torchvision_dddas.simulation.aerial_ground import equal_runs
+from torchvision_dddas.simulation.drawing import View
 from torchvision_dddas.simulation.world import World
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
@@ -22,7 +22,7 @@ _TILE = 512  # side of the pattern of pebbles, in its own texels
 _GRAIN_M = (0.007, 0.031)  # its texels, laid out twice
 
 
-class Seen(NamedTuple):
+class BackdropView(NamedTuple):
     """image: (H, W, 3) uint8 BGR. inverse_m: (H, W) float32, 1 / the way over the ground to each pixel; 0: sky."""
 
     image: np.ndarray
@@ -56,7 +56,7 @@ class Backdrop:
         self._maps: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         self._ridge = rng.uniform(0.3, 1, 6) / np.arange(1, 7), rng.uniform(0, 2 * np.pi, 6)
 
-    def seen(self, view: View, size: tuple[int, int]) -> Seen:
+    def seen(self, view: View, size: tuple[int, int]) -> BackdropView:
         """What a view (its picture's width, height) holds of it."""
         width, height = size
         columns = np.linspace(0, width - 1, (width - 1) // _COLUMN_PX + 2)
@@ -79,7 +79,7 @@ class Backdrop:
             mixed, onto = last - first, image[first:last]
             onto[:] = np.where(ground_there[first:last, :, None], ground[:mixed], onto)
             image[last:] = ground[mixed:]
-        return Seen(image, whole_inverse)
+        return BackdropView(image, whole_inverse)
 
     def _widened(self, image: np.ndarray, width: int) -> np.ndarray:
         """(H, width) of an image (H, C) of some columns, evenly between them."""
@@ -124,18 +124,18 @@ class Backdrop:
         clear = np.round(np.exp(-far / VISIBILITY_M) * _BETWEEN).astype(int) / _BETWEEN
         image = np.empty((*x.shape, 3), np.uint8)
         air = np.broadcast_to(np.round(HAZE).astype(np.uint8), image.shape)
-        for first, last in runs(blur // _BETWEEN):
+        for first, last in equal_runs(blur // _BETWEEN):
             part, k = slice(first, last), int(blur[first]) // _BETWEEN
             fine = self._texture(k, x[part], y[part], place)
             share = blur[part] % _BETWEEN
             if share.any():
                 coarse = self._texture(k + 1, x[part], y[part], place)
-                for begin, end in runs(share):
+                for begin, end in equal_runs(share):
                     weight = float(share[begin]) / _BETWEEN
                     cv2.addWeighted(fine[begin:end], 1 - weight, coarse[begin:end], weight, 0, dst=fine[begin:end])
             image[part] = fine
         self._strew(image, x, y, place, along)
-        for begin, end in runs(clear):
+        for begin, end in equal_runs(clear):
             if clear[begin] < 1:
                 haze = np.ascontiguousarray(air[begin:end])
                 cv2.addWeighted(image[begin:end], clear[begin], haze, 1 - clear[begin], 0, dst=image[begin:end])

@@ -6,16 +6,27 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation import vehicles
-from torchvision_dddas.simulation.backdrop import HAZE, VISIBILITY_M, Backdrop, Seen
-from torchvision_dddas.simulation.billboards import NEAR_M, draw_building, draw_plant, draw_vehicle, plants, rover
-from torchvision_dddas.simulation.bodies import Canvas
-from torchvision_dddas.simulation.camera import View, axes, view_of
-from torchvision_dddas.simulation.figures import Dress, Figures, draw_figure, dress, figures, shadow
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.receiver import SIGMAS_95
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.drawing import NEAR_M, Canvas, View, camera_axes, view_from_pose
+from torchvision_dddas.simulation.ground_backdrop import HAZE, VISIBILITY_M, Backdrop, BackdropView
+from torchvision_dddas.simulation.ground_objects import (
+    draw_building,
+    draw_plant,
+    draw_plants,
+    draw_vehicle,
+)
+from torchvision_dddas.simulation.people_shapes import (
+    Dress,
+    Figures,
+    choose_dress,
+    draw_figure,
+    limb_shadows,
+    pose_figures,
+)
 from torchvision_dddas.simulation.scenario import CameraParameters, Scenario
 from torchvision_dddas.simulation.sensor import Sensor
+from torchvision_dddas.simulation.sensor_errors import SIGMAS_95
+from torchvision_dddas.simulation.vehicle_shapes import car_faces, place_faces, rover_faces, ugv_faces
 from torchvision_dddas.simulation.world import World
 from torchvision_dddas.types import Bodies, Camera, CameraPose, GroundPicture
 
@@ -34,7 +45,7 @@ _LEAST_PX = 2.0  # what is lower in the picture is not drawn
 _SLACK_PX = 4.0  # by so many rows the ground must be nearer than what it hides
 
 
-class Sight(NamedTuple):
+class GroundTruthView(NamedTuple):
     """A picture and its truth. image: (H, W, 3) uint8 BGR. mask: (H, W) uint16, the number of the body seen there.
 
     number: (N,) of the people before the camera. box_px: (N, 4) x, y, width, height of each as if nothing hid it, also
@@ -63,7 +74,7 @@ class GroundCamera:
         self.focal_px = float(focal), float(focal)
         self.centre_px = (team.width_px - 1) / 2, (team.height_px - 1) / 2
         self._backdrop = Backdrop(world, scenario.seed)
-        self._plants = plants(scenario.seed)
+        self._plants = draw_plants(scenario.seed)
         self._foot_m = world.up_m(world.things.east_north_m) if len(world.things) else np.zeros(0)
         self._dress: dict[int, Dress] = {}
         self._sensors: dict[int, Sensor] = {}
@@ -92,7 +103,7 @@ class GroundCamera:
         image, _, _, _ = self._drawn(moment, vehicle)
         return GroundPicture(name, moment.number, image, camera)
 
-    def look(self, moment: Moment, vehicle: int) -> Sight:
+    def look(self, moment: Moment, vehicle: int) -> GroundTruthView:
         """The picture that `take` takes, with the truth: whose body is where, and how much of each it shows."""
         image, mask, view, whole = self._drawn(moment, vehicle)
         number = np.array(sorted(whole), np.int64)
@@ -100,7 +111,7 @@ class GroundCamera:
         for row, n in enumerate(number.tolist()):
             boxes[row], area = _extent(whole[n])
             shares[row] = min(np.count_nonzero(mask == n) / max(area, 1), 1)
-        return Sight(image, mask, number, boxes, shares, view)
+        return GroundTruthView(image, mask, number, boxes, shares, view)
 
     def view(self, moment: Moment, vehicle: int) -> View:
         """From where and whither a vehicle truly looks."""
@@ -108,8 +119,8 @@ class GroundCamera:
         rng = np.random.default_rng([self._scenario.seed, 63, vehicle, moment.number])
         pitch, roll = rng.normal(0, SHAKE_RAD, 2)
         place = moment.bodies.place_m[own] + np.array([0, 0, self._scenario.team.camera_m])
-        pose = CameraPose(place, axes(float(moment.heading_rad[vehicle]), pitch, roll))
-        return view_of(pose, Camera("", self.size_px, self.focal_px, self.centre_px))
+        pose = CameraPose(place, camera_axes(float(moment.heading_rad[vehicle]), pitch, roll))
+        return view_from_pose(pose, Camera("", self.size_px, self.focal_px, self.centre_px))
 
     def _drawn(self, moment: Moment, vehicle: int) -> tuple[np.ndarray, np.ndarray, View, dict[int, np.ndarray]]:
         """Picture, mask, view, and by number the outlines of each person's limbs."""
@@ -125,7 +136,7 @@ class GroundCamera:
         return image, canvas.mask, view, whole
 
     def _draw(
-        self, bodies: Bodies, vehicle: int, view: View, looking: Future[Seen]
+        self, bodies: Bodies, vehicle: int, view: View, looking: Future[BackdropView]
     ) -> tuple[Canvas, dict[int, np.ndarray]]:
         things, eye = self._world.things, view.position_m
         far = np.hypot(*(things.east_north_m - eye[:2]).T)
@@ -177,7 +188,7 @@ class GroundCamera:
                     one = limbs.ends_m[row], limbs.radius_m[row], colour
                     whole[value] = draw_figure(*one, view, canvas, value, self._world.to_sun)
                 else:
-                    faces = vehicles.car() if bodies.kind[k] == "car" else rover()
+                    faces = car_faces() if bodies.kind[k] == "car" else rover_faces()
                     draw_vehicle(faces, bodies, k, haze, view, canvas, self._world.to_sun)
             if before is not None:
                 nearer = inverse_m[part] > 1 / distance[n] + self._slack
@@ -226,8 +237,8 @@ class GroundCamera:
         for k in rows:
             number = int(bodies.number[k])
             if number not in self._dress:
-                self._dress[number] = dress(bodies.colour[k], self._scenario.seed, number)
-        return figures(
+                self._dress[number] = choose_dress(bodies.colour[k], self._scenario.seed, number)
+        return pose_figures(
             bodies.place_m[rows],
             bodies.facing_rad[rows],
             bodies.height_m[rows],
@@ -266,10 +277,10 @@ class GroundCamera:
             up = float(bodies.place_m[k, 2])
             if bodies.kind[k] == "person":
                 row = row_of[k]
-                groups = shadow(limbs.ends_m[row], limbs.radius_m[row], up, sun)
+                groups = limb_shadows(limbs.ends_m[row], limbs.radius_m[row], up, sun)
             else:
-                faces = vehicles.car() if bodies.kind[k] == "car" else vehicles.ugv()
-                corners, _ = vehicles.placed(faces, bodies.place_m[k], float(bodies.facing_rad[k]))
+                faces = car_faces() if bodies.kind[k] == "car" else ugv_faces()
+                corners, _ = place_faces(faces, bodies.place_m[k], float(bodies.facing_rad[k]))
                 flat = corners[..., :2] - (corners[..., 2:] - up) * sun[:2] / max(float(sun[2]), 0.15)
                 groups = np.concatenate([flat, np.full((*flat.shape[:2], 1), up)], axis=2)
             seen = groups @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]

@@ -1,17 +1,68 @@
-"""Paints people and vehicles into a picture from the air, with their shadows, and tells which pixels are theirs."""
+"""What the UAV's camera films of a simulated world, and the truth of every pixel."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation import sunlight
-from torchvision_dddas.simulation.blur import LEAST_PX, streak
-from torchvision_dddas.simulation.moment import Moment
-from torchvision_dddas.simulation.outlines import Outlines, Shapes
-from torchvision_dddas.simulation.shutter import Shutter
+from torchvision_dddas.simulation.aerial_ground import PixelPlaces, Terrain
+from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.body_outlines import Outlines, Shapes
+from torchvision_dddas.simulation.ground_backdrop import HAZE
+from torchvision_dddas.simulation.relief import SHADE_BGR, shadow_above_ground
+from torchvision_dddas.simulation.scenario import Scenario
+from torchvision_dddas.simulation.sensor import Sensor
+from torchvision_dddas.simulation.shutter import LEAST_PX, Shutter, motion_blur, streak_kernel
 from torchvision_dddas.simulation.world import World
+from torchvision_dddas.types import Camera
+
+
+class AerialCamera:
+    """The UAV's camera above a world. A picture depends on the seed and its moment alone, not on those before it."""
+
+    def __init__(self, world: World, scenario: Scenario) -> None:
+        parameters = scenario.camera
+        size = parameters.width_px, parameters.height_px
+        focal = size[0] / 2 / np.tan(np.radians(parameters.hfov_deg) / 2)
+        self.camera = Camera("uav", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2))
+        self._world, self._exposure_s = world, parameters.exposure_s
+        self._shutter = Shutter(self.camera, parameters.readout_s, parameters.vibration_px, scenario.seed)
+        self._terrain = Terrain(world, self._shutter)
+        self._painter = Painter(world, self._shutter, parameters.exposure_s, scenario.seed)
+        self._sensor = Sensor(parameters, size, scenario.seed)
+
+    def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The picture (H, W, 3) uint8 BGR, its targets (H, W) uint16 and its bodies (H, W) uint16; 0: neither."""
+        # Both take about as long, and neither needs the other. A thread for each picture costs little, and none is left
+        # behind in a process that forks.
+        with ThreadPoolExecutor(1) as other:
+            drawing = other.submit(self._painter.drawn, moment)
+            lie = self._terrain.lie(moment)
+            picture = self._terrain.texture(lie)
+            drawn = drawing.result()
+        targets, bodies = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
+        self._painter.paint(moment, drawn, picture, targets, bodies, lie.rise_m)
+        if lie.haze is not None:
+            air = np.empty_like(picture)
+            air[:] = HAZE.astype(np.uint8)
+            picture = np.asarray(cv2.blendLinear(picture, air, 1 - lie.haze, lie.haze))
+        if self._exposure_s > 0:
+            picture = motion_blur(picture, self._ways(moment, lie))
+        return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies
+
+    def _ways(self, moment: Moment, lie: PixelPlaces) -> np.ndarray:
+        """(3, 3, 2) pixels that the ground moves in the picture while it is exposed, from corner to corner."""
+        height, width = lie.east_m.shape
+        row, column = np.meshgrid([0, height // 2, height - 1], [0, width // 2, width - 1], indexing="ij")
+        place = np.stack([lie.east_m[row, column], lie.north_m[row, column]], axis=-1).reshape(-1, 2).astype(float)
+        ground = np.c_[place, self._world.up_m(place)]
+        return self._shutter.ways(moment, ground, self._exposure_s).reshape(3, 3, 2).astype(np.float32)
+
+
+# Paints people and vehicles into a picture from the air, with their shadows, and tells which pixels are theirs.
+
 
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
 _REACH_M = 5.0  # a body with its shadow reaches about so far
@@ -55,7 +106,7 @@ class Painter:
         east, north = np.meshgrid(middles, -middles)
         ground = world.up_m(np.c_[east.ravel(), north.ravel()]).reshape(surface.shape)
         # How high the shadow of what stands about reaches above each cell.
-        self._shade_m = sunlight.above_ground(np.asarray(surface + ground, np.float32), self._cell_m, world.to_sun)
+        self._shade_m = shadow_above_ground(np.asarray(surface + ground, np.float32), self._cell_m, world.to_sun)
 
     def drawn(self, moment: Moment) -> Drawn:
         """All bodies that a moment's picture may show, and their shadows, each on a canvas of its own."""
@@ -68,7 +119,9 @@ class Painter:
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
         shadows = Outlines(*(column[in_sun[shadows.body]] for column in shadows))
-        return Drawn(sheets(solids, shape), shades(shadows, bodies.target, shape), self._own_ways(moment, rows))
+        return Drawn(
+            draw_sheets(solids, shape), draw_shades(shadows, bodies.target, shape), self._own_ways(moment, rows)
+        )
 
     def paint(
         self,
@@ -86,7 +139,7 @@ class Painter:
         bodies = moment.bodies
         _shade(picture, drawn.shades, rise_m)
         for body, at, canvas, step in drawn.sheets:
-            hide(canvas, step, rise_m, at)
+            hide_behind(canvas, step, rise_m, at)
             cover = _averaged(_covered(cv2.extractChannel(canvas, 3)), step)
             paint = np.ascontiguousarray(_averaged(canvas, step)[..., :3])
             mine = cover >= 128
@@ -137,7 +190,7 @@ class Painter:
         return np.clip(above / 1.6, 0, 1)
 
 
-def sheets(outlines: Outlines, shape: tuple[int, ...]) -> list[Sheet]:
+def draw_sheets(outlines: Outlines, shape: tuple[int, ...]) -> list[Sheet]:
     """The outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
     if not len(outlines.body):
         return []
@@ -148,7 +201,7 @@ def sheets(outlines: Outlines, shape: tuple[int, ...]) -> list[Sheet]:
     return _sheets(outlines, low, high, steps, colours)
 
 
-def shades(outlines: Outlines, target: np.ndarray, shape: tuple[int, ...]) -> list[Sheet]:
+def draw_shades(outlines: Outlines, target: np.ndarray, shape: tuple[int, ...]) -> list[Sheet]:
     """The shadows of all of a target on one canvas; target: (N,) of each body."""
     if not len(outlines.body):
         return []
@@ -199,7 +252,7 @@ def _shade(picture: np.ndarray, shades: list[Sheet], rise_m: np.ndarray | None) 
         if rise_m is not None:
             cover[rise_m[at] > _HIDDEN_M] = 0
         layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
-    share = 1 - np.arange(256)[:, None] / 255 * (1 - sunlight.SHADE_BGR)
+    share = 1 - np.arange(256)[:, None] / 255 * (1 - SHADE_BGR)
     keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
     for _, at, _, _ in shades:
         # Taken off the layer when done: where boxes overlap nothing is darkened twice.
@@ -208,7 +261,7 @@ def _shade(picture: np.ndarray, shades: list[Sheet], rise_m: np.ndarray | None) 
         layer[at] = 0
 
 
-def hide(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[slice, slice]) -> None:
+def hide_behind(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[slice, slice]) -> None:
     """Take away from a canvas what is behind something higher on the line of sight."""
     if rise_m is None:
         return
@@ -223,7 +276,7 @@ def _drawn_out(
     at: tuple[slice, slice], cover: np.ndarray, paint: np.ndarray, way_px: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
     """What covers a part of a picture, drawn out along a way; the part grows by what the way needs."""
-    kernel = streak(way_px)
+    kernel = streak_kernel(way_px)
     reach = kernel.shape[0] // 2
     part = [(min(reach, one.start), min(reach, size - one.stop)) for one, size in zip(at, shape[:2], strict=True)]
     wide = cv2.copyMakeBorder(
