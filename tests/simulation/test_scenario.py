@@ -17,7 +17,6 @@ from torchvision_dddas.simulation import (
     scenario_toml,
 )
 
-
 SURVEYS = [name for name in scenario_names() if name != "demo"]
 
 
