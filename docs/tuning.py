@@ -10,7 +10,7 @@ from pathlib import Path
 from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.simulation import film_clip
 from torchvision_dddas.tuning.descent import Plan, Step, descend
-from torchvision_dddas.tuning.preparation import prepare
+from torchvision_dddas.tuning.family import prepare
 from torchvision_dddas.tuning.verdict import judge
 
 

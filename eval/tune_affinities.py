@@ -23,9 +23,9 @@ from sequences import identified, idf1
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.tuning.affinities import Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
+from torchvision_dddas.tuning.source_association import Affinities
 
 KNOBS = {
     "dispersion": ("paper.threshold", "paper.lowest_dispersion", "paper.location_cut", "paper.appearance_cut"),

@@ -25,8 +25,8 @@ from torchvision_dddas.evaluation.studies.axes import Range, possible
 from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.evaluation.studies.tried import Tried
 from torchvision_dddas.tuning.descent import Plan, descend
+from torchvision_dddas.tuning.family import Prepared, prepare
 from torchvision_dddas.tuning.parameters import TUNABLE
-from torchvision_dddas.tuning.preparation import Prepared, prepare
 
 MOST = 100_000
 

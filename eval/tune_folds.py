@@ -28,7 +28,7 @@ from torchvision_dddas.evaluation.studies.running import plan, run_study
 from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.masks import Masks
+from torchvision_dddas.tuning.motion import Masks
 from torchvision_dddas.tuning.parameters import Parameters, chosen
 
 MEAN = "mean"

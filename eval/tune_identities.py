@@ -41,10 +41,10 @@ from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.studies import sweep
 from torchvision_dddas.evaluation.studies.axes import Range
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.tuning import identities
+from torchvision_dddas.tuning import tracking
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.identities import Identities
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
+from torchvision_dddas.tuning.tracking import Identities
 
 KNOBS = (
     "track.speed",
@@ -81,7 +81,7 @@ def main() -> None:
     """Print a table, and write it as JSON."""
     given = _arguments()
     torch.set_num_threads(1)
-    identities.LOOKS = given.looks
+    tracking.LOOKS = given.looks
     phases, learned = ([int(phase) for phase in text.split(",")] for text in (given.phases, given.learned))
     skipped = given.skip.split(",")
     with tempfile.TemporaryDirectory() as place:

@@ -35,14 +35,14 @@ from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import people_in, recognizer_of
-from torchvision_dddas.tuning import recognition
+from torchvision_dddas.tuning import people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.types import People
 
 CROPS = "INRIA crops"
-NAMES = tuple(f"people.{name}" for name in recognition.KNOBS)
+NAMES = tuple(f"people.{name}" for name in people.KNOBS)
 MEASURES = ("f1", "precision", "recall", "iou", "doubt", "off")
 
 
@@ -79,7 +79,7 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
     """At most so many pictures of a set, evenly over it; as what is judged and as what is learned from."""
     parameters = Settings().people
     recognizer = recognizer_of(parameters, "onboard")
-    low = parameters.model_copy(update={"threshold": parameters.threshold - recognition.BELOW})
+    low = parameters.model_copy(update={"threshold": parameters.threshold - people.BELOW})
     pictures: list[Picture] = []
     examples: list[Example] = []
     for clip in some:
@@ -96,7 +96,7 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
             truth_px = np.asarray(clip.truth.boxes[frame.number], float).reshape(-1, 4)
             pictures.append(Picture(group, *scan.windows(parts, maps, size, low), size, truth_px))
             held = _Held(maps)
-            one = recognition.scored(frame.image, truth_px, parameters, held)
+            one = people.scored(frame.image, truth_px, parameters, held)
             examples.append(Example(group, len(examples) + 1, one))
             print(f"\r{group}: {len(pictures)} pictures", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
@@ -199,7 +199,7 @@ def main() -> None:
     for name, learned in splits(list(sets)):
         pictures, batch = sets[name][0], [one for other in learned for one in sets[other][1]]
         plan = Plan(steps=options.steps, batch=16, rate=0.05, look_every=10, patience=1000, most_watched=48)
-        done = descend(recognition.family(), Parameters(Settings(), options.parameters), batch, plan)
+        done = descend(people.family(), Parameters(Settings(), options.parameters), batch, plan)
         tuned = done.settings.people
         told = compared(judge(pictures, Settings().people), judge(pictures, tuned))
         cells = {key: f"{a:.3f} → {b:.3f} ({low:+.3f} to {high:+.3f})" for key, (a, b, low, high) in told.items()}

@@ -32,7 +32,7 @@ from torchvision_dddas.evaluation.metrics.segmentation import Pixels
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.masks import Masks
+from torchvision_dddas.tuning.motion import Masks
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 KNOBS = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")

@@ -16,8 +16,7 @@ from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics import paired
-from torchvision_dddas.tuning import costing
-from torchvision_dddas.tuning import preparation as preparing
+from torchvision_dddas.tuning import costing, family
 
 THRESHOLD = "difference.threshold"
 ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
@@ -37,7 +36,7 @@ def asked(clips: Path, *words: str, bowl: Bowl | None = None):
     with pytest.MonkeyPatch.context() as here:
         # Fewer samples than in earnest: what is tested here is no interval.
         here.setattr(paired, "effects", partial(paired.effects, resamples=40, most=40))
-        here.setattr(preparing, "family_of", lambda name: bowl or Bowl(place=math.log(6)))
+        here.setattr(family, "family_of", lambda name: bowl or Bowl(place=math.log(6)))
         return CliRunner().invoke(app, ["tune", str(clips), "--cache", str(clips.parent / "cache"), *words])
 
 

@@ -6,10 +6,10 @@ import torch
 from tests.tuning.test_identities import walk
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tuning.affinities import WINDOWS, Affinities
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import family_of, with_loss
 from torchvision_dddas.tuning.parameters import Parameters
+from torchvision_dddas.tuning.source_association import WINDOWS, Affinities
 
 PAPER = with_parameters(load_config("paper"), {"paper.window": 2})
 

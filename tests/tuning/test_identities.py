@@ -15,11 +15,11 @@ from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking.sequence import follow_table
 from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.tuning import identities
+from torchvision_dddas.tuning import tracking
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Timed, family_of
-from torchvision_dddas.tuning.identities import Identities, together
 from torchvision_dddas.tuning.parameters import Parameters
+from torchvision_dddas.tuning.tracking import Identities, together
 from torchvision_dddas.types import Detections
 
 PERSON = np.array([20.0, 50.0])
@@ -55,7 +55,7 @@ def seen(clip: Clip, place: Path, false: int = 1, miss: float = 0.1, seed: int =
 def test_a_clip_becomes_stretches_of_its_looks_in_order_each_with_a_loss():
     family, settings, told = Identities(interval=5), Settings(), []
     examples = family.examples([walk()], settings, lambda: told.append(1))
-    assert [example.frame for example in examples] == [1, 1 + 5 * identities.LOOKS]
+    assert [example.frame for example in examples] == [1, 1 + 5 * tracking.LOOKS]
     assert [example.clip for example in examples] == ["walk", "walk"]
     assert len(told) == 2
     values = Parameters(settings, ["track.scatter", "track.prior"]).values()

@@ -1,7 +1,7 @@
 import torch
 
 from torchvision_dddas.nn.motion_segmenter import Core
-from torchvision_dddas.tuning.labelling import regions_of
+from torchvision_dddas.tuning.motion import regions_of
 
 
 def core(*boxes: tuple[int, int, int, int, float]) -> Core:

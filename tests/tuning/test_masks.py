@@ -13,7 +13,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
-from torchvision_dddas.tuning.masks import Masks, masks_of, together
+from torchvision_dddas.tuning.motion import Masks, masks_of, together
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 SETTINGS = with_parameters(

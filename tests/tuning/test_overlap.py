@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels, measures
-from torchvision_dddas.tuning.overlap import LOSSES as BY_NAME
-from torchvision_dddas.tuning.overlap import dice_loss, f_loss, focal_loss
+from torchvision_dddas.tuning.motion import LOSSES as BY_NAME
+from torchvision_dddas.tuning.motion import dice_loss, f_loss, focal_loss
 
 TRUTH = torch.zeros(2, 1, 40, 50, dtype=torch.bool)
 TRUTH[:, :, 5:25, 10:30] = True

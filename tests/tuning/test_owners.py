@@ -6,7 +6,7 @@ import numpy as np
 
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.tuning.matching import owned
+from torchvision_dddas.tuning.examples import owned
 from torchvision_dddas.types import DetectionTable
 
 ONE, OTHER, FAR = [100.0, 50.0, 20.0, 50.0], [112.0, 50.0, 20.0, 50.0], [300.0, 50.0, 20.0, 50.0]

@@ -7,8 +7,7 @@ import pytest
 from tests.evaluation.studies.world import filmed, followed, study
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.tuning.family import FAMILIES, family_of
-from torchvision_dddas.tuning.preparation import prepare
+from torchvision_dddas.tuning.family import FAMILIES, family_of, prepare
 
 
 @pytest.fixture(scope="module")

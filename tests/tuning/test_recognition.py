@@ -11,13 +11,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.people.boxes import body
-from torchvision_dddas.tuning import recognition
+from torchvision_dddas.tuning import people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.recognition import Scored, family, scored
+from torchvision_dddas.tuning.people import Scored, family, scored
 
-NAMES = [f"people.{name}" for name in recognition.KNOBS]
+NAMES = [f"people.{name}" for name in people.KNOBS]
 
 
 def picture(seed: int, true: PeopleParameters) -> Scored:

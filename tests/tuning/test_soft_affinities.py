@@ -12,9 +12,16 @@ from torch import Tensor
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.source_tracker import Look, associate
-from torchvision_dddas.tuning.affinities import together, window_of
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.soft_affinities import Windows, link_gains, location_weight, unlikeliness, wrong_links
+from torchvision_dddas.tuning.source_association import (
+    Windows,
+    link_gains,
+    location_weight,
+    together,
+    unlikeliness,
+    window_of,
+    wrong_links,
+)
 
 ALL = ("threshold", "lowest_dispersion", "location_cut", "appearance_cut")
 

@@ -4,7 +4,7 @@ import torch
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.hsv import from_bgr, within
-from torchvision_dddas.tuning.soft_colours import SoftColours, about, confusion
+from torchvision_dddas.tuning.colours import SoftColours, about, confusion
 
 LOW = torch.tensor([[172, 90, 60], [50, 100, 40]])
 HIGH = torch.tensor([[8, 255, 255], [70, 200, 250]])

@@ -12,7 +12,7 @@ from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.scores import Sight, link_scores
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.soft_scores import Looks, unlikeliness
+from torchvision_dddas.tuning.tracking import Looks, unlikeliness
 
 NAMES = [
     "track.speed",

@@ -5,7 +5,7 @@ import torch
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.evaluation.metrics.detection import areas, iou
 from torchvision_dddas.people.boxes import body, probability
-from torchvision_dddas.tuning.soft_people import bodies, doubt, soft_f
+from torchvision_dddas.tuning.people import bodies, doubt, soft_f
 
 KNOBS = {
     f"people.{name}": torch.tensor(float(getattr(PeopleParameters(), name)), dtype=torch.float64)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.tuning.soft_places import Linear, Spread, laid, stepped, surprise
+from torchvision_dddas.tuning.places import Linear, Spread, gauss_newton_step, gaussian_nll, project_to_ground
 
 
 def test_a_spread_is_the_sum_of_what_knobs_add_to_it():
@@ -16,7 +16,7 @@ def test_surprise_is_the_density_of_a_normal_distribution():
 
     covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
     off = np.array([0.7, -1.1])
-    found = surprise(torch.as_tensor(off), torch.as_tensor(covariance))
+    found = gaussian_nll(torch.as_tensor(off), torch.as_tensor(covariance))
     assert float(found) == pytest.approx(-multivariate_normal(np.zeros(2), covariance).logpdf(off))
 
 
@@ -24,7 +24,9 @@ def test_surprise_is_least_where_ellipses_are_as_large_as_errors():
     rng = np.random.default_rng(0)
     off = torch.as_tensor(rng.normal(0, 1.5, (4000, 2)))
     sigmas = torch.linspace(0.5, 4, 71, dtype=torch.float64)
-    mean = [float(surprise(off, (s**2 * torch.eye(2, dtype=torch.float64)).expand(4000, 2, 2)).mean()) for s in sigmas]
+    mean = [
+        float(gaussian_nll(off, (s**2 * torch.eye(2, dtype=torch.float64)).expand(4000, 2, 2)).mean()) for s in sigmas
+    ]
     assert float(sigmas[int(np.argmin(mean))]) == pytest.approx(float(off.std()), abs=0.05)
 
 
@@ -46,7 +48,7 @@ def a_problem(seed: int = 0, landmarks: int = 3, batch: int = 2) -> Linear:
 def test_the_step_is_that_of_weighted_least_squares():
     problem = a_problem()
     pixels, variance = torch.full((2, 6), 0.5, dtype=torch.float64), torch.full((2, 13), 2.0, dtype=torch.float64)
-    step, covariance = stepped(problem, pixels, variance)
+    step, covariance = gauss_newton_step(problem, pixels, variance)
     for b in range(2):
         rows = np.vstack([problem.slopes[b] / np.sqrt(0.5), problem.by_turn[b] / np.sqrt(2.0)])
         wanted = np.concatenate([problem.missing[b] / np.sqrt(0.5), -problem.correction[b] / np.sqrt(2.0)])
@@ -58,10 +60,10 @@ def test_what_is_not_known_has_no_say():
     problem = a_problem()
     problem.known[:, 2] = 0
     pixels, variance = torch.full((2, 6), 0.5, dtype=torch.float64), torch.full((2, 13), 2.0, dtype=torch.float64)
-    before = stepped(problem, pixels, variance)
+    before = gauss_newton_step(problem, pixels, variance)
     variance[:, 2] = 1e4
     problem.correction[:, 2] = 77.0
-    for a, b in zip(before, stepped(problem, pixels, variance), strict=True):
+    for a, b in zip(before, gauss_newton_step(problem, pixels, variance), strict=True):
         assert a.numpy() == pytest.approx(b.numpy())
 
 
@@ -72,7 +74,9 @@ def test_gradients_of_places_by_variances_are_right():
 
     def lost(pixels: torch.Tensor, variance: torch.Tensor, spot: torch.Tensor) -> torch.Tensor:
         # The scale that keeps digits is no part of the result: its slope must not be either.
-        return surprise(*laid(off, by_pose, by_pixel, *stepped(problem, pixels, variance), spot))
+        return gaussian_nll(
+            *project_to_ground(off, by_pose, by_pixel, *gauss_newton_step(problem, pixels, variance), spot)
+        )
 
     assert torch.autograd.gradcheck(lost, start)
 
@@ -80,8 +84,8 @@ def test_gradients_of_places_by_variances_are_right():
 def test_a_picture_among_others_is_as_by_itself():
     problem, pixels = a_problem(), torch.full((2, 6), 0.5, dtype=torch.float64)
     variance = torch.full((2, 13), 2.0, dtype=torch.float64)
-    both = stepped(problem, pixels, variance)
+    both = gauss_newton_step(problem, pixels, variance)
     for b in range(2):
         one = Linear(*(getattr(problem, name)[b : b + 1] for name in Linear.__dataclass_fields__))
-        for whole, part in zip(both, stepped(one, pixels[b : b + 1], variance[b : b + 1]), strict=True):
+        for whole, part in zip(both, gauss_newton_step(one, pixels[b : b + 1], variance[b : b + 1]), strict=True):
             assert part[0].numpy() == pytest.approx(whole[b].numpy())

@@ -5,7 +5,7 @@ import torch
 
 from torchvision_dddas.functional.homography import fit
 from torchvision_dddas.geometry import transfer
-from torchvision_dddas.tuning.soft_registration import TrackedFrame, refitted
+from torchvision_dddas.tuning.registration import TrackedFrame, refitted
 
 TRUE = torch.tensor([[1.01, 0.02, 3.0], [-0.01, 0.99, -2.0], [1e-5, -2e-5, 1.0]], dtype=torch.float64)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.tuning.toys import pieces
-from torchvision_dddas.tuning.split import batch_of, parted, shares
+from torchvision_dddas.tuning.examples import batch_of, parted, shares
 
 
 def test_the_last_part_of_each_clip_is_watched_and_never_learned_from() -> None:

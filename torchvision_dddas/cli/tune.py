@@ -22,7 +22,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.tuning.costing import TimeCost
     from torchvision_dddas.tuning.descent import Descended, Plan, Step
-    from torchvision_dddas.tuning.preparation import Prepared
+    from torchvision_dddas.tuning.family import Prepared
     from torchvision_dddas.tuning.verdict import Side, Verdict
 
 CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
@@ -384,7 +384,7 @@ def _prepared(
     quiet: bool,
 ) -> "Prepared":
     from torchvision_dddas.cli.progress import progress
-    from torchvision_dddas.tuning.preparation import prepare
+    from torchvision_dddas.tuning.family import prepare
 
     with progress("examples", None, quiet) as tick:
         ready = prepare(spec, base, names, holdout, clips, measure, loss, tick)

@@ -1,18 +1,14 @@
-"""The parameters of registration: how far the background's motion is off where masks say that nothing moves.
-
-Examples are points followed from a labelled frame to the next, and the loss is the mean distance, in pixels, by which
-the motion that the pipeline finds misses those on background. What is too wide takes in what moves slowly; what is too
-narrow leaves few points, or a registration that is not believed. Points are looked for anew in each frame, as at a cold
-start: with registration.redetect_frames above 1 the pipeline carries them on.
-"""
+"""The family of registration: how far the background motion is off where masks say that nothing moves."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.config import RegistrationParameters, Settings
@@ -24,10 +20,11 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.functional import affine, homography
+from torchvision_dddas.functional.consensus import transfer_error
+from torchvision_dddas.functional.soft.inliers import Fit, fitted, weights
 from torchvision_dddas.functional.threshold import step
-from torchvision_dddas.tuning.clip_masks import check_masks, labels_at
+from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.soft_registration import TrackedFrame, refitted
 from torchvision_dddas.types import Frame
 
 RANSAC, CHECK = "registration.ransac_px", "registration.forward_backward_px"
@@ -144,3 +141,54 @@ def _lost(pair: Step, parameters: Mapping[str, Tensor], softness: float) -> Tens
     )
     least = max(fixed.min_inlier_share, 1e-3)
     return found.off_px + LOST_PX * step(1 - found.share / least, softness)
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """The points of one frame that were found in the next one, and again on the way back.
+
+    earlier_px, later_px: u, v. missed_px: by how much the way back missed its start. still: which lie on background,
+    out of reach of what moves.
+    """
+
+    earlier_px: Float[Tensor, "N 2"]
+    later_px: Float[Tensor, "N 2"]
+    missed_px: Float[Tensor, " N"]
+    still: Bool[Tensor, " N"]
+
+
+class Refitted(NamedTuple):
+    """later_from_earlier: (3, 3). off_px: mean miss of the points on background. share: of the points that agree."""
+
+    later_from_earlier: Float[Tensor, "3 3"]
+    off_px: Float[Tensor, ""]
+    share: Float[Tensor, ""]
+
+
+def refitted(
+    points: TrackedFrame,
+    guess: Float[Tensor, "3 3"],
+    tolerance_px: Tensor,
+    check_px: Tensor | None,
+    last_share: float,
+    fit: Fit,
+    softness: float = 0.0,
+) -> Refitted:
+    """The motion of the points that agree with a guess and were followed there and back.
+
+    tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None where there is no check.
+    last_share: of the tolerance, which the refit keeps to. fit: as `ops.homography.fit`. softness: a share of each.
+    """
+    earlier, later = points.earlier_px[None], points.later_px[None]
+    trusted = torch.ones_like(earlier[..., 0])
+    if check_px is not None:
+        trusted = weights(points.missed_px[None], check_px, softness)
+    matrix, _ = fitted(earlier, later, trusted, guess[None], last_share * tolerance_px, fit, softness)
+    error_px = transfer_error(matrix, earlier, later)
+    agreeing = weights(error_px, tolerance_px, softness) * trusted
+    # Distances, not their squares: a point on background that was lost on the way has no more say than another.
+    return Refitted(
+        matrix[0],
+        error_px[0, points.still].mean(),
+        agreeing.sum() / trusted.sum().clamp(min=1),
+    )

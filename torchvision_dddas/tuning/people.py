@@ -1,10 +1,4 @@
-"""People by their shape: probabilities that are the shares that are right, boxes that fit, a threshold that pays.
-
-The windows of a picture are scored once by the hard recognizer, down to `BELOW` under the threshold. What is right is
-told by the boxes of the settings that the examples were prepared with. Three losses are added, each with parameters of
-its own: the doubt about scores (probability_slope, probability_even), 1 - IoU of the boxes that are right
-(height_share, width_share, feet_share) and 1 - F1 of the picture (threshold).
-"""
+"""The family of people: calibrated probabilities, boxes that fit, and a threshold that pays."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +6,9 @@ from functools import partial
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
@@ -22,11 +18,11 @@ from torchvision_dddas.evaluation.metrics.detection import areas, iou
 from torchvision_dddas.evaluation.metrics.ranking import SAME, judged
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.functional.threshold import step
 from torchvision_dddas.people import pyramid as scan
-from torchvision_dddas.people.boxes import people_of
+from torchvision_dddas.people.boxes import body_sides, log_odds, people_of
 from torchvision_dddas.people.scorer import WindowScorer
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.soft_people import bodies, doubt, soft_f
 
 MOST = 80
 """Pictures of a clip that are learned from, evenly over it: to score one takes about a second, and all clips' windows
@@ -167,3 +163,38 @@ def _lost(content: Scored, parameters: Mapping[str, Tensor], softness: float) ->
         common, union = areas(bodies(content.window_px, values), content.true_px)
         total = total + (1 - common / union).mean()
     return total
+
+
+Parameters = Mapping[str, Tensor]
+
+
+def bodies(window_px: Float[Tensor, "N 4"], parameters: Parameters) -> Float[Tensor, "N 4"]:
+    """The bodies' boxes in windows, x, y, width, height, by the parameters height_share, width_share and feet_share."""
+    shares = (parameters[f"people.{name}_share"] for name in ("height", "width", "feet"))
+    return torch.stack(body_sides(*window_px.unbind(1), *shares), 1)
+
+
+def doubt(margin: Float[Tensor, " N"], right: Float[Tensor, " N"], parameters: Parameters) -> Float[Tensor, " N"]:
+    """Negative log-likelihood, in nats, of detections of these scores being right (1) or wrong (0).
+
+    By the parameters probability_slope and probability_even: least where probabilities are the shares that are right.
+    """
+    odds = log_odds(margin, parameters["people.probability_slope"], parameters["people.probability_even"])
+    return functional.binary_cross_entropy_with_logits(odds, right, reduction="none")
+
+
+def soft_f(
+    margin: Float[Tensor, " N"], right: Float[Tensor, " N"], people: int, threshold: Tensor, softness: float
+) -> Float[Tensor, ""]:
+    """F1 of the detections of one picture that score above a threshold; 1 where nobody is there and none is found.
+
+    people: how many there truly are. softness: in units of the score; 0: the hard figure.
+    """
+    counts = step(margin - threshold, softness)
+    found = counts.sum()
+    nobody = torch.zeros_like(found) + (people == 0)
+    return (2 * (counts * right).sum() + nobody * _SPARE) / (found + people + nobody * _SPARE)
+
+
+_SPARE = 1.0
+"""Found in a picture without people: the more there are the worse, and none is right."""

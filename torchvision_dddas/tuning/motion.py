@@ -1,27 +1,40 @@
-"""The parameters of motion: masks of labelled frames, and how far soft ones are from them."""
+"""The family of motion segmentation: masks of labelled frames against soft masks."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import cast
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.detection.blobs import filled_hull
+from torchvision_dddas.detection.detector import Loop
+from torchvision_dddas.detection.engine import (
+    EVIDENCE_CAP,
+    EVIDENCE_SCALE,
+    Engine,
+    Foreground,
+    View,
+    Window,
+    load_engine,
+)
+from torchvision_dddas.detection.torch_engine import TorchEngine
+from torchvision_dddas.detection.torch_foreground import TEXTURED, distances, least_of, seen_by_both
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.functional.soft.straight_through import through
-from torchvision_dddas.nn.motion_segmenter import Differences, SoftMotion, Values
-from torchvision_dddas.tuning.clip_masks import check_masks, labels_at
+from torchvision_dddas.nn.motion_segmenter import Core, Differences, Regions, SoftMotion, Values
+from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
-from torchvision_dddas.tuning.labelling import regions_of
-from torchvision_dddas.tuning.overlap import LOSSES, f_loss
-from torchvision_dddas.tuning.recorded_clips import Recorded, differences_of, recorded
+from torchvision_dddas.types import Registration, Scene
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -193,3 +206,181 @@ def _as_drawn(frame: Labelled, mask: np.ndarray, freer_mask: np.ndarray, freer: 
 def family() -> Masks:
     """As `tuning.family` asks for it."""
     return Masks()
+
+
+# What is further from any region than this makes no part of it when the core grows a little, px.
+_FAR_PX = 40.0
+
+
+def regions_of(core: Core, hull: bool, reach: float = 0.0) -> Regions:
+    """What hangs together (8 neighbours) in each mask of a batch, whether it passes any gate or not.
+
+    hull: fill convex hulls. reach: pixels that miss the threshold by less belong to the nearest region, or where there
+    is none make one of their own; in the unit of the margin.
+    """
+    margins = core.margin.detach()[:, 0].cpu().numpy()
+    near, filled = np.zeros((2, *margins.shape), np.int64)
+    counts = [_label_regions(margin, hull, reach, *maps) for margin, *maps in zip(margins, near, filled, strict=True)]
+    device = core.mask.device
+    return Regions(
+        torch.from_numpy(near)[:, None].to(device), torch.from_numpy(filled)[:, None].to(device), max(counts)
+    )
+
+
+def _label_regions(margin: np.ndarray, hull: bool, reach: float, near: np.ndarray, filled: np.ndarray) -> int:
+    """Writes the labels of one picture; returns how many there are."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats((margin > 0).astype(np.uint8), ltype=cv2.CV_32S)
+    near[:] = parts
+    # Large ones last: what lies in a large hull is there with it, though it be a speck of its own.
+    for label in 1 + np.argsort(stats[1:, cv2.CC_STAT_AREA], kind="stable"):
+        x, y, width, height = (int(v) for v in stats[label, :4])
+        window = np.s_[y : y + height, x : x + width]
+        region = parts[window] == label
+        filled[window][filled_hull(region) if hull else region] = label
+    if reach <= 0:
+        return count - 1
+    weak, weak_parts = cv2.connectedComponents((margin > -reach).astype(np.uint8), ltype=cv2.CV_32S)
+    strong = np.zeros(weak, bool)
+    strong[weak_parts[parts > 0]] = True
+    strong[0] = False
+    if count > 1:
+        away, nearest = cv2.distanceTransformWithLabels(
+            (parts == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        of_place = np.zeros(int(nearest.max()) + 1, np.int64)
+        of_place[nearest[parts > 0]] = parts[parts > 0]
+        joins = strong[weak_parts] & (parts == 0) & (away < _FAR_PX)
+        near[joins] = of_place[nearest[joins]]
+    numbers = np.zeros(weak, np.int64)
+    alone = np.flatnonzero(~strong[1:]) + 1
+    numbers[alone] = count + np.arange(len(alone))
+    lone = numbers[weak_parts]
+    near[lone > 0] = lone[lone > 0]
+    return count - 1 + len(alone)
+
+
+# A frame in which nothing moves and nothing is found is right: this many pixels are right in any.
+_SPARE_PX = 1.0
+
+
+def f_loss(
+    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
+) -> Float[Tensor, "B"]:
+    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11)."""
+    right, found, true = _sums(mask, truth, known)
+    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
+
+
+def dice_loss(
+    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
+) -> Float[Tensor, "B"]:
+    """As `f_loss` with squares of the found mask (Milletari et al. 2016): doubtful pixels cost less."""
+    right, found, true = _sums(mask, truth, known, power=2)
+    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
+
+
+def focal_loss(
+    mask: Float[Tensor, "B 1 H W"],
+    truth: Bool[Tensor, "B 1 H W"],
+    known: Bool[Tensor, "B 1 H W"],
+    focus: float = 2.0,
+    movers: float = 0.75,
+) -> Float[Tensor, "B"]:
+    """Mean of -(1 - p)^focus ln p, p what the mask gives the truth (Lin et al. 2017). movers: their weight."""
+    right = torch.where(truth, mask, 1 - mask).clamp(min=1e-6)
+    weight = torch.where(truth, movers, 1 - movers) * known
+    return (-((1 - right) ** focus) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
+
+
+LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "f": f_loss,
+    "dice": dice_loss,
+    "focal": focal_loss,
+}
+"""By the names that `dddas tune --loss` takes; the first one unless said."""
+
+
+def _sums(mask: Tensor, truth: Tensor, known: Tensor, power: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """Per mask: what is found and true, what is found, what is true."""
+    seen = mask * known
+    right = (seen * truth).sum((1, 2, 3))
+    return right, (seen**power).sum((1, 2, 3)), (truth & known).sum((1, 2, 3)).to(mask.dtype)
+
+
+_NUMBER = "number of the frame"
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A frame and what the hard pipeline made of it. window: None where it had none. mask: (H, W) bool, its targets."""
+
+    frame: int
+    window: Window | None
+    mask: np.ndarray
+
+
+def recorded(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[Recorded]:
+    """The wanted frames of a clip, in order. Raises InputError as `dddas detect` does."""
+    source = opened(clip)
+    engine = _Recorder(load_engine("onboard", settings), wanted)
+    loop = Loop(engine, settings, source.rate_hz)
+
+    def scenes() -> Iterator[Scene]:
+        for frame in source:
+            engine.number = frame.number
+            yield from loop.feed(frame)
+        yield from loop.end(source.last)
+
+    for scene in scenes():
+        number = scene.frame.number
+        if number in wanted:
+            yield Recorded(number, engine.windows.pop(number, None), scene.mask > 0)
+
+
+class _Recorder:
+    """A back end that remembers the windows of wanted frames."""
+
+    def __init__(self, engine: Engine, wanted: Set[int]) -> None:
+        self.name, self.number = engine.name, 0
+        self.windows: dict[int, Window] = {}
+        self._vision, self._wanted = engine, wanted
+
+    @property
+    def parameters(self) -> Settings:
+        return self._vision.parameters
+
+    @parameters.setter
+    def parameters(self, settings: Settings) -> None:
+        self._vision.parameters = settings
+
+    def prepare(self, image: np.ndarray) -> View:
+        view = self._vision.prepare(image)
+        view.kept[_NUMBER] = self.number
+        return view
+
+    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
+        return self._vision.register(pairs)
+
+    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+        for window in windows:
+            if (number := window.reference.kept[_NUMBER]) in self._wanted:
+                self.windows[number] = window
+        return self._vision.foreground(windows)
+
+
+@torch.inference_mode()
+def differences_of(window: Window, settings: Settings) -> Differences:
+    """A window as far as no tunable parameter has a say, on the CPU; a batch of one."""
+    grey, warped, seen, texture = TorchEngine(settings, "cpu").registered([window])
+    parameters = settings.difference
+    distance = distances(window, grey, warped, parameters)
+    least = [least_of(pair, distance, warped) for pair in window.near]
+    both = [seen_by_both(seen[a], seen[b], grey.shape[-1]) for a, b in window.near]
+    return Differences(
+        torch.cat(least, 1).clone(),
+        torch.cat(both, 1),
+        texture.to(torch.uint8),
+        texture > TEXTURED,
+        EVIDENCE_SCALE,
+        EVIDENCE_CAP,
+    )
