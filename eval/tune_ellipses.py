@@ -31,10 +31,11 @@ from geo_scene import CAMERA, Case, Scenes, scenes
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.tuning.aerial_examples import Seen, kept, look_at
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.places import Seen, family, kept, look_at
+from torchvision_dddas.tuning.places import family
 from torchvision_dddas.types import Flight, LandmarkObservations
 
 TUNED = (

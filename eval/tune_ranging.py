@@ -22,8 +22,8 @@ from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.evaluation.metrics.metres import inside
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.ground_examples import KNOBS, sighted
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.place_examples import KNOBS, sighted
 from torchvision_dddas.tuning.places import family
 from torchvision_dddas.types import Camera
 

@@ -14,7 +14,8 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.tuning.places import Look, family
+from torchvision_dddas.tuning.aerial_examples import Look
+from torchvision_dddas.tuning.places import family
 
 
 def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:

@@ -9,10 +9,11 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Registrar
 from torchvision_dddas.geo.plane import ground_points
 from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.tuning.aerial_examples import SPREADS, Seen, kept, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.places import SPREADS, UNPLACED, Seen, family, kept, look_at, of_settings, only_noise
+from torchvision_dddas.tuning.places import UNPLACED, family
 
 HFOV = float(np.radians(70.0))
 

@@ -14,8 +14,8 @@ from torchvision_dddas.evaluation.metrics.truth import Positions
 from torchvision_dddas.geo.ranging import sight
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.ground_examples import KNOBS, sighted, sightings_of
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.place_examples import KNOBS, sighted, sightings_of
 from torchvision_dddas.tuning.places import UNPLACED, family
 from torchvision_dddas.types import Camera
 

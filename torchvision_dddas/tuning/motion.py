@@ -63,6 +63,14 @@ class Labelled:
     settings: Settings
 
 
+def f_loss(
+    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
+) -> Float[Tensor, "B"]:
+    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11)."""
+    right, found, true = _sums(mask, truth, known)
+    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
+
+
 class Masks:
     """Implements `Family` for the parameters of motion.
 
@@ -177,6 +185,15 @@ def _examples(clip: Clip, settings: Settings, after: bool, tick: Tick) -> list[E
     return found
 
 
+@dataclass(frozen=True)
+class Recorded:
+    """A frame and what the hard pipeline made of it. window: None where it had none. mask: (H, W) bool, its targets."""
+
+    frame: int
+    window: Window | None
+    mask: np.ndarray
+
+
 def _true(clip: Clip) -> tuple[Set[int], Callable[[Recorded], np.ndarray]]:
     """Which frames of a clip are learned from, and their labels: 0 nothing moves, -1 unknown."""
     truth = clip.truth
@@ -263,14 +280,6 @@ def _label_regions(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
 _SPARE_PX = 1.0
 
 
-def f_loss(
-    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
-) -> Float[Tensor, "B"]:
-    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11)."""
-    right, found, true = _sums(mask, truth, known)
-    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
-
-
 def dice_loss(
     mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
 ) -> Float[Tensor, "B"]:
@@ -292,6 +301,13 @@ def focal_loss(
     return (-((1 - right) ** focus) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
 
 
+def _sums(mask: Tensor, truth: Tensor, known: Tensor, power: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    """Per mask: what is found and true, what is found, what is true."""
+    seen = mask * known
+    right = (seen * truth).sum((1, 2, 3))
+    return right, (seen**power).sum((1, 2, 3)), (truth & known).sum((1, 2, 3)).to(mask.dtype)
+
+
 LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
     "f": f_loss,
     "dice": dice_loss,
@@ -300,23 +316,7 @@ LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 """By the names that `dddas tune --loss` takes; the first one unless said."""
 
 
-def _sums(mask: Tensor, truth: Tensor, known: Tensor, power: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-    """Per mask: what is found and true, what is found, what is true."""
-    seen = mask * known
-    right = (seen * truth).sum((1, 2, 3))
-    return right, (seen**power).sum((1, 2, 3)), (truth & known).sum((1, 2, 3)).to(mask.dtype)
-
-
 _NUMBER = "number of the frame"
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """A frame and what the hard pipeline made of it. window: None where it had none. mask: (H, W) bool, its targets."""
-
-    frame: int
-    window: Window | None
-    mask: np.ndarray
 
 
 def recorded(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[Recorded]:

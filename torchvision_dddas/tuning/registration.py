@@ -37,6 +37,20 @@ _FEWEST = 8
 
 
 @dataclass(frozen=True)
+class TrackedFrame:
+    """The points of one frame that were found in the next one, and again on the way back.
+
+    earlier_px, later_px: u, v. missed_px: by how much the way back missed its start. still: which lie on background,
+    out of reach of what moves.
+    """
+
+    earlier_px: Float[Tensor, "N 2"]
+    later_px: Float[Tensor, "N 2"]
+    missed_px: Float[Tensor, " N"]
+    still: Bool[Tensor, " N"]
+
+
+@dataclass(frozen=True)
 class Step:
     """A pair of frames: its points, and the parameters of what is not tuned."""
 
@@ -141,20 +155,6 @@ def _lost(pair: Step, parameters: Mapping[str, Tensor], softness: float) -> Tens
     )
     least = max(fixed.min_inlier_share, 1e-3)
     return found.off_px + LOST_PX * step(1 - found.share / least, softness)
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """The points of one frame that were found in the next one, and again on the way back.
-
-    earlier_px, later_px: u, v. missed_px: by how much the way back missed its start. still: which lie on background,
-    out of reach of what moves.
-    """
-
-    earlier_px: Float[Tensor, "N 2"]
-    later_px: Float[Tensor, "N 2"]
-    missed_px: Float[Tensor, " N"]
-    still: Bool[Tensor, " N"]
 
 
 class Refitted(NamedTuple):

@@ -123,6 +123,27 @@ def family() -> Affinities:
     return Affinities()
 
 
+@dataclass(frozen=True)
+class Windows:
+    """W windows of two frames, the newer one's targets (N) as rows, the older one's (M) as columns; float64.
+
+    similarity, alternative: with a dummy first on both axes, as `targets.paper.affinity` and
+    `targets.gating.alternatives` have them, of both features. now, before: who is there. true: the true links.
+    joined_at: of each two targets of the newer and the older frame, P places each, as `targets.dispersion` has it.
+    there: who is. speaks: which of the frames has a say in the dispersion. pictured: whether appearance is known.
+    """
+
+    similarity: Float[Tensor, "W 2 N1 M1"]
+    alternative: Float[Tensor, "W 2 N1 M1"]
+    now: Bool[Tensor, "W N"]
+    before: Bool[Tensor, "W M"]
+    true: Bool[Tensor, "W N M"]
+    joined_at: Float[Tensor, "W 2 2 P P"]
+    there: Bool[Tensor, "W 2 P"]
+    speaks: Bool[Tensor, "W 2"]
+    pictured: Bool[Tensor, "W"]
+
+
 def together(windows: Sequence[Mapping[str, np.ndarray]], device: torch.device | str = "cpu") -> Windows:
     """Windows as one batch: those with fewer targets are filled up with nobody."""
     parts = {}
@@ -192,27 +213,6 @@ _ROUNDS = 10
 
 LOCATION, APPEARANCE = 0, 1
 """Places of the two features on their axis."""
-
-
-@dataclass(frozen=True)
-class Windows:
-    """W windows of two frames, the newer one's targets (N) as rows, the older one's (M) as columns; float64.
-
-    similarity, alternative: with a dummy first on both axes, as `targets.paper.affinity` and
-    `targets.gating.alternatives` have them, of both features. now, before: who is there. true: the true links.
-    joined_at: of each two targets of the newer and the older frame, P places each, as `targets.dispersion` has it.
-    there: who is. speaks: which of the frames has a say in the dispersion. pictured: whether appearance is known.
-    """
-
-    similarity: Float[Tensor, "W 2 N1 M1"]
-    alternative: Float[Tensor, "W 2 N1 M1"]
-    now: Bool[Tensor, "W N"]
-    before: Bool[Tensor, "W M"]
-    true: Bool[Tensor, "W N M"]
-    joined_at: Float[Tensor, "W 2 2 P P"]
-    there: Bool[Tensor, "W 2 P"]
-    speaks: Bool[Tensor, "W 2"]
-    pictured: Bool[Tensor, "W"]
 
 
 def unlikeliness(parameters: PaperParameters, windows: Windows, softness: float) -> Float[Tensor, "W"]:

@@ -119,6 +119,34 @@ def family() -> Identities:
     return Identities()
 
 
+@dataclass(frozen=True)
+class Looks:
+    """Stretches of clips, T looks each, in which box n is always target n; float64 but for what is yes or no.
+
+    frame: numbers. interval: usual distance of the looks. size: width and height of the picture. usual, known: of the
+    pace. births, doubt: as `Sight` has them. box_px: x, y, width, height, any where none is there. there: whether a
+    target is seen. certain: with the score 1. begins: with a score that may begin a track. step: homographies from the
+    look before. likeness: of tracks (rows) and boxes, NaN where unknown. visible: shares of the boxes. own: whether the
+    boxes are of moving targets that were found in the clip.
+    """
+
+    frame: Float[Tensor, "B T"]
+    interval: Float[Tensor, "B"]
+    size: Float[Tensor, "B 2"]
+    usual: Float[Tensor, "B T"]
+    known: Float[Tensor, "B T"]
+    births: Float[Tensor, "B T"]
+    doubt: Float[Tensor, "B T"]
+    box_px: Float[Tensor, "B T N 4"]
+    there: Bool[Tensor, "B T N"]
+    certain: Bool[Tensor, "B T N"]
+    begins: Bool[Tensor, "B T N"]
+    step: Float[Tensor, "B T 3 3"]
+    likeness: Float[Tensor, "B T N N"]
+    visible: Float[Tensor, "B T N"]
+    own: Bool[Tensor, "B"]
+
+
 def together(stretches: Sequence[Stretch], device: torch.device | str = "cpu") -> Looks:
     """Stretches as one batch: those with fewer looks or targets are filled up with looks at which nobody is."""
     shapes = [stretch.looks["there"].shape for stretch in stretches]
@@ -259,34 +287,6 @@ def _stacked(looks: Sequence[_Look], birth_score: float) -> dict[str, np.ndarray
 
 # Of messages a look; more change the loss by less than a hundredth where targets crowd.
 _ROUNDS = 10
-
-
-@dataclass(frozen=True)
-class Looks:
-    """Stretches of clips, T looks each, in which box n is always target n; float64 but for what is yes or no.
-
-    frame: numbers. interval: usual distance of the looks. size: width and height of the picture. usual, known: of the
-    pace. births, doubt: as `Sight` has them. box_px: x, y, width, height, any where none is there. there: whether a
-    target is seen. certain: with the score 1. begins: with a score that may begin a track. step: homographies from the
-    look before. likeness: of tracks (rows) and boxes, NaN where unknown. visible: shares of the boxes. own: whether the
-    boxes are of moving targets that were found in the clip.
-    """
-
-    frame: Float[Tensor, "B T"]
-    interval: Float[Tensor, "B"]
-    size: Float[Tensor, "B 2"]
-    usual: Float[Tensor, "B T"]
-    known: Float[Tensor, "B T"]
-    births: Float[Tensor, "B T"]
-    doubt: Float[Tensor, "B T"]
-    box_px: Float[Tensor, "B T N 4"]
-    there: Bool[Tensor, "B T N"]
-    certain: Bool[Tensor, "B T N"]
-    begins: Bool[Tensor, "B T N"]
-    step: Float[Tensor, "B T 3 3"]
-    likeness: Float[Tensor, "B T N N"]
-    visible: Float[Tensor, "B T N"]
-    own: Bool[Tensor, "B"]
 
 
 @dataclass
