@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from torchvision_dddas.config import GroundParameters
-from torchvision_dddas.geo.fusion import associate, together
-from torchvision_dddas.geo.ranging import sight
+from torchvision_dddas.geo.fusion import associate, estimate_places
+from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.types import Camera, Poses, Sightings
 
 KNOBS = GroundParameters()
@@ -48,7 +48,7 @@ def look(people: np.ndarray, tall: np.ndarray, turn: float, rng: np.random.Gener
     u, feet, height = u + moved[0], feet + moved[1], height + moved[2]
     box = np.stack([u + 0.5 - 0.2 * height, feet + 0.5 - height, 0.4 * height, height], axis=1)
     poses = Poses(np.tile(place, (n, 1)), np.full(n, known.heading_rad), np.zeros(n))
-    return sight(box, np.zeros(n, bool), known, poses, poses.place, KNOBS)
+    return range_people(box, np.zeros(n, bool), known, poses, poses.place, KNOBS)
 
 
 def scene(vehicles: int, people: int, rng: np.random.Generator) -> tuple[list[float], ...]:
@@ -56,7 +56,7 @@ def scene(vehicles: int, people: int, rng: np.random.Generator) -> tuple[list[fl
     where, tall = rng.normal(0, 4, (people, 2)), KNOBS.body_height_m + rng.normal(0, KNOBS.body_height_sigma_m, people)
     team = [look(where, tall, 2 * np.pi * v / vehicles + rng.normal(0, 0.3), rng) for v in range(vehicles)]
     team = [seen for seen in team if (seen.by != "bearing").all()]
-    fused, joint, _ = together(team, np.tile(np.arange(people)[:, None], len(team)))
+    fused, joint, _ = estimate_places(team, np.tile(np.arange(people)[:, None], len(team)))
     own, off = joint[np.arange(people), :, np.arange(people)], fused - where
     inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(own), off) < 5.991
     groups = [row[row >= 0] for row in associate(team)]

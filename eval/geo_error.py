@@ -44,10 +44,10 @@ from geo_scene import (
 )
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.plane import absolute, ground_points, homography_fix
-from torchvision_dddas.geo.pose_estimation import expected_of, fit_pose, prior_of
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import absolute_covariance, fix_by_homography, locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.pose_estimation import fit_pose, independent_expectation, pose_prior
 from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import Fix, Flight, LandmarkObservations
 
@@ -116,7 +116,7 @@ def run(batch: Scenes, method: str) -> Found:
     for s in range(count):
         marks, flight = marks_of(batch, s), flight_of(batch.axes[s], batch.place[s])
         degrees = (lonlat(marks.east_north_m, ORIGIN), ORIGIN) if method == "paper" else None
-        fix = Registrar(CAMERA, settings, solver).step(1, 0.0, flight, marks, degrees)
+        fix = Georeferencer(CAMERA, settings, solver).update(1, 0.0, flight, marks, degrees)
         off[s], inside[s] = judged(fix, batch.targets_px[s], batch.true_targets[s] + batch.common_m[s], batch.case)
         flagged[s] = any(state != "used" for state in fix.state)
         states.append(fix.state)
@@ -127,7 +127,7 @@ def judged(fix: Fix, targets_px: np.ndarray, where_m: np.ndarray, case: Case) ->
     """How far each target is off, (T, 2), and whether its ellipse holds that, (T,); NaN where nothing is said."""
     if fix.by == "":
         return np.full(targets_px.shape, np.nan), np.full(len(targets_px), np.nan)
-    found, covariance = ground_points(fix, CAMERA, targets_px, case.pixel_sigma)
+    found, covariance = locate_pixels(fix, CAMERA, targets_px, case.pixel_sigma)
     off = found - where_m
     known = np.isfinite(off).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     inside = np.full(len(off), np.nan)
@@ -169,14 +169,14 @@ def shared(case: Case, seeds: int) -> dict[str, object]:
     batch, settings = scenes(case, seeds, TARGETS), with_parameters(Settings(), {"aerial.correlation_s": 0.0})
     off, inside = {"relative": [], "absolute": []}, {"relative": [], "absolute": []}
     for s in range(seeds):
-        fix = Registrar(CAMERA, settings, load_solver("onboard")).step(
+        fix = Georeferencer(CAMERA, settings, load_solver("onboard")).update(
             1, 0.0, flight_of(batch.axes[s], batch.place[s]), marks_of(batch, s)
         )
-        found, covariance = ground_points(fix, CAMERA, batch.targets_px[s], case.pixel_sigma)
+        found, covariance = locate_pixels(fix, CAMERA, batch.targets_px[s], case.pixel_sigma)
         truth = batch.true_targets[s]
         for kind, where, spread in (
             ("relative", truth + batch.common_m[s], covariance),
-            ("absolute", truth, absolute(covariance, case.common_m)),
+            ("absolute", truth, absolute_covariance(covariance, case.common_m)),
         ):
             away = found - where
             off[kind].append(np.linalg.norm(away, axis=1))
@@ -309,11 +309,11 @@ def blind(batch: Scenes, method: str) -> Found:
     off, inside = np.full(batch.targets_px.shape, np.nan), np.full(batch.targets_px.shape[:2], np.nan)
     for s in range(len(batch)):
         if method == "homography":
-            fix = homography_fix(1, marks_of(batch, s), solver, settings.aerial.least_spread)
+            fix = fix_by_homography(1, marks_of(batch, s), solver, settings.aerial.least_spread)
         else:
-            prior = prior_of(flight_of(batch.axes[s], batch.place[s]), CAMERA, settings.aerial)
+            prior = pose_prior(flight_of(batch.axes[s], batch.place[s]), CAMERA, settings.aerial)
             assert prior is not None
-            solution = fit_pose(marks_of(batch, s), CAMERA, expected_of(prior, batch.sigma_m[s]))
+            solution = fit_pose(marks_of(batch, s), CAMERA, independent_expectation(prior, batch.sigma_m[s]))
             fix = Fix(1, "") if solution is None else Fix(1, "pose", solution.pose, solution.covariance[:7, :7])
         off[s], inside[s] = judged(fix, batch.targets_px[s], batch.true_targets[s] + batch.common_m[s], batch.case)
     return Found(off, inside, np.zeros(len(off), bool), [])
@@ -331,10 +331,10 @@ def over_time(
         settings = with_parameters(settings_for("pose"), {"aerial.correlation_s": alike_s})
         far, inside = np.full((2, seeds, frames, batches[0].targets_px.shape[1]), np.nan)
         for s in range(seeds):
-            registrar = Registrar(CAMERA, settings, alone)
+            registrar = Georeferencer(CAMERA, settings, alone)
             for f, batch in enumerate(batches):
                 flight = flight_of(batch.axes[s], batch.place[s])
-                fix = registrar.step(f + 1, f / rate_hz, flight, marks_of(batch, s))
+                fix = registrar.update(f + 1, f / rate_hz, flight, marks_of(batch, s))
                 off, inside[s, f] = judged(fix, batch.targets_px[s], batch.true_targets[s], case)
                 far[s, f] = np.linalg.norm(off, axis=1)
         late = slice(frames // 2, None)

@@ -28,9 +28,9 @@ from geo_scene import ALTITUDE_SIGMA, FOCAL_SIGMA, HEADING_SIGMA, POSITION_SIGMA
 from ranging_error import SIZES, People, detected, fitted, identities, read_truth, tsai
 
 from torchvision_dddas.config import GroundParameters, Settings, with_parameters
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.plane import ground_points
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.types import Camera, Flight, LandmarkObservations
 
 RATE_HZ = {"PETS09-S2L1": 7.0, "TUD-Stadtmitte": 25.0}
@@ -116,21 +116,21 @@ def follow(
     """Errors in metres of all who are no landmarks, NaN where nothing was said, and whether ellipses hold them."""
     mode, has_telemetry, alike_s = WAYS[way]
     settings = with_parameters(Settings(), {"aerial.mode": mode, "aerial.correlation_s": alike_s})
-    registrar, far, inside = Registrar(camera, settings, load_solver("onboard")), [], []
+    registrar, far, inside = Georeferencer(camera, settings, load_solver("onboard")), [], []
     for number, some in rows.items():
         n = len(some)
         marks = LandmarkObservations(
             crowd.who[some], crowd.foot_px[some], crowd.east_north_m[some], np.full(n, SIGMA_M), crowd.sigma_px[some],
             np.zeros(n),
         )  # fmt: skip
-        fix = registrar.step(number, number / rate_hz, flight if has_telemetry else None, marks, None)
+        fix = registrar.update(number, number / rate_hz, flight if has_telemetry else None, marks, None)
         others = np.setdiff1d(np.flatnonzero(crowd.frame == number), some)
         for one in others:
             if fix.by == "":
                 far.append(np.nan)
                 inside.append(np.nan)
                 continue
-            place, covariance = ground_points(fix, camera, crowd.foot_px[one, None], float(crowd.sigma_px[one]))
+            place, covariance = locate_pixels(fix, camera, crowd.foot_px[one, None], float(crowd.sigma_px[one]))
             off = place[0] - crowd.east_north_m[one]
             far.append(float(np.linalg.norm(off)))
             sound = np.isfinite(covariance).all() and np.isfinite(off).all()

@@ -26,8 +26,8 @@ import report
 from geo_error import flight_of, marks_of, settings_for
 from geo_scene import CAMERA, Case, scenes
 
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geometry import east_north, lonlat
 
 ORIGIN = (-110.95, 32.23)
@@ -104,9 +104,9 @@ def poses(n: int) -> Callable[[], object]:
     solver = load_solver("onboard")
 
     def run() -> None:
-        registrar = Registrar(CAMERA, settings_for("pose"), solver)
+        registrar = Georeferencer(CAMERA, settings_for("pose"), solver)
         for number, (flight, marks) in enumerate(frames, 1):
-            registrar.step(number, number / 10, flight, marks)
+            registrar.update(number, number / 10, flight, marks)
 
     return run
 

@@ -25,7 +25,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.evaluation.metrics.detection import iou
-from torchvision_dddas.geo.ranging import sight, touches_border
+from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.types import Camera, Poses, Sightings
 
@@ -147,7 +147,7 @@ def seen(people: People, camera: Camera, parameters: GroundParameters) -> Sighti
     """What ranging says of them."""
     n = len(people.frame)
     poses = Poses(np.tile(camera.place, (n, 1)), np.full(n, camera.heading_rad), np.full(n, camera.pitch_rad))
-    return sight(people.box_px, people.cut, camera, poses, poses.place, parameters)
+    return range_people(people.box_px, people.cut, camera, poses, poses.place, parameters)
 
 
 def body_height(people: People, camera: Camera, use: np.ndarray) -> float:

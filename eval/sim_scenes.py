@@ -17,9 +17,10 @@ from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.detection.gates import pixels_per_metre
 from torchvision_dddas.evaluation.metrics.crowd_frames import shown
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-from torchvision_dddas.geo import Locator, Site, Targets, Watch, gathered, local, site_of
-from torchvision_dddas.geo.elevation import about
-from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.terrain import shift_origin
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
 from torchvision_dddas.simulation.drawing import view_from_pose
 from torchvision_dddas.simulation.sensor_errors import SIGMAS_95, Receivers
@@ -86,7 +87,7 @@ class Eye:
         self._settings = usual(source, way.settings)
         self._kept = way.landmarks or tuple(range(len(source.names)))
         self._error_m = _errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
-        self._watch: Watch | None = None
+        self._watch: LandmarkWatch | None = None
         origin = source.scenario.world.origin_deg
         self._local = partial(geometry.east_north, origin_deg=origin)
 
@@ -100,23 +101,23 @@ class Eye:
         if self._watch is None:
             self._watch = self._made(site)
         else:
-            self._watch.locator.learn(site)
+            self._watch.locator.set_site(site)
         locator = self._watch.locator
-        watched = gathered(self._watch.step(scene), locator, self._source.rate_hz)
+        watched = group_crowds(self._watch.update(scene), locator, self._source.rate_hz)
         found = watched.scene.detections
         rows = np.arange(len(found))
         targets = Targets(
             found.box_px, rows + 1, np.zeros(len(found), bool), found.score.clip(0, 1), bodies=True,
             middle_px=found.middle_px if self._settings.crowds.join_m else None,
         )  # fmt: skip
-        grounded = locator.ground(watched.look, targets)
+        grounded = locator.locate_targets(watched.fixed, targets)
         tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
         scorer.feed(
             FrameResult(TrackedFrame(scene.frame.number, scene.frame, found, tracks), grounded, watched.sighted_by)
         )
-        return math.nan if truth is None else self._astray(truth, locator, watched.look.fix)
+        return math.nan if truth is None else self._astray(truth, locator, watched.fixed.fix)
 
-    def _astray(self, truth: Truth, locator: Locator, fix: Fix) -> float:
+    def _astray(self, truth: Truth, locator: AerialLocator, fix: Fix) -> float:
         bodies = truth.bodies
         crowds = [bodies.target == number for number in np.unique(bodies.target[bodies.kind == "person"])]
         middle = np.array([bodies.place_m[rows].mean(axis=0) for rows in crowds])
@@ -127,36 +128,40 @@ class Eye:
             return math.nan
         origin = locator.site.origin_deg
         assert origin is not None
-        laid = self._local(geometry.lonlat(locator.places(fix, pixel[inside]), origin))
+        laid = self._local(geometry.lonlat(locator.ground_places(fix, pixel[inside]), origin))
         return float(np.linalg.norm(laid - middle[inside, :2], axis=1).mean())
 
     def scorer(self) -> CrowdScorer:
         """A new one in the truth's metres."""
         return CrowdScorer(self._local)
 
-    def _made(self, site: Site) -> Watch:
+    def _made(self, site: Site) -> LandmarkWatch:
         source = self._source
-        locator = Locator(site, source.camera, self._settings, load_solver("onboard"), source.rate_hz, focal_known=True)
+        locator = AerialLocator.from_site(
+            site, source.camera, self._settings, load_solver("onboard"), source.rate_hz, focal_known=True
+        )
         colours = source.colours
         rows = np.array(self._kept)
         some = Colours(tuple(colours.names[k] for k in rows), colours.low[rows], colours.high[rows])
-        return Watch(locator, some, self._finder)
+        return LandmarkWatch(locator, some, self._finder)
 
     def _site(self) -> Site:
         """What was reported until now, in the metres of the first report, with the ground's elevation."""
         reports = self._reports()
         telemetry = self._source.telemetry()
         if self._watch is None:
-            site = site_of(reports, telemetry)
+            site = build_site(reports, telemetry)
             return replace(site, elevation=self._elevation(site), sun_rad=self._source.sun_rad)
         site = self._watch.locator.site
         assert site.origin_deg is not None
-        return replace(site, landmarks=local(reports, site.origin_deg), telemetry=local(telemetry, site.origin_deg))
+        return replace(
+            site, landmarks=to_local(reports, site.origin_deg), telemetry=to_local(telemetry, site.origin_deg)
+        )
 
     def _elevation(self, site: Site) -> Elevation:
         elevation, origin = self._source.elevation, site.origin_deg
         assert origin is not None
-        return about(elevation, self._local(np.array([origin]))[0])
+        return shift_origin(elevation, self._local(np.array([origin]))[0])
 
     def _reports(self) -> Landmarks:
         """Those of the landmarks in use, with the receivers' errors; without planned waypoints."""

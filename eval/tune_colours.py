@@ -25,8 +25,8 @@ import report
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics.segmentation import ratio
-from torchvision_dddas.geo.colour_calibration import hsv_of, hue_apart, pooled, ranges_of, standing_out
-from torchvision_dddas.geo.opencv_colours import OpenCVColourFinder
+from torchvision_dddas.geo.colour_calibration import build_ranges, find_samples, hue_difference, pool_samples, to_hsv
+from torchvision_dddas.geo.colours import OpenCVColourFinder
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Fault, Scenario, Shot, Simulator
 from torchvision_dddas.simulation.ground_vehicles import marker_plates
 from torchvision_dddas.tuning.colours import fit_colours
@@ -86,13 +86,13 @@ def ways(learned: Sequence[Seen], steps: int) -> dict[str, Colours]:
 
 def unlabelled(pictures: Sequence[np.ndarray], own: Colours) -> Colours | None:
     """What `dddas colours --count 4` finds, in the order of the team; None where a colour does not stand out."""
-    hsv, least = [hsv_of(picture) for picture in pictures], load_config().landmarks.least_area_px
-    groups = pooled([standing_out(one, least, k) for k, one in enumerate(hsv)], TEAM)
+    hsv, least = [to_hsv(picture) for picture in pictures], load_config().landmarks.least_area_px
+    groups = pool_samples([find_samples(one, least, k) for k, one in enumerate(hsv)], TEAM)
     middle = own.low[:, 0] + 7
-    order = [min(range(len(groups)), key=lambda k: abs(hue_apart(groups[k][0].hue, hue))) for hue in middle]
+    order = [min(range(len(groups)), key=lambda k: abs(hue_difference(groups[k][0].hue, hue))) for hue in middle]
     if len(set(order)) < TEAM:
         return None
-    low, high, _ = ranges_of([groups[k] for k in order], hsv, least)
+    low, high, _ = build_ranges([groups[k] for k in order], hsv, least)
     return Colours(own.names, low, high)
 
 

@@ -29,8 +29,8 @@ import report
 from geo_scene import CAMERA, Case, Scenes, scenes
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.tuning.aerial_examples import Seen, kept, look_at
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
@@ -98,7 +98,7 @@ def judged(part: Sequence[Scenes], settings: Settings) -> tuple[np.ndarray, np.n
     for batch in part:
         case = replace(batch.case, pixel_sigma=settings.aerial.target_sigma_px)
         for flight, marks, pixels, true in parts(batch, settings):
-            fix = Registrar(CAMERA, settings, solver).step(1, 0.0, flight, marks)
+            fix = Georeferencer(CAMERA, settings, solver).update(1, 0.0, flight, marks)
             off, held = geo_error.judged(fix, pixels, true, case)
             inside.append(held)
             far.append(np.linalg.norm(off, axis=1))

@@ -23,7 +23,7 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.detection.detector import Loop
 from torchvision_dddas.detection.engine import load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.simulation import film, load_scenario

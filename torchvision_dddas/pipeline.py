@@ -10,7 +10,8 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import detector as run
 from torchvision_dddas.detection.engine import Engine
-from torchvision_dddas.geo import Locator, Targets, Watch, Watched, gathered
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, group_crowds
+from torchvision_dddas.geo.aerial_locator import tracked_targets
 from torchvision_dddas.tracking import sequence as following
 from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
 from torchvision_dddas.types import Fix, FrameResult, Scene, Telemetry, TrackedFrame
@@ -33,7 +34,7 @@ def survey(
     engine: Engine,
     settings: Settings,
     telemetry: Telemetry | None = None,
-    watch: Watch | None = None,
+    watch: LandmarkWatch | None = None,
     interval: int = 1,
     mission: "Mission | None" = None,
     seen: Callable[[Scene], object] | None = None,
@@ -46,7 +47,7 @@ def survey(
     target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
     retune: as in run.run. pictures: as `following.Follower` has it.
     """
-    waiting: dict[int, Watched] = {}
+    waiting: dict[int, WatchedScene] = {}
     crowds = CrowdIdentities() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
@@ -58,7 +59,7 @@ def survey(
                 continue
             if mission is not None:
                 mission.refresh(scene)
-            watched = gathered(watch.step(scene), watch.locator, source.rate_hz)
+            watched = group_crowds(watch.update(scene), watch.locator, source.rate_hz)
             waiting[scene.frame.number] = watched if pictures else _unpictured(watched)
             if seen is not None:
                 seen(watched.scene)
@@ -70,45 +71,38 @@ def survey(
             continue
         past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
         if crowds is not None:
-            followed = _with_crowd_identities(followed, past[-1].look.fix, watch.locator, crowds)
+            followed = _with_crowd_identities(followed, past[-1].fixed.fix, watch.locator, crowds)
         surveyed = _located(followed, past, watch.locator)
         yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
 
 
-def _with_crowd_identities(followed: TrackedFrame, fix: Fix, locator: Locator, crowds: CrowdIdentities) -> TrackedFrame:
+def _with_crowd_identities(
+    followed: TrackedFrame, fix: Fix, locator: AerialLocator, crowds: CrowdIdentities
+) -> TrackedFrame:
     """A tracked frame with the identities that its crowds have on the ground. fix: how its picture lies there."""
     tracks = followed.tracks
     seen = tracks.row >= 0
     box, middle = tracks.box_px[seen], followed.detections.middle_px[tracks.row[seen]]
     middle = np.where(np.isfinite(middle), middle, box[:, :2] + (box[:, 2:] - 1) / 2)
-    place, radius = locator.places(fix, middle), locator.radii(fix, box)
+    place, radius = locator.ground_places(fix, middle), locator.ground_radii(fix, box)
     return replace(followed, tracks=crowds.rename(tracks, locator.time_s(followed.number), place, radius))
 
 
-def _unpictured(watched: Watched) -> Watched:
+def _unpictured(watched: WatchedScene) -> WatchedScene:
     return replace(watched, scene=replace(watched.scene, frame=following.without_picture(watched.scene.frame)))
 
 
-def _located(followed: TrackedFrame, past: Sequence[Watched], locator: Locator) -> FrameResult:
+def _located(followed: TrackedFrame, past: Sequence[WatchedScene], locator: AerialLocator) -> FrameResult:
     """A followed frame on the ground. past: what was seen since the one before, it at the end."""
-    here, tracks = past[-1], followed.tracks
-    # A box that bridges a gap was not seen: it has an identity, and no place.
-    seen = tracks.row >= 0
-    middle = followed.detections.middle_px[tracks.row[seen]] if locator.settings.crowds.join_m else None
-    targets = Targets(
-        tracks.box_px[seen],
-        tracks.identity[seen],
-        seen[seen],
-        tracks.score[seen].clip(0, 1),
-        bodies=True,
-        middle_px=middle,
-    )
-    earlier = tuple(a for watched in past[:-1] for a in watched.look.adjustments)
+    here, targets = past[-1], tracked_targets(followed, bool(locator.settings.crowds.join_m))
+    earlier = tuple(a for watched in past[:-1] for a in watched.fixed.adjustments)
     seconds = dict(followed.seconds)
     for watched in past:
-        for stage, spent in watched.look.seconds.items():
+        for stage, spent in watched.fixed.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + spent
-    grounded = locator.ground(replace(here.look, seconds={}), targets, (*followed.adjustments, *earlier), seconds)
+    grounded = locator.locate_targets(
+        replace(here.fixed, seconds={}), targets, (*followed.adjustments, *earlier), seconds
+    )
     origin = locator.site.origin_deg
     degrees = None if origin is None else geometry.lonlat(grounded.marks.east_north_m, origin)
     return FrameResult(followed, grounded, here.sighted_by, degrees)

@@ -29,7 +29,7 @@ from torchvision_dddas.control.rules import (
     shed,
     steered,
 )
-from torchvision_dddas.geo.landmark_selection import LandmarkUse, best_spread, chosen, spread_m2
+from torchvision_dddas.geo.landmark_trajectories import LandmarkUse, best_spread, select_landmarks, spread_m2
 from torchvision_dddas.types import Adjustment, LandmarkObservations
 
 KNOBS = IntervalParameters(minimum_frames=1, maximum_frames=12)
@@ -196,37 +196,41 @@ def marks_at(places, seen=None):
 
 
 def test_every_landmark_in_view_is_used_by_default_and_no_other():
-    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkParameters())
+    rows, use, record = select_landmarks(
+        1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 4, 5}), np.full(6, 9.0), LandmarkParameters()
+    )
     assert (rows.tolist(), use.landmark, record) == ([0, 1, 2, 4, 5], (0, 1, 2, 4, 5), ())
 
 
 def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
-    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
+    rows, use, record = select_landmarks(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
     assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
-    rows, use, (more,) = chosen(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
+    rows, use, (more,) = select_landmarks(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
     assert len(rows) == 6 and use.poor
     assert (more.frame, more.parameter, more.old, more.new) == (2, "landmarks.used", 4, 6)
     assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
-    _, use, (fewer,) = chosen(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
+    _, use, (fewer,) = select_landmarks(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
     assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
 
 
 def test_four_fast_landmarks_alone_change_nothing():
-    rows, use, record = chosen(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 3}), np.full(6, 9.0), SOURCE)
+    rows, use, record = select_landmarks(1, LandmarkUse(), marks_at(SIX, {0, 1, 2, 3}), np.full(6, 9.0), SOURCE)
     assert (rows.tolist(), use.poor, record) == ([0, 1, 2, 3], False, ())
 
 
 def test_a_speed_around_the_threshold_does_not_make_the_number_flutter():
     use, changes = LandmarkUse(), 0
     for frame, speed in enumerate([1.9, 2.1, 1.9, 2.1, 1.8, 2.05] * 5, 1):
-        _, use, record = chosen(frame, use, marks_at(SIX), np.full(6, speed), SOURCE)
+        _, use, record = select_landmarks(frame, use, marks_at(SIX), np.full(6, speed), SOURCE)
         changes += len(record)
     assert changes == 1
 
 
 def test_an_unknown_speed_leaves_the_number_as_it_is():
     for poor, count in ((True, 6), (False, 4)):
-        rows, use, record = chosen(1, LandmarkUse((0, 1, 2, 3), poor), marks_at(SIX), np.full(6, np.nan), SOURCE)
+        rows, use, record = select_landmarks(
+            1, LandmarkUse((0, 1, 2, 3), poor), marks_at(SIX), np.full(6, np.nan), SOURCE
+        )
         assert (len(rows), use.poor, record) == (count, poor, ())
 
 
@@ -235,9 +239,9 @@ def test_the_four_in_use_stay_until_others_are_clearly_better_spread():
     places[4] = (10.4, 10.4)  # a little better than the corner beside it
     held = LandmarkUse((0, 1, 2, 3))
     assert spread_m2(places[[0, 1, 3, 4]]) >= spread_m2(places[:4])
-    assert chosen(1, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 2, 3]
+    assert select_landmarks(1, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 2, 3]
     places[2] = (5.0, 0.1)  # and now that one lies on a line with two others
-    assert chosen(2, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 3, 4]
+    assert select_landmarks(2, held, marks_at(places), np.zeros(6), SOURCE)[0].tolist() == [0, 1, 3, 4]
 
 
 def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmarks_in_one_place():

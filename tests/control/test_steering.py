@@ -8,7 +8,7 @@ import pytest
 
 from torchvision_dddas.config import Settings, SteeringParameters
 from torchvision_dddas.control.steering_api import Steering
-from torchvision_dddas.geo.landmark_selection import best_spread, spread_m2
+from torchvision_dddas.geo.landmark_trajectories import best_spread, spread_m2
 from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.types import (
     Adjustment,

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.geo.colour_calibration import (
-    Sample,
-    hsv_of,
-    hue_apart,
-    in_box,
-    marked,
-    named,
-    pooled,
-    ranges_of,
-    standing_out,
+    ColourSample,
+    build_ranges,
+    find_samples,
+    hue_difference,
+    mask_range,
+    name_hues,
+    pool_samples,
+    sample_box,
+    to_hsv,
 )
 
 PLATES = {"red": (178, 210, 200), "yellow": (28, 220, 220), "blue": (112, 200, 190), "magenta": (150, 190, 200)}
@@ -44,46 +44,46 @@ def inside(mask, box):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_plates_are_found_and_each_range_marks_its_own_and_no_other(seed):
     image, boxes = painted(PLATES, seed)
-    hsv = hsv_of(image)
-    groups = pooled([standing_out(hsv, LEAST)], None)
-    names = named([group[0].hue for group in groups])
+    hsv = to_hsv(image)
+    groups = pool_samples([find_samples(hsv, LEAST)], None)
+    names = name_hues([group[0].hue for group in groups])
     assert sorted(names) == sorted(PLATES)
-    low, high, others = ranges_of(groups, [hsv], LEAST)
+    low, high, others = build_ranges(groups, [hsv], LEAST)
     assert others.tolist() == [0, 0, 0, 0]
     for k, name in enumerate(names):
-        mask = marked(hsv, low[k], high[k])
+        mask = mask_range(hsv, low[k], high[k])
         assert {other for other, box in boxes.items() if inside(mask, box) > 0.02} == {name}
         assert inside(mask, boxes[name]) > 0.95
 
 
 def test_ranges_still_hold_in_another_light():
     image, _ = painted(PLATES)
-    groups = pooled([standing_out(hsv_of(image), LEAST)], None)
-    low, high, _ = ranges_of(groups, [hsv_of(image)], LEAST)
-    names = named([group[0].hue for group in groups])
+    groups = pool_samples([find_samples(to_hsv(image), LEAST)], None)
+    low, high, _ = build_ranges(groups, [to_hsv(image)], LEAST)
+    names = name_hues([group[0].hue for group in groups])
     darker, boxes = painted(PLATES, seed=5, shade=0.75)
     for k, name in enumerate(names):
-        assert inside(marked(hsv_of(darker), low[k], high[k]), boxes[name]) > 0.9
+        assert inside(mask_range(to_hsv(darker), low[k], high[k]), boxes[name]) > 0.9
 
 
 def test_red_goes_over_zero():
     image, boxes = painted({"red": (179, 210, 200)})
-    hsv = hsv_of(image)
-    group = pooled([standing_out(hsv, LEAST)], 1)
-    low, high, _ = ranges_of(group, [hsv], LEAST)
+    hsv = to_hsv(image)
+    group = pool_samples([find_samples(hsv, LEAST)], 1)
+    low, high, _ = build_ranges(group, [hsv], LEAST)
     assert low[0, 0] > 150 and high[0, 0] < 30
-    assert inside(marked(hsv, low[0], high[0]), boxes["red"]) > 0.95
+    assert inside(mask_range(hsv, low[0], high[0]), boxes["red"]) > 0.95
 
 
 def test_ground_without_plates_has_no_colour_that_is_clear():
-    assert pooled([standing_out(hsv_of(painted({})[0]), LEAST)], None) == []
+    assert pool_samples([find_samples(to_hsv(painted({})[0]), LEAST)], None) == []
 
 
 def test_neighbouring_hues_share_the_gap_between_them():
     def sample(hue):
-        return [Sample(hue, np.full((50, 3), (hue, 200, 200), np.uint8), 1.0, 0, (0, 0, 5, 5))]
+        return [ColourSample(hue, np.full((50, 3), (hue, 200, 200), np.uint8), 1.0, 0, (0, 0, 5, 5))]
 
-    low, high, _ = ranges_of([sample(20), sample(30), sample(175)], [np.zeros((9, 9, 3), np.uint8)], LEAST)
+    low, high, _ = build_ranges([sample(20), sample(30), sample(175)], [np.zeros((9, 9, 3), np.uint8)], LEAST)
     assert high[0, 0] < low[1, 0] <= high[0, 0] + 2
     assert (low[0, 0], high[1, 0]) == (12, 38)  # where there is room, all of the margin
     assert (low[2, 0], high[2, 0]) == (167, 3)
@@ -92,26 +92,26 @@ def test_neighbouring_hues_share_the_gap_between_them():
 def test_what_else_a_range_marks_is_counted():
     image, boxes = painted({"red": PLATES["red"], "blue": PLATES["blue"]})
     image[430:450, 500:530] = image[boxes["red"][1] + 8, boxes["red"][0] + 12]
-    hsv = hsv_of(image)
-    red, blue = in_box(hsv, boxes["red"]), in_box(hsv, boxes["blue"])
+    hsv = to_hsv(image)
+    red, blue = sample_box(hsv, boxes["red"]), sample_box(hsv, boxes["blue"])
     assert red is not None and blue is not None
     found = [[red], [blue]]
-    assert ranges_of(found, [hsv], LEAST)[2].tolist() == [1, 0]
+    assert build_ranges(found, [hsv], LEAST)[2].tolist() == [1, 0]
 
 
 def test_a_box_on_grey_has_no_colour_and_one_half_on_the_plate_has_the_plates():
     image, boxes = painted({"blue": PLATES["blue"]})
     x, y, _, _ = boxes["blue"]
-    half = in_box(hsv_of(image), (x - 8, y - 4, 24, 16))
-    assert half is not None and abs(hue_apart(half.hue, 112)) <= 4
-    assert in_box(np.full((20, 20, 3), (90, 10, 200), np.uint8), (0, 0, 20, 20)) is None
+    half = sample_box(to_hsv(image), (x - 8, y - 4, 24, 16))
+    assert half is not None and abs(hue_difference(half.hue, 112)) <= 4
+    assert sample_box(np.full((20, 20, 3), (90, 10, 200), np.uint8), (0, 0, 20, 20)) is None
 
 
 def test_pictures_of_one_team_are_taken_together():
-    pictures = [hsv_of(painted(PLATES, seed)[0]) for seed in (0, 1)]
-    groups = pooled([standing_out(hsv, LEAST, n) for n, hsv in enumerate(pictures)], 4)
+    pictures = [to_hsv(painted(PLATES, seed)[0]) for seed in (0, 1)]
+    groups = pool_samples([find_samples(hsv, LEAST, n) for n, hsv in enumerate(pictures)], 4)
     assert sorted(tuple(sorted(one.picture for one in group)) for group in groups) == [(0, 1)] * 4
 
 
 def test_hues_of_one_name_are_numbered():
-    assert named([0, 178, 60, 112]) == ["red-1", "red-2", "green", "blue"]
+    assert name_hues([0, 178, 60, 112]) == ["red-1", "red-2", "green", "blue"]

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.solvers import ColourFinder, load_colours
+from torchvision_dddas.geo.colours import ColourFinder, load_colours
 
 LOW = np.array([[170, 80, 60], [10, 80, 60], [55, 40, 40], [0, 0, 0]], float)
 HIGH = np.array([[8, 255, 255], [30, 255, 255], [65, 255, 200], [180, 255, 90]], float)

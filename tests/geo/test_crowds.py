@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.geo.crowds import joined, together
+from torchvision_dddas.geo.crowds import group_targets, merge_detections
 from torchvision_dddas.geometry import middles_of
 from torchvision_dddas.types import Detections
 
@@ -16,26 +16,26 @@ STILL = np.zeros((3, 2))
 
 def test_a_chain_of_near_targets_is_one_crowd_and_a_far_one_is_another():
     place = np.array([[0.0, 0], [4, 0], [8, 0], [30, 0]])
-    assert together(place, np.full(4, 1.0), np.zeros((4, 2)), 2.0, 1.5).tolist() == [0, 0, 0, 1]
+    assert group_targets(place, np.full(4, 1.0), np.zeros((4, 2)), 2.0, 1.5).tolist() == [0, 0, 0, 1]
 
 
 def test_what_counts_is_the_gap_between_rims_not_between_middles():
     place = np.array([[0.0, 0], [10, 0]])
-    assert together(place, np.array([5.0, 4.0]), STILL[:2], 1.0, 1.5).tolist() == [0, 0]
-    assert together(place, np.array([5.0, 3.9]), STILL[:2], 1.0, 1.5).tolist() == [0, 1]
+    assert group_targets(place, np.array([5.0, 4.0]), STILL[:2], 1.0, 1.5).tolist() == [0, 0]
+    assert group_targets(place, np.array([5.0, 3.9]), STILL[:2], 1.0, 1.5).tolist() == [0, 1]
 
 
 def test_a_car_that_passes_a_crowd_is_none_of_it():
     place, velocity = np.array([[0.0, 0], [1, 0]]), np.array([[1.0, 0], [6, 0]])
-    assert together(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 1]
+    assert group_targets(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 1]
     velocity[1] = np.nan  # whose way nobody knows goes with all
-    assert together(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 0]
+    assert group_targets(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 0]
 
 
 def test_targets_of_unknown_place_stay_alone():
     place = np.array([[0.0, 0], [np.nan, np.nan], [np.nan, np.nan]])
-    assert together(place, np.ones(3), STILL, 100.0, 1.5).tolist() == [0, 1, 2]
-    assert together(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), 1.0, 1.0).tolist() == []
+    assert group_targets(place, np.ones(3), STILL, 100.0, 1.5).tolist() == [0, 1, 2]
+    assert group_targets(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), 1.0, 1.0).tolist() == []
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30)), min_size=1, max_size=12), st.randoms())
@@ -44,7 +44,7 @@ def test_crowds_do_not_depend_on_the_order_of_targets(places, chance):
     order = list(range(len(place)))
     chance.shuffle(order)
     ones, still = np.ones(len(place)), np.zeros((len(place), 2))
-    crowd, shuffled = (together(p, ones, still, 2.0, 1.0) for p in (place, place[order]))
+    crowd, shuffled = (group_targets(p, ones, still, 2.0, 1.0) for p in (place, place[order]))
     same = crowd[:, None] == crowd[None]
     assert (same[np.ix_(order, order)] == (shuffled[:, None] == shuffled[None])).all()
 
@@ -72,7 +72,7 @@ def test_the_middle_is_the_mean_of_the_foreground():
 def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
     found, mask = scene()
     found = replace(found, middle_px=middles_of(found.box_px, mask))
-    crowds, numbered = joined(found, mask, np.array([0, 1, 0]))
+    crowds, numbered = merge_detections(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
     assert crowds.score.tolist() == [0.9, 0.7]
     assert crowds.area_px.tolist() == [20, 16]
@@ -87,6 +87,6 @@ def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
 
 
 def test_nobody_makes_no_crowd():
-    crowds, mask = joined(Detections(), np.zeros((4, 5), np.uint16), np.zeros(0, np.int64))
+    crowds, mask = merge_detections(Detections(), np.zeros((4, 5), np.uint16), np.zeros(0, np.int64))
     assert len(crowds) == 0
     assert mask.sum() == 0

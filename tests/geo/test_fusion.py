@@ -6,8 +6,8 @@ import pytest
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.geo import fusion
-from torchvision_dddas.geo.fusion import associate, crowd, fuse, gate, together
-from torchvision_dddas.geo.ranging import sight
+from torchvision_dddas.geo.fusion import associate, crowd, estimate_places, fuse, gate_distance
+from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.types import Sightings
 
 KNOBS = GroundParameters()
@@ -64,7 +64,7 @@ def test_people_far_apart_are_not_fused():
 
 @pytest.mark.parametrize(("apart", "people"), [(0.95, 1), (1.05, 2)])
 def test_the_gate_is_that_of_three_sigmas(apart, people):
-    limit = np.sqrt(gate(3.0) * 0.02)
+    limit = np.sqrt(gate_distance(3.0) * 0.02)
     assert len(fuse([sightings([[0, 0]]), sightings([[apart * limit, 0]])])) == people
 
 
@@ -122,10 +122,10 @@ def test_four_vehicles_halve_the_error_of_one_and_say_how_large_it_is():
             box[:, 3] += rng.normal(0, 1, 3) * np.hypot(KNOBS.height_sigma * height, 0.5)
             box[:, 1] = feet - box[:, 3]
             where = poses(known, 3, place)
-            team.append(sight(box, np.zeros(3, bool), known, where, where.place, KNOBS))
+            team.append(range_people(box, np.zeros(3, bool), known, where, where.place, KNOBS))
         alone += [np.linalg.norm(seen.east_north_m - people, axis=1) for seen in team]
         same = np.tile(np.arange(3)[:, None], 4)
-        found, joint, _ = together(team, same)
+        found, joint, _ = estimate_places(team, same)
         off = found - people
         own = joint[np.arange(3), :, np.arange(3)]
         inside.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(own), off) < 5.991)

@@ -8,10 +8,11 @@ import pytest
 from tests.overflight import COLOURS_TOML, Overflight, pictures
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import Locator, Watch, camera_of, check_table, locate, site_of
-from torchvision_dddas.geo.aerial_locator import Targets, points_of, sigma_of
-from torchvision_dddas.geo.pose_estimation import bare_prior
-from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
+from torchvision_dddas.geo.aerial_targets import Targets, point_sigma_px, reference_points
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.pose_estimation import focal_prior
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections
@@ -45,9 +46,9 @@ def prepared(tmp_path):
             (tmp_path / name).write_text(text)
         settings = with_parameters(Settings(), parameters)
         flown = read_telemetry(tmp_path / "tel.csv") if telemetry else None
-        site = replace(site_of(read_landmarks(tmp_path / "l.csv"), flown), elevation=elevation)
-        camera, known, _ = camera_of(read_camera(tmp_path / "c.toml"), None, flown, settings)
-        locator = Locator(site, camera, settings, load_solver("onboard"), flight.rate_hz, known)
+        site = replace(build_site(read_landmarks(tmp_path / "l.csv"), flown), elevation=elevation)
+        camera, known, _ = resolve_camera(read_camera(tmp_path / "c.toml"), None, flown, settings)
+        locator = AerialLocator.from_site(site, camera, settings, load_solver("onboard"), flight.rate_hz, known)
         return locator, read_detections(tmp_path / "t.txt")
 
     return prepare
@@ -66,9 +67,9 @@ def errors(flight, found):
 def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(prepared):
     flight = Overflight(pitch_deg=45, ground=hill, geographic=False, gps_m=0.1, pixel=0.5)
     locator, table = prepared(flight)
-    level = errors(flight, locate(table, locator))
+    level = errors(flight, locator.locate_table(table))
     locator, table = prepared(flight, raster(hill))
-    known = errors(flight, locate(table, locator))
+    known = errors(flight, locator.locate_table(table))
     assert np.median(level) > 1.0
     assert np.median(known) < 0.3
 
@@ -76,16 +77,16 @@ def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(p
 def test_a_level_raster_changes_nothing(prepared):
     flight = Overflight(pitch_deg=60, geographic=False)
     locator, table = prepared(flight)
-    bare = [g.positions.east_north_m for g in locate(table, locator)]
+    bare = [g.positions.east_north_m for g in locator.locate_table(table)]
     locator, table = prepared(flight, raster(lambda places: np.zeros(len(places))))
-    for g, before in zip(locate(table, locator), bare, strict=True):
+    for g, before in zip(locator.locate_table(table), bare, strict=True):
         np.testing.assert_allclose(g.positions.east_north_m, before, atol=1e-6)
 
 
 def test_the_vehicle_is_above_the_ground_below_it_not_above_the_origins(prepared):
     flight = Overflight(pitch_deg=45, ground=hill, geographic=False)
     locator, _ = prepared(flight, raster(hill))
-    at = locator.flight(0.0)
+    at = locator.telemetry_at(0.0)
     assert at is not None
     assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
 
@@ -98,7 +99,7 @@ def test_heights_above_sea_will_do_where_the_ground_is_known(prepared):
     height = np.array([flight.vehicle(frame)[2] for frame in flight.numbers()]) + 1300.0
     unknown = np.full(len(flown), np.nan)
     locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=unknown, above_sea_m=height))
-    at = locator.flight(0.0)
+    at = locator.telemetry_at(0.0)
     assert at is not None
     assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
 
@@ -109,7 +110,7 @@ def test_an_altitude_below_the_ground_counts_as_unknown(prepared):
     assert flown is not None
     sunk = np.where(flown.time_s < 0.35, -2.0, flown.altitude_m)
     locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=sunk))
-    before, after = locator.flight(0.0), locator.flight(0.8)
+    before, after = locator.telemetry_at(0.0), locator.telemetry_at(0.8)
     assert isinstance(before, Flight)
     assert isinstance(after, Flight)
     assert np.isnan(before.altitude_m)
@@ -122,17 +123,17 @@ def test_a_landmark_where_the_raster_has_no_height_is_not_used(prepared):
     row, column = (int(v) for v in np.rint(flight.marks(1)[2][::-1] + 260))
     holed.up_m[row - 5 : row + 6, column - 5 : column + 6] = np.nan
     locator, table = prepared(flight, holed)
-    first = next(iter(locate(table, locator)))
+    first = next(iter(locator.locate_table(table)))
     assert first.marks.landmark.tolist() == [0, 1, 3]
 
 
 def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
     flight = Overflight(landmarks=6, geographic=False)
     locator, table = prepared(flight, **{"landmarks.rule": "source"})
-    calm = list(locate(table, locator))
+    calm = list(locator.locate_table(table))
     assert {len(g.marks) for g in calm} == {4}
     locator, table = prepared(flight, **{"landmarks.rule": "source", "landmarks.poor_speed_m_s": 0.3})
-    busy = list(locate(table, locator))
+    busy = list(locator.locate_table(table))
     assert len(busy[-1].marks) == 6
     (moved,) = [a for g in busy for a in g.adjustments]
     assert (moved.parameter, moved.new) == ("landmarks.used", 6)
@@ -150,7 +151,7 @@ def test_frames_between_with_landmarks_are_located_too(prepared):
         line=table.line[sparse],
         identity=None if table.identity is None else table.identity[sparse],
     )
-    found = list(locate(table, locator))
+    found = list(locator.locate_table(table))
     assert [g.frame for g in found] == list(range(1, 11))
     assert [len(g.positions) for g in found] == [4, 0, 0] * 3 + [4]
 
@@ -158,9 +159,11 @@ def test_frames_between_with_landmarks_are_located_too(prepared):
 def test_landmarks_that_are_absent_for_a_while_leave_gaps_without_positions(prepared):
     flight = Overflight(geographic=False)
     locator, table = prepared(flight, telemetry=False)
-    marks = locator.marks
-    locator.marks = lambda frame: marks(frame) if frame != 5 else replace(marks(5), image_px=np.full((4, 2), np.nan))
-    found = {g.frame: g for g in locate(table, locator)}
+    marks = locator.landmarks_at
+    locator.landmarks_at = lambda frame: (
+        marks(frame) if frame != 5 else replace(marks(5), image_px=np.full((4, 2), np.nan))
+    )
+    found = {g.frame: g for g in locator.locate_table(table)}
     assert len(found[5].positions) == 0
     assert found[5].fix.cause
     assert all(len(found[frame].positions) == 4 for frame in (4, 6))
@@ -170,30 +173,30 @@ def test_a_found_box_is_known_less_well_the_larger_it_is():
     boxes = np.array([[0, 0, 10, 10], [0, 0, 40, 40.0]])
     targets = Targets(boxes, np.array([1, 2]), np.ones(2, bool), np.ones(2))
     parameters = Settings().aerial
-    assert sigma_of(targets, parameters) == pytest.approx([1, 1])
-    assert sigma_of(replace(targets, bodies=True), parameters) == pytest.approx(np.hypot(1, [1.3, 5.2]))
+    assert point_sigma_px(targets, parameters) == pytest.approx([1, 1])
+    assert point_sigma_px(replace(targets, bodies=True), parameters) == pytest.approx(np.hypot(1, [1.3, 5.2]))
 
 
 def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
     feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
     targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
     parameters = Settings().aerial
-    points, lift = points_of(targets, parameters, posed=True)
+    points, lift = reference_points(targets, parameters, posed=True)
     assert points.tolist() == [[5, 9], [5, 10]]
     assert lift.tolist() == [0, 0]
     bodies = replace(targets, feet_px=None, bodies=True)
-    assert points_of(bodies, parameters, posed=True)[1].tolist() == [0.85, 0.85]
+    assert reference_points(bodies, parameters, posed=True)[1].tolist() == [0.85, 0.85]
     # A homography alone cannot tell what lies above the ground.
-    assert points_of(bodies, parameters, posed=False)[1].tolist() == [0, 0]
+    assert reference_points(bodies, parameters, posed=False)[1].tolist() == [0, 0]
 
 
 def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess():
     flown = Telemetry(np.zeros(3), np.full(3, 50.0), np.zeros(3), hfov_rad=np.radians([60.0, 60.0, 61.0]))
-    camera, known, notes = camera_of(None, (1000, 600), flown, Settings())
+    camera, known, notes = resolve_camera(None, (1000, 600), flown, Settings())
     assert known
     assert not notes
     assert camera.focal_px[0] == pytest.approx(500 / np.tan(np.radians(30)))
-    camera, known, (note,) = camera_of(None, (1000, 600), None, Settings())
+    camera, known, (note,) = resolve_camera(None, (1000, 600), None, Settings())
     assert not known
     assert "using 70 degrees" in note
     assert camera.centre_px == (499.5, 299.5)
@@ -201,24 +204,24 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
 
 def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), height_m=50.0)
-    _, known, (note,) = camera_of(camera, None, None, Settings())
+    _, known, (note,) = resolve_camera(camera, None, None, Settings())
     assert known
     assert "give --telemetry" in note
 
 
 def test_paper_mode_says_that_it_leaves_a_bent_lens_aside():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
-    _, _, (note,) = camera_of(camera, None, None, with_parameters(Settings(), {"aerial.mode": "paper"}))
+    _, _, (note,) = resolve_camera(camera, None, None, with_parameters(Settings(), {"aerial.mode": "paper"}))
     assert "takes the lens of camera mine for straight" in note
-    assert camera_of(camera, None, None, Settings())[2] == []
+    assert resolve_camera(camera, None, None, Settings())[2] == []
 
 
 def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():
     camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), focal_sigma=0.002)
     for parameters, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
         settings = with_parameters(Settings(), parameters)
-        found, known, _ = camera_of(camera, None, None, settings)
-        prior = bare_prior(found, settings.aerial, known)
+        found, known, _ = resolve_camera(camera, None, None, settings)
+        prior = focal_prior(found, settings.aerial, known)
         assert prior.information[6, 6] == pytest.approx(sigma**-2)
 
 
@@ -228,7 +231,7 @@ def test_places_over_the_date_line_are_near_each_other(prepared):
     marks = read_landmarks(locator.site.landmarks.path)
     place = marks.place + np.array([-69.0500, 0.0])
     place[:, 0] = (place[:, 0] + 180) % 360 - 180
-    moved = site_of(replace(marks, place=place), None)
+    moved = build_site(replace(marks, place=place), None)
     assert np.abs(moved.landmarks.place).max() < 100
 
 
@@ -237,11 +240,11 @@ def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
     colours = read_colours(tmp_path / "colours.toml")
     locator, _ = prepared(flight, pictured=False)
-    watch = Watch(locator, colours, load_colours("onboard"))
+    watch = LandmarkWatch(locator, colours, load_colours("onboard"))
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
-        found = watch.step(scene(frame, picture, flight.shown(frame, flight.marks(frame))[:1]))
+        found = watch.update(scene(frame, picture, flight.shown(frame, flight.marks(frame))[:1]))
         assert found.sighted_by[0] == "motion" or found.sighted_by[0] == "colour"
-        np.testing.assert_allclose(found.look.marks.image_px, flight.shown(frame, flight.marks(frame)), atol=1.0)
+        np.testing.assert_allclose(found.fixed.marks.image_px, flight.shown(frame, flight.marks(frame)), atol=1.0)
         # The landmark's blob is gone from the targets, and the mask counts on.
         assert len(found.scene.detections) == 1
         assert found.scene.mask.max() == 1
@@ -251,13 +254,13 @@ def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_
     flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
     locator, _ = prepared(flight, pictured=False)
-    watch = Watch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
+    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
     still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
         truth = flight.shown(frame, flight.marks(frame))
         beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
-        found = watch.step(replace(scene(frame, picture, beside), step=still))
-        np.testing.assert_allclose(found.look.marks.image_px[0], truth[0], atol=1.0)
+        found = watch.update(replace(scene(frame, picture, beside), step=still))
+        np.testing.assert_allclose(found.fixed.marks.image_px[0], truth[0], atol=1.0)
     assert found.sighted_by[0] == "colour"
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring, with_aerial, within_95
 from torchvision_dddas.config import Settings
-from torchvision_dddas.geo.bias_filter import Memory
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.plane import ground_points
-from torchvision_dddas.geo.pose_estimation import expected_of, prior_of
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.bias_filter import BiasFilter
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.pose_estimation import independent_expectation, pose_prior
 from torchvision_dddas.types import Flight, LandmarkObservations
 
 SOLVER = load_solver("onboard")
@@ -20,7 +20,7 @@ NAN = float("nan")
 
 
 def registrar(settings=None, **parameters):
-    return Registrar(CAMERA, settings or with_aerial(**parameters), SOLVER, names=NAMES)
+    return Georeferencer(CAMERA, settings or with_aerial(**parameters), SOLVER, names=NAMES)
 
 
 def rows(marks, which):
@@ -28,26 +28,26 @@ def rows(marks, which):
 
 
 def off(fix, seen):
-    return ground_points(fix, CAMERA, seen.targets_px, 1.0)[0] - seen.targets
+    return locate_pixels(fix, CAMERA, seen.targets_px, 1.0)[0] - seen.targets
 
 
 def test_the_first_frame_is_that_of_a_single_picture():
     seen = look(1)
-    alone, first = (registrar(correlation_s=s).step(1, 0.0, seen.flight, seen.marks) for s in (0.0, 20.0))
+    alone, first = (registrar(correlation_s=s).update(1, 0.0, seen.flight, seen.marks) for s in (0.0, 20.0))
     assert np.allclose(alone.pose.place_m, first.pose.place_m, atol=1e-6)
     assert np.allclose(alone.covariance, first.covariance, rtol=1e-6)
-    prior = prior_of(seen.flight, CAMERA, Settings().aerial)
+    prior = pose_prior(seen.flight, CAMERA, Settings().aerial)
     assert prior is not None
-    remembered = Memory().at(0.0, prior, seen.marks, 20.0).expected(prior, seen.marks)
-    assert np.allclose(remembered.information, expected_of(prior, seen.marks.sigma_m).information)
+    remembered = BiasFilter().at(0.0, prior, seen.marks, 20.0).expected(prior, seen.marks)
+    assert np.allclose(remembered.information, independent_expectation(prior, seen.marks.sigma_m).information)
 
 
 def test_frames_stand_alone_without_a_time_over_which_errors_stay_alike():
     first, second = look(1), look(2)
     both = registrar(correlation_s=0.0)
-    both.step(1, 0.0, first.flight, first.marks)
-    after = both.step(2, 0.1, second.flight, second.marks)
-    alone = registrar(correlation_s=0.0).step(2, 0.1, second.flight, second.marks)
+    both.update(1, 0.0, first.flight, first.marks)
+    after = both.update(2, 0.1, second.flight, second.marks)
+    alone = registrar(correlation_s=0.0).update(2, 0.1, second.flight, second.marks)
     assert np.allclose(after.pose.place_m, alone.pose.place_m)
 
 
@@ -57,10 +57,10 @@ def test_noise_of_pixels_averages_out_over_frames_and_errors_of_receivers_do_not
     seen, one = look(3), registrar()
     for frame in range(20):
         noisy = replace(seen.marks, image_px=seen.marks.image_px + rng.normal(0, 1, (4, 2)))
-        fix = one.step(frame + 1, 0.1 * frame, seen.flight, noisy)
+        fix = one.update(frame + 1, 0.1 * frame, seen.flight, noisy)
         if frame == 0:
-            first = ground_points(fix, CAMERA, seen.targets_px, 0.0)[1]
-    last = ground_points(fix, CAMERA, seen.targets_px, 0.0)[1]
+            first = locate_pixels(fix, CAMERA, seen.targets_px, 0.0)[1]
+    last = locate_pixels(fix, CAMERA, seen.targets_px, 0.0)[1]
     share = np.trace(last, axis1=1, axis2=2) / np.trace(first, axis1=1, axis2=2)
     assert (share < 1.0).all() and (share > 0.7).all()
 
@@ -74,8 +74,8 @@ def test_ellipses_hold_95_percent_over_a_clip(sigma_m):
         for frame in range(10):
             seen = look(seed, sigma_m=sigma_m)
             told = replace(seen.marks, east_north_m=ring(4) - sigma_m * slow)
-            fix = one.step(frame + 1, 0.5 * frame, seen.flight, told)
-            ground, covariance = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+            fix = one.update(frame + 1, 0.5 * frame, seen.flight, told)
+            ground, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
             inside.append(within_95(ground - seen.targets, covariance))
             slow = keep * slow + np.sqrt(1 - keep**2) * rng.normal(0, 1, (4, 2))
     assert np.mean(inside) > 0.85
@@ -84,9 +84,9 @@ def test_ellipses_hold_95_percent_over_a_clip(sigma_m):
 def test_a_repair_goes_on_from_frame_to_frame():
     seen, one = look(5, n=6), registrar()
     swapped = replace(seen.marks, image_px=seen.marks.image_px[[1, 0, 2, 3, 4, 5]])
-    right = registrar().step(1, 0.0, seen.flight, seen.marks)
+    right = registrar().update(1, 0.0, seen.flight, seen.marks)
     for frame in range(3):
-        fix = one.step(frame + 1, 0.1 * frame, seen.flight, swapped)
+        fix = one.update(frame + 1, 0.1 * frame, seen.flight, swapped)
         assert fix.state[:3] == ("reassigned", "reassigned", "used")
         assert "red and green swapped back" in fix.changes[0]
         assert np.allclose(off(fix, seen), off(right, seen), atol=0.2)
@@ -95,14 +95,14 @@ def test_a_repair_goes_on_from_frame_to_frame():
 def test_landmarks_come_and_go():
     seen, one = look(6, n=6), registrar()
     for frame, which in enumerate([[0, 1, 2, 3], [2, 3, 4, 5], [0], [0, 1, 2, 3, 4, 5]]):
-        fix = one.step(frame + 1, 0.2 * frame, seen.flight, rows(seen.marks, which))
+        fix = one.update(frame + 1, 0.2 * frame, seen.flight, rows(seen.marks, which))
         assert fix.by == "pose" and fix.landmark.tolist() == which and np.isfinite(off(fix, seen)).all()
 
 
 def test_few_landmarks_leave_the_rest_to_the_telemetry_and_none_leave_all():
     seen = look(7)
-    few = registrar().step(9, 0.0, seen.flight, rows(seen.marks, [0, 1]))
-    none = registrar().step(9, 0.0, seen.flight, rows(seen.marks, []))
+    few = registrar().update(9, 0.0, seen.flight, rows(seen.marks, [0, 1]))
+    none = registrar().update(9, 0.0, seen.flight, rows(seen.marks, []))
     assert few.by == "pose" and "2 missing of the 4" in few.cause
     assert none.by == "telemetry" and none.cause == "frame 9 has no landmark: by telemetry alone"
     assert np.trace(few.covariance[3:6, 3:6]) < np.trace(none.covariance[3:6, 3:6])
@@ -110,40 +110,40 @@ def test_few_landmarks_leave_the_rest_to_the_telemetry_and_none_leave_all():
 
 def test_a_gap_is_said_and_no_place_invented():
     seen, one = look(8), registrar()
-    assert one.step(16, 0.0, seen.flight, seen.marks).by == "pose"
-    gap = one.step(17, 0.1, None, rows(seen.marks, [0, 1, 3]))
+    assert one.update(16, 0.0, seen.flight, seen.marks).by == "pose"
+    gap = one.update(17, 0.1, None, rows(seen.marks, [0, 1, 3]))
     assert gap.by == "" and gap.pose is None
     assert gap.cause == "frame 17 has 3 landmarks and no telemetry, 1 missing of the 4 that are needed"
-    assert one.step(18, 0.2, seen.flight, seen.marks).by == "pose"
+    assert one.update(18, 0.2, seen.flight, seen.marks).by == "pose"
 
 
 def test_four_landmarks_need_no_telemetry():
     seen = look(9, sigma_m=0.02)
-    fix = registrar().step(1, 0.0, None, seen.marks)
+    fix = registrar().update(1, 0.0, None, seen.marks)
     assert fix.by == "pose" and np.abs(off(fix, seen)).max() < 0.3
 
 
 def test_a_row_of_landmarks_needs_telemetry():
     row = np.stack([np.linspace(-25, 25, 4), 0.1 * np.array([1.0, -1.0, -1.0, 1.0])], axis=1)
     seen = look(10, places=row, sigma_m=0.02)
-    assert np.abs(off(registrar().step(1, 0.0, seen.flight, seen.marks), seen)).max() < 1.0
-    assert "stand on one line" in registrar().step(1, 0.0, None, seen.marks).cause
+    assert np.abs(off(registrar().update(1, 0.0, seen.flight, seen.marks), seen)).max() < 1.0
+    assert "stand on one line" in registrar().update(1, 0.0, None, seen.marks).cause
 
 
 def test_telemetry_that_lacks_what_the_landmarks_cannot_tell_is_named():
     seen = look(11)
-    fix = registrar().step(4, 0.0, replace(seen.flight, heading_rad=NAN, place=(NAN, NAN)), rows(seen.marks, [0]))
+    fix = registrar().update(4, 0.0, replace(seen.flight, heading_rad=NAN, place=(NAN, NAN)), rows(seen.marks, [0]))
     assert fix.by == ""
     assert fix.cause == "frame 4 has 1 landmark, too few where the telemetry does not say heading and place"
 
 
 def test_landmarks_without_a_place_or_seen_twice_do_no_harm():
     seen = look(12, n=6)
-    right = registrar().step(1, 0.0, seen.flight, rows(seen.marks, [0, 1, 2, 3]))
+    right = registrar().update(1, 0.0, seen.flight, rows(seen.marks, [0, 1, 2, 3]))
     places, pixels = seen.marks.east_north_m.copy(), seen.marks.image_px.copy()
     places[4], pixels[5] = NAN, [5.0, 5.0]
     marks = replace(seen.marks, east_north_m=places, image_px=pixels, landmark=np.array([0, 1, 2, 3, 4, 3]))
-    fix = registrar().step(1, 0.0, seen.flight, marks)
+    fix = registrar().update(1, 0.0, seen.flight, marks)
     assert fix.state == ("used",) * 4 + ("excluded",) * 2
     assert fix.changes == ("black left out: its place is not known", "white left out where it is seen a second time")
     assert np.allclose(fix.pose.place_m, right.pose.place_m)
@@ -153,16 +153,16 @@ def test_a_landmark_out_of_the_picture_is_not_listed():
     seen = look(13, n=5)
     pixels = seen.marks.image_px.copy()
     pixels[2] = NAN
-    fix = registrar().step(1, 0.0, seen.flight, replace(seen.marks, image_px=pixels))
+    fix = registrar().update(1, 0.0, seen.flight, replace(seen.marks, image_px=pixels))
     assert fix.landmark.tolist() == [0, 1, 3, 4]
 
 
 def test_a_report_that_jumps_within_its_errors_is_no_outlier():
     seen, one = look(14, n=5), registrar()
     for frame in range(5):
-        one.step(frame + 1, 0.1 * frame, seen.flight, seen.marks)
+        one.update(frame + 1, 0.1 * frame, seen.flight, seen.marks)
     jumped = seen.marks.east_north_m + np.eye(5)[:, :1] * [1.5, -1.5]
-    fix = one.step(6, 0.5, seen.flight, replace(seen.marks, east_north_m=jumped))
+    fix = one.update(6, 0.5, seen.flight, replace(seen.marks, east_north_m=jumped))
     assert fix.state == ("used",) * 5 and fix.changes == ()
 
 
@@ -170,7 +170,7 @@ def test_the_bare_homography_is_by_landmarks_alone_and_telemetry_only_tests_them
     seen = look(15, errors=0, sigma_m=0.5)
     swapped = replace(seen.marks, image_px=seen.marks.image_px[[1, 0, 2, 3]])
     one = registrar(mode="homography")
-    fixes = [one.step(1, 0.0, flight, marks) for flight, marks in ((None, seen.marks), (seen.flight, swapped))]
+    fixes = [one.update(1, 0.0, flight, marks) for flight, marks in ((None, seen.marks), (seen.flight, swapped))]
     for fix in fixes:
         assert fix.by == "homography" and fix.pose is None and np.abs(off(fix, seen)).max() < 1e-6
     assert fixes[1].state == ("reassigned", "reassigned", "used", "used")
@@ -180,24 +180,24 @@ def test_the_bare_homography_is_of_the_picture_that_a_straight_lens_would_show()
     bent = replace(CAMERA, k1=-0.2)
     seen = look(14, n=6, errors=0.0, sigma_m=0.02, camera=bent)
     settings = with_aerial(mode="homography")
-    one = Registrar(bent, settings, SOLVER)
-    ground, _ = ground_points(one.step(1, 0.0, None, seen.marks), bent, seen.targets_px, 1.0)
+    one = Georeferencer(bent, settings, SOLVER)
+    ground, _ = locate_pixels(one.update(1, 0.0, None, seen.marks), bent, seen.targets_px, 1.0)
     assert np.abs(ground - seen.targets).max() < 1e-6
-    ground, _ = ground_points(registrar(settings).step(1, 0.0, None, seen.marks), CAMERA, seen.targets_px, 1.0)
+    ground, _ = locate_pixels(registrar(settings).update(1, 0.0, None, seen.marks), CAMERA, seen.targets_px, 1.0)
     assert np.abs(ground - seen.targets).max() > 0.1
 
 
 def test_paper_mode_takes_identities_as_they_come():
     seen = look(16, errors=0)
     swapped = replace(seen.marks, image_px=seen.marks.image_px[[1, 0, 2, 3]])
-    fix = registrar(mode="paper").step(1, 0.0, seen.flight, swapped)
+    fix = registrar(mode="paper").update(1, 0.0, seen.flight, swapped)
     assert fix.by == "paper" and fix.state == ("used",) * 4
 
 
 def test_nothing_at_all_is_refused():
     for flight in (None, Flight(NAN)):
         for mode in ("pose", "homography", "paper"):
-            fix = registrar(mode=mode).step(2, 0.0, flight, LandmarkObservations())
+            fix = registrar(mode=mode).update(2, 0.0, flight, LandmarkObservations())
             assert fix.by == "" and "frame 2 has no landmark" in fix.cause
 
 
@@ -205,6 +205,6 @@ def test_landmarks_that_fit_hopelessly_leave_a_gap_and_no_place():
     """All six names went round: no change of one or two explains it."""
     seen = look(8, n=6)
     turned = replace(seen.marks, image_px=seen.marks.image_px[[4, 2, 1, 0, 5, 3]])
-    fix = registrar().step(7, 0.0, None, turned)
+    fix = registrar().update(7, 0.0, None, turned)
     assert fix.by == "" and fix.pose is None and fix.state == ("excluded",) * 6
     assert "the landmarks disagree" in fix.cause and "10 times as large" in fix.cause

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from torchvision_dddas.geo.landmark_cutting import cut_out
+from torchvision_dddas.geo.landmark_watch import cut_out_landmarks
 from torchvision_dddas.types import Detections
 
 NOWHERE = np.full((1, 2), np.nan)
@@ -25,7 +25,7 @@ VEHICLES = np.array([False, True, False])
 def test_the_rest_of_a_crowd_stays_a_target_and_what_no_disc_touches_is_as_it_was():
     found, mask = scene()
     middles = np.array([[25.0, 50.0], [105.5, 15.5]])
-    left, numbered = cut_out(found, mask, VEHICLES, middles, np.array([12.0, 12.0]), 20.0)
+    left, numbered = cut_out_landmarks(found, mask, VEHICLES, middles, np.array([12.0, 12.0]), 20.0)
     assert left.score.tolist() == [0.5, 0.7]
     assert left.speed_px.tolist() == [0.0, 2.0]
     x, _, width, _ = left.box_px[0]
@@ -42,20 +42,22 @@ def test_what_a_vehicles_own_blob_leaves_must_be_larger_than_a_rest_of_a_crowd()
     mask[10:22, 112:120] = 2  # 96 px beside it
     found.box_px[1, 2] += 8
     middles, radius = np.array([[105.5, 15.5]]), np.array([9.0])
-    own, _ = cut_out(found, mask, VEHICLES, middles, radius, 30.0)
-    shared, _ = cut_out(found, mask, np.zeros(3, bool), middles, radius, 30.0)
+    own, _ = cut_out_landmarks(found, mask, VEHICLES, middles, radius, 30.0)
+    shared, _ = cut_out_landmarks(found, mask, np.zeros(3, bool), middles, radius, 30.0)
     assert own.score.tolist() == [0.5, 0.7]
     assert shared.score.tolist() == [0.5, 0.6, 0.7]
 
 
 def test_of_a_vehicle_whose_middle_is_not_known_nothing_stays_and_of_others_all_does():
     found, mask = scene()
-    left, numbered = cut_out(found, mask, VEHICLES, NOWHERE, np.array([np.nan]), np.inf)
+    left, numbered = cut_out_landmarks(found, mask, VEHICLES, NOWHERE, np.array([np.nan]), np.inf)
     assert left.score.tolist() == [0.5, 0.7]
     assert (numbered > 0).sum() == ((mask == 1) | (mask == 3)).sum()
 
 
 def test_a_scene_without_anything_stays_empty():
-    left, numbered = cut_out(Detections(), np.zeros((9, 9), np.uint16), np.zeros(0, bool), NOWHERE, np.ones(1), 1.0)
+    left, numbered = cut_out_landmarks(
+        Detections(), np.zeros((9, 9), np.uint16), np.zeros(0, bool), NOWHERE, np.ones(1), 1.0
+    )
     assert len(left) == 0
     assert not numbered.any()

@@ -7,9 +7,9 @@ import pytest
 
 from tests.airborne import CAMERA, GPS_M, look
 from torchvision_dddas.config import AerialParameters
-from torchvision_dddas.geo.landmark_faults import judge
-from torchvision_dddas.geo.plane import ground_points
-from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
+from torchvision_dddas.geo.landmark_faults import check_landmarks
+from torchvision_dddas.geo.plane_homography import locate_pixels
+from torchvision_dddas.geo.pose_estimation import focal_prior, independent_expectation, pose_prior
 from torchvision_dddas.types import Camera, Fix, LandmarkObservations
 
 KNOBS = AerialParameters()
@@ -18,12 +18,12 @@ SEEDS = range(25)
 
 
 def judged(seen, marks, telemetry=True):
-    bare = expected_of(bare_prior(CAMERA, KNOBS), marks.sigma_m)
-    prior = prior_of(seen.flight, CAMERA, KNOBS)
+    bare = independent_expectation(focal_prior(CAMERA, KNOBS), marks.sigma_m)
+    prior = pose_prior(seen.flight, CAMERA, KNOBS)
     assert prior is not None
-    expected = expected_of(prior, marks.sigma_m) if telemetry else bare
+    expected = independent_expectation(prior, marks.sigma_m) if telemetry else bare
     names = NAMES[: len(marks)]
-    return judge(marks, CAMERA, expected, KNOBS.gate_probability, names, bare if telemetry else None)
+    return check_landmarks(marks, CAMERA, expected, KNOBS.gate_probability, names, bare if telemetry else None)
 
 
 def with_pixels_of(marks, order):
@@ -105,7 +105,7 @@ def test_a_row_of_landmarks_does_not_overrule_the_telemetry(seed):
     verdict = judged(astray, seen.marks)
     assert not verdict.alone and not verdict.passed
     fix = Fix(1, "pose", verdict.solution.pose, verdict.solution.covariance[:7, :7])
-    ground, covariance = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+    ground, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
     off = ground - seen.targets
     assert (np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 4**2).all()
 
@@ -143,7 +143,7 @@ def test_without_telemetry_four_of_six_landmarks_whose_names_are_all_wrong_are_n
     marks = LandmarkObservations(
         np.arange(6), np.roll(pixels, turn, axis=0), places, np.full(6, GPS_M), np.ones(6), np.zeros(6)
     )
-    expected = expected_of(bare_prior(camera, KNOBS), marks.sigma_m)
-    verdict = judge(marks, camera, expected, KNOBS.gate_probability, NAMES)
+    expected = independent_expectation(focal_prior(camera, KNOBS), marks.sigma_m)
+    verdict = check_landmarks(marks, camera, expected, KNOBS.gate_probability, NAMES)
     assert not verdict.passed
     assert "no change explains it" in verdict.cause

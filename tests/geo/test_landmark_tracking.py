@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.config import LandmarkParameters
-from torchvision_dddas.geo.landmark_tracking import LandmarkFollower, separate
+from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, separate
 from torchvision_dddas.types import Detections
 
 EXACT = LandmarkParameters(reach_px=10.0)
@@ -67,11 +67,11 @@ def blobs(*boxes):
 
 
 def follower(names="a", **parameters):
-    return LandmarkFollower(tuple(names), LandmarkParameters(reach_px=30.0, **parameters))
+    return LandmarkTracker(tuple(names), LandmarkParameters(reach_px=30.0, **parameters))
 
 
 def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target():
-    found = follower().step(1, plates((100, 50, 10, 10)), blobs((96, 48, 30, 14), (300, 200, 20, 20)))
+    found = follower().update(1, plates((100, 50, 10, 10)), blobs((96, 48, 30, 14), (300, 200, 20, 20)))
     assert found.image_px.tolist() == [[110.5, 54.5]] and found.by == ("motion",)
     assert found.colour_px.tolist() == [[104.5, 54.5]]
     assert (found.blob.tolist(), found.rows.tolist()) == ([0], [True, False])
@@ -79,8 +79,8 @@ def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target
 
 def test_by_choice_it_is_at_its_colours_centre_and_so_it_is_without_a_blob():
     masks = plates((100, 50, 10, 10))
-    chosen = follower(centre="colour").step(1, masks, blobs((96, 48, 30, 14)))
-    alone = follower().step(1, masks, blobs())
+    chosen = follower(centre="colour").update(1, masks, blobs((96, 48, 30, 14)))
+    alone = follower().update(1, masks, blobs())
     for found in (chosen, alone):
         assert found.image_px.tolist() == [[104.5, 54.5]] and found.by == ("colour",)
     assert chosen.rows.tolist() == [True]
@@ -90,18 +90,18 @@ def test_the_centre_of_a_blobs_mass_counts_where_its_pixels_are_known():
     foreground = np.zeros(SIZE, np.uint16)
     foreground[48:62, 96:116] = 1
     foreground[50, 116:126] = 1  # a limb that widens the box
-    found = follower().step(1, plates((100, 50, 10, 10)), blobs((96, 48, 30, 14)), foreground=foreground)
+    found = follower().update(1, plates((100, 50, 10, 10)), blobs((96, 48, 30, 14)), foreground=foreground)
     v, u = np.nonzero(foreground)
     assert found.image_px[0] == pytest.approx([u.mean(), v.mean()])
 
 
 def test_a_person_near_a_vehicle_that_is_not_seen_to_move_stays_a_target():
-    found = follower().step(1, plates((100, 50, 10, 10)), blobs((116, 50, 8, 8)))
+    found = follower().update(1, plates((100, 50, 10, 10)), blobs((116, 50, 8, 8)))
     assert (found.by, found.blob.tolist(), found.rows.tolist()) == (("colour",), [-1], [False])
 
 
 def test_nothing_is_said_of_a_landmark_that_is_not_seen_or_cut_by_the_border():
-    found = follower("ab").step(1, plates((0, 50, 10, 10), []), blobs((0, 48, 14, 14)))
+    found = follower("ab").update(1, plates((0, 50, 10, 10), []), blobs((0, 48, 14, 14)))
     assert np.isnan(found.image_px).all() and found.by == ("", "")
     assert found.rows.tolist() == [True]
 
@@ -109,9 +109,9 @@ def test_nothing_is_said_of_a_landmark_that_is_not_seen_or_cut_by_the_border():
 def test_a_blob_much_larger_than_usual_holds_somebody_else_too_and_its_centre_is_not_taken():
     one = follower()
     for frame in range(1, 6):
-        usual = one.step(frame, plates((100 + frame, 50, 10, 10)), blobs((98 + frame, 48, 14, 14)))
+        usual = one.update(frame, plates((100 + frame, 50, 10, 10)), blobs((98 + frame, 48, 14, 14)))
         assert usual.by == ("motion",)
-    both = one.step(6, plates((106, 50, 10, 10)), blobs((104, 48, 40, 14)))
+    both = one.update(6, plates((106, 50, 10, 10)), blobs((104, 48, 40, 14)))
     assert both.by == ("colour",) and both.image_px.tolist() == [[110.5, 54.5]]
     assert (both.rows.tolist(), both.shared.tolist()) == ([False], [True])
 
@@ -119,27 +119,27 @@ def test_a_blob_much_larger_than_usual_holds_somebody_else_too_and_its_centre_is
 def test_a_blob_no_longer_than_the_vehicle_is_it_however_large_for_its_colour_and_so_are_parts_of_it():
     one, length_px = follower(), np.array([34.0])
     for frame in range(1, 6):
-        one.step(frame, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14)), length_px=length_px)
+        one.update(frame, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14)), length_px=length_px)
     masks, whole = plates((100, 50, 10, 10)), blobs((90, 42, 40, 26))
-    found = one.step(6, masks, whole, length_px=length_px)
+    found = one.update(6, masks, whole, length_px=length_px)
     assert (found.rows.tolist(), found.shared.tolist(), found.by) == ([True], [False], ("colour",))
-    parts = one.step(7, masks, blobs((114, 48, 8, 12), (140, 48, 8, 12), (70, 48, 60, 12)), length_px=length_px)
+    parts = one.update(7, masks, blobs((114, 48, 8, 12), (140, 48, 8, 12), (70, 48, 60, 12)), length_px=length_px)
     assert parts.rows.tolist() == [True, False, False]
 
 
 def test_a_vehicle_whose_colour_is_not_seen_is_kept_from_the_targets_where_it_is_expected():
     masks, at = plates([]), np.array([[4.0, 50.0]])
     seen = blobs((0, 44, 12, 14), (60, 44, 12, 14))
-    found = follower().step(1, masks, seen, expected_px=at, length_px=np.array([20.0]))
+    found = follower().update(1, masks, seen, expected_px=at, length_px=np.array([20.0]))
     assert found.rows.tolist() == [True, False] and np.isnan(found.image_px).all()
 
 
 def test_two_landmarks_in_one_blob_are_at_their_colours_and_the_blob_is_no_target():
     one, masks = follower("ab"), plates((100, 50, 10, 10), (116, 50, 10, 10))
     for frame in range(1, 6):
-        apart = one.step(frame, masks, blobs((98, 48, 14, 14), (114, 48, 14, 14)))
+        apart = one.update(frame, masks, blobs((98, 48, 14, 14), (114, 48, 14, 14)))
         assert apart.by == ("motion", "motion") and apart.blob.tolist() == [0, 1]
-    found = one.step(6, masks, blobs((98, 48, 30, 14)))
+    found = one.update(6, masks, blobs((98, 48, 30, 14)))
     assert found.by == ("colour", "colour")
     assert (found.rows.tolist(), found.shared.tolist()) == ([True], [False])
 
@@ -148,7 +148,7 @@ def test_a_vehicle_is_told_from_a_larger_roof_of_its_colour_by_its_travel_and_un
     one, roof, seen = follower(), (200, 200, 24, 24), []
     for frame in range(1, 15):
         plate = (100 + 3 * frame, 50, 10, 10)
-        found = one.step(frame, plates([plate, roof]), blobs())
+        found = one.update(frame, plates([plate, roof]), blobs())
         seen.append(found.by[0])
         if found.by[0]:
             assert found.image_px[0] == pytest.approx([104.5 + 3 * frame, 54.5])
@@ -161,24 +161,24 @@ def test_what_moves_over_the_ground_counts_not_what_moves_in_the_picture():
     for frame in range(1, 15):
         pan = np.array([[1, 0, -4], [0, 1, 0], [0, 0, 1.0]])
         roof = (300 - 4 * frame, 200, 12, 12)
-        found = one.step(frame, plates([(100, 50, 10, 10), roof]), blobs(), pan)
+        found = one.update(frame, plates([(100, 50, 10, 10), roof]), blobs(), pan)
     assert found is not None and found.image_px[0] == pytest.approx([104.5, 54.5])
 
 
 def test_where_a_landmark_is_expected_tells_between_two_that_stand_still():
     masks = plates([(100, 50, 10, 10), (300, 200, 10, 10)])
-    assert follower().step(1, masks, blobs()).by == ("",)
-    found = follower().step(1, masks, blobs(), expected_px=np.array([[290.0, 210.0]]))
+    assert follower().update(1, masks, blobs()).by == ("",)
+    found = follower().update(1, masks, blobs(), expected_px=np.array([[290.0, 210.0]]))
     assert found.image_px.tolist() == [[304.5, 204.5]]
 
 
 def test_between_differentiations_a_landmark_keeps_its_blob_though_a_nearer_one_comes():
     one = follower(interval_frames=50)
     for frame in range(1, 6):
-        one.step(frame, plates((100, 50, 10, 10)), blobs((104, 44, 22, 22)))
-    found = one.step(6, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14), (104, 44, 22, 22)))
+        one.update(frame, plates((100, 50, 10, 10)), blobs((104, 44, 22, 22)))
+    found = one.update(6, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14), (104, 44, 22, 22)))
     assert found.blob.tolist() == [1]
-    anew = follower().step(6, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14), (104, 44, 22, 22)))
+    anew = follower().update(6, plates((100, 50, 10, 10)), blobs((98, 48, 14, 14), (104, 44, 22, 22)))
     assert anew.blob.tolist() == [0]
 
 
@@ -187,20 +187,20 @@ def test_a_landmark_comes_back_after_it_was_hidden():
     for frame in range(1, 40):
         hidden = 10 <= frame < 20
         plate = (100 + 2 * frame, 50, 10, 10)
-        found = one.step(frame, plates([] if hidden else plate), blobs())
+        found = one.update(frame, plates([] if hidden else plate), blobs())
         assert found.by == (("",) if hidden else ("colour",))
     assert found.image_px[0] == pytest.approx([104.5 + 2 * 39, 54.5])
 
 
 def test_a_plate_with_a_seam_is_one_patch_and_specks_are_none():
     masks = plates([(100, 50, 10, 10), (112, 50, 8, 10), (300, 200, 2, 2)])
-    found = follower().step(1, masks, blobs())
+    found = follower().update(1, masks, blobs())
     assert found.colour_px[0] == pytest.approx([109.5, 54.5], abs=0.2)
 
 
 def test_a_jerk_of_the_camera_that_nobody_measured_does_not_lose_a_landmark():
     one = follower()
     for frame in range(1, 6):
-        one.step(frame, plates((100, 50, 10, 10)), blobs(), np.eye(3))
-    found = one.step(6, plates((122, 62, 10, 10)), blobs(), None)
+        one.update(frame, plates((100, 50, 10, 10)), blobs(), np.eye(3))
+    found = one.update(6, plates((122, 62, 10, 10)), blobs(), None)
     assert found.image_px.tolist() == [[126.5, 66.5]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import LandmarkParameters
-from torchvision_dddas.geo.landmark_trajectories import Courses
+from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
 from torchvision_dddas.types import Landmarks
 
 RATE = 25.0
@@ -25,7 +25,7 @@ def once_a_second(seconds, places):
 
 
 def test_reports_once_a_second_give_a_straight_way_in_every_frame_and_no_jump_at_a_report():
-    course = Courses(landmarks(once_a_second(range(4), [(0, 0), (5, 0), (10, 5), (10, 15)])), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(once_a_second(range(4), [(0, 0), (5, 0), (10, 5), (10, 15)])), KNOBS, RATE)
     places = np.array([course.at(frame).east_north_m[0] for frame in range(1, 77)])
     assert places[[0, 25, 50, 75]].tolist() == [[0, 0], [5, 0], [10, 5], [10, 15]]
     assert places[10] == pytest.approx([2, 0])
@@ -34,20 +34,22 @@ def test_reports_once_a_second_give_a_straight_way_in_every_frame_and_no_jump_at
 
 
 def test_reports_at_broken_frames_are_met_between_the_pictures():
-    course = Courses(landmarks([(0.5, 0, 0, 0), (1.5, 0, 1, 0), (2.5, 0, 4, 0)]), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks([(0.5, 0, 0, 0), (1.5, 0, 1, 0), (2.5, 0, 4, 0)]), KNOBS, RATE)
     assert course.at(1).east_north_m[0] == pytest.approx([0.5, 0])
     assert course.at(2).east_north_m[0] == pytest.approx([2.5, 0])
 
 
 def test_what_is_known_of_a_landmark_stands_beside_it():
-    marks = Courses(landmarks([(1, 0, 3, 4, 0, 0.2)]), KNOBS, RATE).at(1)
+    marks = LandmarkTrajectories(landmarks([(1, 0, 3, 4, 0, 0.2)]), KNOBS, RATE).at(1)
     assert (marks.landmark.tolist(), marks.east_north_m.tolist()) == ([0], [[3, 4]])
     assert (marks.sigma_m.tolist(), marks.pixel_sigma.tolist(), marks.up_m.tolist()) == ([0.2], [2.0], [1.5])
     assert np.isnan(marks.image_px).all()
 
 
 def test_a_short_dropout_is_bridged_straight_and_less_sure_in_its_middle():
-    course = Courses(landmarks(once_a_second([0, 1, 2, 5, 6, 7], [(t, 0) for t in (0, 1, 2, 5, 6, 7)])), KNOBS, RATE)
+    course = LandmarkTrajectories(
+        landmarks(once_a_second([0, 1, 2, 5, 6, 7], [(t, 0) for t in (0, 1, 2, 5, 6, 7)])), KNOBS, RATE
+    )
     middle = course.at(1 + round(3.5 * RATE))
     assert middle.east_north_m[0] == pytest.approx([3.5, 0], abs=0.03)
     assert middle.sigma_m[0] == pytest.approx(np.hypot(1.0, 0.5 * 1.5), rel=0.02)
@@ -56,7 +58,7 @@ def test_a_short_dropout_is_bridged_straight_and_less_sure_in_its_middle():
 
 def test_a_long_dropout_goes_straight_on_for_gap_s_and_then_the_landmark_is_absent_until_it_reports_again():
     seconds = [0, 1, 2, 12, 13]
-    course = Courses(landmarks(once_a_second(seconds, [(2.0 * t, 0) for t in seconds])), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(once_a_second(seconds, [(2.0 * t, 0) for t in seconds])), KNOBS, RATE)
     after = course.at(1 + 25 * 5)
     assert after.east_north_m[0] == pytest.approx([10, 0])
     assert after.sigma_m[0] == pytest.approx(np.hypot(1.0, 0.5 * 3))
@@ -67,7 +69,7 @@ def test_a_long_dropout_goes_straight_on_for_gap_s_and_then_the_landmark_is_abse
 
 
 def test_after_the_last_report_too():
-    course = Courses(landmarks(once_a_second([0, 1, 2], [(0, 0), (0, 1), (0, 2)])), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(once_a_second([0, 1, 2], [(0, 0), (0, 1), (0, 2)])), KNOBS, RATE)
     assert course.at(1 + 25 * 4).east_north_m[0] == pytest.approx([0, 4])
     assert len(course.at(1 + 25 * 7)) == 0
 
@@ -75,7 +77,7 @@ def test_after_the_last_report_too():
 def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_lay_from_it():
     corner = [(1 + 25 * t, 0, *place, 1) for t, place in ((0, (0, 0)), (10, (10, 0)), (20, (10, 10)))]
     reports = [(1 + 25 * t, 0, t, 0.5) for t in range(4)]
-    course = Courses(landmarks(reports + corner), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(reports + corner), KNOBS, RATE)
     assert course.at(1 + 25 * 10).east_north_m[0] == pytest.approx([10, 0.5])
     assert course.at(1 + 25 * 16).east_north_m[0] == pytest.approx([10, 6.5])
     # It strays from its plan by no more than it keeps to it at all.
@@ -86,14 +88,14 @@ def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_la
 def test_a_dropout_between_reports_on_a_plan_begins_and_ends_without_a_jump():
     plan = [(1, 0, 0, 0, 1), (501, 0, 20, 0, 1)]
     reports = [(1 + 25 * t, 0, t, 1.0) for t in range(4)] + [(1 + 25 * t, 0, t, -1.0) for t in range(15, 20)]
-    course = Courses(landmarks(reports + plan), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(reports + plan), KNOBS, RATE)
     north = np.array([course.at(frame).east_north_m[0, 1] for frame in range(1, 400)])
     assert north[75] == pytest.approx(1.0) and north[375] == pytest.approx(-1.0)
     assert np.abs(np.diff(north)).max() < 0.02
 
 
 def test_a_plan_alone_will_do():
-    course = Courses(landmarks([(1, 0, 0, 0, 1), (11, 0, 10, 0, 1, 0.3)]), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks([(1, 0, 0, 0, 1), (11, 0, 10, 0, 1, 0.3)]), KNOBS, RATE)
     marks = course.at(6)
     assert marks.east_north_m.tolist() == [[5, 0]]
     assert marks.sigma_m[0] == pytest.approx((1.0 + 0.3) / 2)
@@ -101,7 +103,7 @@ def test_a_plan_alone_will_do():
 
 def test_a_table_with_places_in_pictures_gives_those_rows_and_no_others():
     rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (1, 1, 1, 1, 0, np.nan, 7, 8), (3, 0, 2, 0, 0, np.nan, 9, 9), (2, 1, 1, 1)]
-    course = Courses(landmarks(rows, ("a", "b")), KNOBS, RATE)
+    course = LandmarkTrajectories(landmarks(rows, ("a", "b")), KNOBS, RATE)
     assert course.pictured
     assert course.at(1).landmark.tolist() == [0, 1] and course.at(1).image_px.tolist() == [[5, 6], [7, 8]]
     assert len(course.at(2)) == 0
@@ -110,16 +112,18 @@ def test_a_table_with_places_in_pictures_gives_those_rows_and_no_others():
 
 def test_a_row_with_a_picture_and_no_place_gets_the_place_between_its_reports():
     rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (2, 0, np.nan, np.nan, 0, np.nan, 5, 7), (3, 0, 2, 0, 0, np.nan, 5, 8)]
-    marks = Courses(landmarks(rows), KNOBS, RATE).at(2)
+    marks = LandmarkTrajectories(landmarks(rows), KNOBS, RATE).at(2)
     assert marks.east_north_m.tolist() == [[1, 0]] and marks.image_px.tolist() == [[5, 7]]
 
 
 def test_a_landmark_without_any_place_is_absent():
-    assert len(Courses(landmarks([(1, 0, np.nan, np.nan)]), KNOBS, RATE).at(1)) == 0
+    assert len(LandmarkTrajectories(landmarks([(1, 0, np.nan, np.nan)]), KNOBS, RATE).at(1)) == 0
 
 
 def test_speeds_are_those_over_the_ground():
-    course = Courses(landmarks(once_a_second(range(5), [(3 * t, 4 * t) for t in range(5)]), ("a", "b")), KNOBS, RATE)
+    course = LandmarkTrajectories(
+        landmarks(once_a_second(range(5), [(3 * t, 4 * t) for t in range(5)]), ("a", "b")), KNOBS, RATE
+    )
     speed = course.speed_m_s(51)
     assert speed[0] == pytest.approx(5.0) and np.isnan(speed[1])
 
@@ -127,4 +131,4 @@ def test_speeds_are_those_over_the_ground():
 def test_degrees_are_refused():
     degrees = landmarks([(1, 0, 0, 0)])
     with pytest.raises(ValueError, match="wanted local metres"):
-        Courses(Landmarks(**{**vars(degrees), "geographic": True}), KNOBS, RATE)
+        LandmarkTrajectories(Landmarks(**{**vars(degrees), "geographic": True}), KNOBS, RATE)

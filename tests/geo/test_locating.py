@@ -8,7 +8,7 @@ import pytest
 from tests.upright import boxes, camera
 from torchvision_dddas.config import load_config
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.ground_locator import locate, survey
+from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.geometry import east_north, lonlat
 from torchvision_dddas.types import DetectionTable
 
@@ -38,7 +38,7 @@ def table(cam, place=(0.0, 0.0), frames=(1, 2, 3), identity=(5, 9)):
 
 
 def found(tables, cameras, poses=None, settings=SETTINGS, rate=None):
-    return list(locate(survey(tables, cameras, poses or [None] * len(tables), settings, rate), settings))
+    return list(GroundLocator(cameras, settings, poses=poses or (), rate_hz=rate).locate_tables(tables))
 
 
 def test_one_camera_keeps_the_identities_of_its_table():
@@ -62,13 +62,13 @@ def test_rows_without_identity_are_numbered_after_those_that_have_one():
 def test_an_identity_twice_in_a_frame_is_said_with_its_line():
     twice = replace(table(camera()), identity=np.array([5, 9, 5, 5, 5, 9]))
     with pytest.raises(InputError, match=r"line 4: identity 5 is there already in frame 2; wanted each once"):
-        survey([twice], [camera()], [None], SETTINGS)
+        GroundLocator(camera(), SETTINGS).locate_tables([twice])
 
 
 def test_scores_that_are_no_probabilities_make_sure_positions():
     one = table(camera(), frames=(1,))
     graded = replace(one, score=np.array([87.0, 3.5]))
-    (located,) = locate(survey([graded], [camera()], [None], SETTINGS), SETTINGS)
+    (located,) = GroundLocator(camera(), SETTINGS).locate_tables([graded])
     assert located.positions.score.tolist() == [1, 1]
     assert located.score.tolist() == [87, 3.5]
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring, within_95
-from torchvision_dddas.geo.plane import absolute, ground_points, homography_fix
-from torchvision_dddas.geo.pose_estimation import moved
+from torchvision_dddas.geo.plane_homography import absolute_covariance, fix_by_homography, locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.pose_estimation import move_pose
 from torchvision_dddas.geo.projection import project
-from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.geometry import lonlat, transfer
 from torchvision_dddas.types import Fix
 
@@ -28,8 +28,8 @@ def posed(seen, sigma=1e-4):
 @pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
 def test_exact_landmarks_give_exact_ground(n, tilt_deg):
     seen = look(1, n=n, errors=0, tilt_deg=tilt_deg)
-    fix = homography_fix(1, seen.marks, SOLVER)
-    ground, _ = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+    fix = fix_by_homography(1, seen.marks, SOLVER)
+    ground, _ = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
     assert fix.by == "homography" and fix.state == ("used",) * n
     assert np.allclose(ground, seen.targets, atol=1e-6)
     assert fix.image_from_ground is not None
@@ -41,8 +41,8 @@ def test_exact_landmarks_give_exact_ground(n, tilt_deg):
 def test_landmarks_far_from_the_origin_do_as_well_and_their_errors_are_the_same(far, tilt_deg, sigma_m):
     seen = look(1, errors=0, tilt_deg=tilt_deg, sigma_m=sigma_m)
     moved_away = replace(seen.marks, east_north_m=seen.marks.east_north_m + far)
-    ground, covariance = ground_points(homography_fix(1, moved_away, SOLVER), CAMERA, seen.targets_px, 1.0)
-    near = ground_points(homography_fix(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)[1]
+    ground, covariance = locate_pixels(fix_by_homography(1, moved_away, SOLVER), CAMERA, seen.targets_px, 1.0)
+    near = locate_pixels(fix_by_homography(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)[1]
     assert np.allclose(ground, seen.targets + far, atol=1e-6)
     assert np.allclose(covariance, near, rtol=1e-5)
 
@@ -53,7 +53,7 @@ def test_ellipses_of_the_homography_hold_95_percent(case):
     inside = []
     for seed in range(60):
         seen = look(seed, **case)
-        ground, covariance = ground_points(homography_fix(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)
+        ground, covariance = locate_pixels(fix_by_homography(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)
         inside.append(within_95(ground - seen.targets, covariance))
     assert 0.88 < np.mean(inside) < 0.99
 
@@ -63,7 +63,7 @@ def test_a_sure_landmark_weighs_more_than_an_unsure_one():
     for sigma in (np.r_[np.full(5, 0.05), 5.0], np.full(6, 2.0)):
         seen = look(2, n=6, errors=0)
         wrong = replace(seen.marks, east_north_m=seen.marks.east_north_m + np.eye(6)[:, 5:] * 5.0, sigma_m=sigma)
-        ground, _ = ground_points(homography_fix(1, wrong, SOLVER), CAMERA, seen.targets_px, 1.0)
+        ground, _ = locate_pixels(fix_by_homography(1, wrong, SOLVER), CAMERA, seen.targets_px, 1.0)
         off.append(np.abs(ground - seen.targets).max())
     assert off[0] < 0.05 < 0.5 < off[1]
 
@@ -75,39 +75,39 @@ def test_six_landmarks_are_better_than_four_of_them():
         seen = look(seed, n=6)
         some = replace(seen.marks, **{k: getattr(seen.marks, k)[[0, 1, 3, 4]] for k in vars(seen.marks)})
         for off, marks in ((six, seen.marks), (four, some)):
-            ground, _ = ground_points(homography_fix(1, marks, SOLVER), CAMERA, seen.targets_px, 1.0)
+            ground, _ = locate_pixels(fix_by_homography(1, marks, SOLVER), CAMERA, seen.targets_px, 1.0)
             off.append(np.linalg.norm(ground - seen.targets, axis=1).mean())
     assert np.mean(six) < np.mean(four)
 
 
 def test_too_few_landmarks_are_refused_with_how_many_are_missing_and_where():
-    fix = homography_fix(17, look(1, n=3).marks, SOLVER)
+    fix = fix_by_homography(17, look(1, n=3).marks, SOLVER)
     assert fix.by == "" and fix.cause == "frame 17 has 3 landmarks, 1 missing of the 4 that are needed"
-    assert np.isnan(ground_points(fix, CAMERA, np.zeros((2, 2)), 1.0)[0]).all()
+    assert np.isnan(locate_pixels(fix, CAMERA, np.zeros((2, 2)), 1.0)[0]).all()
 
 
 def test_landmarks_on_one_line_are_refused():
     row = np.stack([np.linspace(-25, 25, 5), 0.01 * np.linspace(-25, 25, 5) ** 2 / 25], axis=1)
-    fix = homography_fix(3, look(1, places=row, errors=0).marks, SOLVER)
+    fix = fix_by_homography(3, look(1, places=row, errors=0).marks, SOLVER)
     assert fix.by == "" and "the 5 landmarks of frame 3 stand on one line" in fix.cause
 
 
 def test_landmarks_nearer_to_a_line_than_their_places_are_known_are_refused():
     row = np.array([[-25.0, 0.0], [-8.0, 1.0], [8.0, 0.0], [25.0, 1.0]])
-    assert "for how well they are known" in homography_fix(1, look(1, places=row, errors=0).marks, SOLVER).cause
-    assert homography_fix(1, look(1, places=row, errors=0, sigma_m=0.0, pixel_sigma=0.1).marks, SOLVER).by
+    assert "for how well they are known" in fix_by_homography(1, look(1, places=row, errors=0).marks, SOLVER).cause
+    assert fix_by_homography(1, look(1, places=row, errors=0, sigma_m=0.0, pixel_sigma=0.1).marks, SOLVER).by
 
 
 def test_three_of_four_on_a_line_are_refused():
     corner = np.array([[-20.0, 0.0], [0.0, 0.0], [20.0, 0.0], [0.0, 20.0]])
-    assert homography_fix(1, look(1, places=corner, errors=0).marks, SOLVER).by == ""
+    assert fix_by_homography(1, look(1, places=corner, errors=0).marks, SOLVER).by == ""
 
 
 def test_beyond_the_horizon_there_is_no_ground():
     seen = look(1, errors=0, tilt_deg=75.0, places=ring(4) * 0.4)
     sky = np.array([[960.0, -400.0], [960.0, 600.0]])
-    for fix in (homography_fix(1, replace(seen.marks, sigma_m=np.zeros(4)), SOLVER), posed(seen)):
-        ground, covariance = ground_points(fix, CAMERA, sky, 1.0)
+    for fix in (fix_by_homography(1, replace(seen.marks, sigma_m=np.zeros(4)), SOLVER), posed(seen)):
+        ground, covariance = locate_pixels(fix, CAMERA, sky, 1.0)
         assert np.isfinite(ground).all(axis=1).tolist() == [False, True]
         assert np.isfinite(covariance).all(axis=(1, 2)).tolist() == [False, True]
 
@@ -115,8 +115,8 @@ def test_beyond_the_horizon_there_is_no_ground():
 def test_raw_degrees_lose_what_local_metres_keep():
     seen = look(4, n=6, errors=0)
     degrees = (lonlat(seen.marks.east_north_m, TUCSON), TUCSON)
-    fix = homography_fix(1, seen.marks, SOLVER, degrees=degrees, paper=True)
-    ground, covariance = ground_points(fix, CAMERA, seen.targets_px, 1.0)
+    fix = fix_by_homography(1, seen.marks, SOLVER, degrees=degrees, paper=True)
+    ground, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
     off = np.linalg.norm(ground - seen.targets, axis=1)
     assert fix.by == "paper" and 1e-3 < np.median(off) < 10
     assert np.isnan(covariance).all()
@@ -125,24 +125,24 @@ def test_raw_degrees_lose_what_local_metres_keep():
 def test_rays_meet_the_plane_that_is_asked_for():
     seen = look(5, errors=0, tilt_deg=45.0)
     above = project(np.array([[3.0, 4.0, 1.7]]), seen.pose, CAMERA)
-    assert np.allclose(ground_points(posed(seen), CAMERA, above, 1.0, up_m=1.7)[0], [[3.0, 4.0]])
-    assert np.linalg.norm(ground_points(posed(seen), CAMERA, above, 1.0)[0] - [3.0, 4.0]) > 1.0
+    assert np.allclose(locate_pixels(posed(seen), CAMERA, above, 1.0, up_m=1.7)[0], [[3.0, 4.0]])
+    assert np.linalg.norm(locate_pixels(posed(seen), CAMERA, above, 1.0)[0] - [3.0, 4.0]) > 1.0
 
 
 def test_the_covariance_of_rays_is_that_of_the_pose_and_of_the_pixel():
     seen = look(6, errors=0, tilt_deg=30.0)
     fix = Fix(1, "pose", seen.pose, np.diag([0.01, 0.02, 0.05, 1.0, 0.5, 2.0, 0.01]) ** 2)
-    _, covariance = ground_points(fix, CAMERA, seen.targets_px, 2.0)
+    _, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 2.0)
     columns = []
     for step in 1e-5 * np.eye(7):
         there, back = (
-            ground_points(replace(fix, pose=moved(seen.pose, sign * step)), CAMERA, seen.targets_px, 2.0)[0]
+            locate_pixels(replace(fix, pose=move_pose(seen.pose, sign * step)), CAMERA, seen.targets_px, 2.0)[0]
             for sign in (1, -1)
         )
         columns.append((there - back) / 2e-5)
     by_pose = np.stack(columns, axis=2)
     columns = [
-        (ground_points(fix, CAMERA, seen.targets_px + step, 2.0)[0] - seen.targets) / 1e-3 for step in 1e-3 * np.eye(2)
+        (locate_pixels(fix, CAMERA, seen.targets_px + step, 2.0)[0] - seen.targets) / 1e-3 for step in 1e-3 * np.eye(2)
     ]
     by_pixel = np.stack(columns, axis=2)
     expected = by_pose @ fix.covariance @ by_pose.swapaxes(1, 2) + 4 * by_pixel @ by_pixel.swapaxes(1, 2)
@@ -157,23 +157,23 @@ def test_rays_meet_a_slope_where_it_is():
 
     there = np.array([[3.0, 4.0], [-9.0, 2.0]])
     pixels = project(np.c_[there, slope(there)], seen.pose, CAMERA)
-    ground, _ = ground_points(posed(seen), CAMERA, pixels, 1.0, surface=slope)
+    ground, _ = locate_pixels(posed(seen), CAMERA, pixels, 1.0, surface=slope)
     assert np.allclose(ground, there, atol=0.02)
-    nowhere, _ = ground_points(posed(seen), CAMERA, pixels, 1.0, surface=lambda p: np.full(len(p), np.nan))
+    nowhere, _ = locate_pixels(posed(seen), CAMERA, pixels, 1.0, surface=lambda p: np.full(len(p), np.nan))
     assert np.isnan(nowhere).all()
 
 
 def test_the_middle_of_a_body_tells_where_it_stands_once_its_height_is_known():
     seen = look(8, errors=0, tilt_deg=35.0)
     middle = project(UPRIGHT + np.array([0, 0, 0.85]), seen.pose, CAMERA)
-    feet, _ = ground_points(posed(seen), CAMERA, middle, 1.0, up_m=0.85)
+    feet, _ = locate_pixels(posed(seen), CAMERA, middle, 1.0, up_m=0.85)
     assert np.allclose(feet, UPRIGHT[:, :2], atol=1e-6)
-    body, _ = ground_points(posed(seen), CAMERA, middle, 1.0)
+    body, _ = locate_pixels(posed(seen), CAMERA, middle, 1.0)
     assert (np.linalg.norm(body - UPRIGHT[:, :2], axis=1) > 0.4).all()
 
 
 def test_the_error_common_to_the_team_is_added_to_the_absolute_covariance_only():
-    assert np.allclose(absolute(np.diag([1.0, 2.0])[None], GPS_M), np.diag([1 + GPS_M**2, 2 + GPS_M**2]))
+    assert np.allclose(absolute_covariance(np.diag([1.0, 2.0])[None], GPS_M), np.diag([1 + GPS_M**2, 2 + GPS_M**2]))
 
 
 @pytest.mark.parametrize("paper", [False, True])
@@ -182,5 +182,5 @@ def test_landmarks_on_one_line_or_in_one_spot_are_refused_in_words(paper):
     row = replace(seen.marks, east_north_m=np.outer(np.arange(5), [3.0, 4.0]))
     spot = replace(seen.marks, image_px=np.tile(seen.marks.image_px[:1], (5, 1)))
     for marks, words in ((row, "stand on one line"), (spot, "show in one spot of the picture")):
-        fix = homography_fix(7, marks, SOLVER, paper=paper)
+        fix = fix_by_homography(7, marks, SOLVER, paper=paper)
         assert fix.by == "" and f"the 5 landmarks of frame 7 {words}" in fix.cause

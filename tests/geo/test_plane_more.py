@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.solvers import PlaneSolver, load_solver
+from torchvision_dddas.geo.plane_solvers import PlaneSolver, load_solver
 from torchvision_dddas.geometry import lonlat
 
 TUCSON = (-110.95, 31.3)
@@ -228,7 +228,7 @@ def test_both_back_ends_give_the_same():
 
 
 def test_the_onboard_solver_needs_no_torch():
-    load = "from torchvision_dddas.geo.solvers import load_solver; load_solver('auto')"
+    load = "from torchvision_dddas.geo.plane_solvers import load_solver; load_solver('auto')"
     script = f"import sys; {load}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "False"

@@ -8,8 +8,7 @@ import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring
 from torchvision_dddas.config import AerialParameters
-from torchvision_dddas.geo.initial_pose import find_pose
-from torchvision_dddas.geo.pose_estimation import bare_prior, expected_of, prior_of
+from torchvision_dddas.geo.pose_estimation import find_pose, focal_prior, independent_expectation, pose_prior
 from torchvision_dddas.types import Flight
 
 KNOBS = AerialParameters()
@@ -25,14 +24,14 @@ SAYS_NOT: dict[str, dict[str, Any]] = {
 
 
 def told(flight, ground_up_m=0.0):
-    prior = prior_of(flight, CAMERA, KNOBS, ground_up_m)
+    prior = pose_prior(flight, CAMERA, KNOBS, ground_up_m)
     assert prior is not None
     return prior
 
 
 def solved(seen, flight, used=None, camera=CAMERA):
-    prior = prior_of(flight, camera, KNOBS) or bare_prior(camera, KNOBS)
-    return find_pose(seen.marks, camera, expected_of(prior, seen.marks.sigma_m), used)
+    prior = pose_prior(flight, camera, KNOBS) or focal_prior(camera, KNOBS)
+    return find_pose(seen.marks, camera, independent_expectation(prior, seen.marks.sigma_m), used)
 
 
 def same(found, pose):
@@ -126,8 +125,8 @@ def test_landmarks_that_no_camera_up_there_can_see_have_no_pose():
 
 
 def test_telemetry_that_says_nothing_of_the_pose_is_no_prior():
-    assert prior_of(None, CAMERA, KNOBS) is None
-    assert prior_of(Flight(NAN, speed_m_s=5.0), CAMERA, KNOBS) is None
+    assert pose_prior(None, CAMERA, KNOBS) is None
+    assert pose_prior(Flight(NAN, speed_m_s=5.0), CAMERA, KNOBS) is None
 
 
 def test_a_tilt_that_is_only_guessed_tells_little():

@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.airborne import CAMERA
-from torchvision_dddas.geo.pose_estimation import moved
+from torchvision_dddas.geo.pose_estimation import move_pose
 from torchvision_dddas.geo.projection import (
     axes_of,
-    bent,
-    lifted,
+    distort_pixels,
+    normalize,
+    normalize_with_slopes,
     project,
     project_with_slopes,
     rays,
-    slopes_of_lift,
-    unbent,
+    undistort_pixels,
 )
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import CameraPose
@@ -80,7 +80,7 @@ def test_a_point_beyond_the_bend_of_the_lens_is_shown_nowhere():
 def test_slopes_of_the_projection_are_its_differences(camera):
     _, by_pose, by_point = project_with_slopes(POINTS, ABOVE, camera)
     for axis, step in enumerate(1e-6 * np.eye(7)):
-        there, back = (project(POINTS, moved(ABOVE, sign * step), camera) for sign in (1, -1))
+        there, back = (project(POINTS, move_pose(ABOVE, sign * step), camera) for sign in (1, -1))
         assert np.allclose((there - back) / 2e-6, by_pose[:, :, axis], rtol=1e-5, atol=1e-4)
     for axis, step in enumerate(1e-6 * np.eye(3)):
         there, back = (project(POINTS + sign * step, ABOVE, camera) for sign in (1, -1))
@@ -89,11 +89,11 @@ def test_slopes_of_the_projection_are_its_differences(camera):
 
 def test_slopes_of_the_lift_are_its_differences():
     pixels = np.array([[200.0, 100.0], [1500.0, 900.0]])
-    _, by_pixel, by_focal = slopes_of_lift(pixels, 1.0, BENT)
+    _, by_pixel, by_focal = normalize_with_slopes(pixels, 1.0, BENT)
     for axis, step in enumerate(1e-3 * np.eye(2)):
-        apart = lifted(pixels + step, 1.0, BENT) - lifted(pixels - step, 1.0, BENT)
+        apart = normalize(pixels + step, 1.0, BENT) - normalize(pixels - step, 1.0, BENT)
         assert np.allclose(apart / 2e-3, by_pixel[:, :, axis], rtol=1e-4, atol=1e-9)
-    apart = lifted(pixels, np.exp(1e-5), BENT) - lifted(pixels, np.exp(-1e-5), BENT)
+    apart = normalize(pixels, np.exp(1e-5), BENT) - normalize(pixels, np.exp(-1e-5), BENT)
     assert np.allclose(apart / 2e-5, by_focal, rtol=1e-4)
 
 
@@ -121,7 +121,7 @@ def test_what_turns_about_up_undone_leaves_a_tilt():
 def test_a_straight_lens_shows_points_at_unbent_pixels_and_bent_ones_are_the_lens_again():
     seen = project(POINTS, ABOVE, BENT)
     straight = project(POINTS, replace(ABOVE, focal=1.0), replace(BENT, k1=0.0, k2=0.0))
-    found = unbent(project(POINTS, replace(ABOVE, focal=1.0), BENT), BENT)
+    found = undistort_pixels(project(POINTS, replace(ABOVE, focal=1.0), BENT), BENT)
     assert np.allclose(found, straight, atol=1e-6)
-    assert np.allclose(bent(unbent(seen, BENT), BENT), seen, atol=1e-6)
-    assert np.abs(unbent(seen, BENT) - seen).max() > 1
+    assert np.allclose(distort_pixels(undistort_pixels(seen, BENT), BENT), seen, atol=1e-6)
+    assert np.abs(undistort_pixels(seen, BENT) - seen).max() > 1

@@ -8,7 +8,7 @@ import pytest
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.ranging import sight, touches_border
+from torchvision_dddas.geo.ranging import range_people, touches_border
 
 PEOPLE = np.array([[0.0, 8.0], [2.5, 12.0], [-3.0, 20.0], [1.0, 30.0]])
 WHOLE = np.zeros(4, bool)
@@ -17,7 +17,7 @@ WHOLE = np.zeros(4, bool)
 def seen(box_px, cam, cut=None, place=(0.0, 0.0), **parameters):
     cut = np.zeros(len(box_px), bool) if cut is None else cut
     where = poses(cam, len(box_px), place)
-    return sight(box_px, cut, cam, where, where.place, GroundParameters(**{"body_height_m": 1.75, **parameters}))
+    return range_people(box_px, cut, cam, where, where.place, GroundParameters(**{"body_height_m": 1.75, **parameters}))
 
 
 @pytest.mark.parametrize("use", ["height", "feet", "both"])

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.plane import ground_points
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geo.projection import axes_of, project
-from torchvision_dddas.geo.solvers import load_solver
 from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 
 CAMERA = Camera("aerial", (1920, 1080), (1371.0, 1371.0), (959.5, 539.5))
@@ -23,7 +23,9 @@ def flown(alike_s: tuple[float, float], told_s: float, seed: int) -> tuple[float
     Telemetry and receivers err as the settings say, alike over alike_s each; the registrar is told told_s.
     """
     rng = np.random.default_rng(seed)
-    registrar = Registrar(CAMERA, with_parameters(Settings(), {"aerial.correlation_s": told_s}), load_solver("onboard"))
+    registrar = Georeferencer(
+        CAMERA, with_parameters(Settings(), {"aerial.correlation_s": told_s}), load_solver("onboard")
+    )
     keep = np.repeat(np.exp(-STEP_S / np.array(alike_s)), (6, 8))
     off, inside = [], []
     slow = rng.normal(0, 1, 14)
@@ -38,8 +40,8 @@ def flown(alike_s: tuple[float, float], told_s: float, seed: int) -> tuple[float
         )
         reports = RING_M + GPS_M * slow[6:].reshape(4, 2)
         marks = LandmarkObservations(np.arange(4), seen[0], reports, np.full(4, GPS_M), np.ones(4), np.zeros(4))
-        fix = registrar.step(frame, STEP_S * frame, flight, marks)
-        found, covariance = ground_points(fix, CAMERA, seen[1], 1.0)
+        fix = registrar.update(frame, STEP_S * frame, flight, marks)
+        found, covariance = locate_pixels(fix, CAMERA, seen[1], 1.0)
         if frame > FRAMES // 2:
             away = found - TARGETS_M
             off.append(np.linalg.norm(away, axis=1).mean())

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from torchvision_dddas.geo.speeds import Movers
+from torchvision_dddas.geo.aerial_targets import TargetSpeeds
 
 EXACT = 1e-4 * np.eye(2)[None]
 
 
 def fed(places, times, covariance=EXACT, identity=1, movers=None):
     """The velocities, one a place."""
-    movers = movers or Movers()
+    movers = movers or TargetSpeeds()
     return np.array(
         [
-            movers.step(t, np.array([identity]), np.array([p], float), covariance)[0]
+            movers.update(t, np.array([identity]), np.array([p], float), covariance)[0]
             for t, p in zip(times, places, strict=True)
         ]
     )
@@ -44,15 +44,15 @@ def test_a_target_without_identity_has_no_velocity():
 
 
 def test_a_target_that_comes_back_after_long_begins_anew():
-    movers = Movers()
+    movers = TargetSpeeds()
     fed(np.outer(np.arange(10) / 10, [3.0, 0.0]), np.arange(10) / 10, movers=movers)
     assert np.isnan(fed([[500.0, 0.0]], [60.0], movers=movers)).all()
 
 
 def test_what_is_said_of_one_target_does_not_touch_another():
-    movers, alone = Movers(), Movers()
+    movers, alone = TargetSpeeds(), TargetSpeeds()
     for k in range(10):
         both = np.array([[0.1 * k, 0.0], [5.0, 0.3 * k]])
-        together = movers.step(k / 10, np.array([1, 2]), both, np.repeat(EXACT, 2, axis=0))
-        single = alone.step(k / 10, np.array([2]), both[1:], EXACT)
+        together = movers.update(k / 10, np.array([1, 2]), both, np.repeat(EXACT, 2, axis=0))
+        single = alone.update(k / 10, np.array([2]), both[1:], EXACT)
     np.testing.assert_allclose(together[1], single[0])

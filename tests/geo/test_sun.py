@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.sun import BODY_WIDTH_M, feet_below, shadow_m, sun_at
+from torchvision_dddas.geo.aerial_targets import BODY_WIDTH_M, remove_shadow, shadow_m, sun_at
 from torchvision_dddas.simulation.drawing import camera_axes, view_from_pose
 from torchvision_dddas.types import Camera, CameraPose
 
@@ -50,8 +50,8 @@ def test_the_feet_of_a_strip_of_body_and_one_of_shadow_are_found_from_the_mean_o
     width = np.linalg.norm(view.project(foot[None] + (BODY_WIDTH_M, 0, 0))[0] - start)
     lengths[0] = np.hypot(lengths[0], width)
     middle = np.average([body.mean(axis=0), cast.mean(axis=0)], axis=0, weights=lengths)
-    found = feet_below(middle[None], foot[None], pose, CAMERA, height, shade[:2])
+    found = remove_shadow(middle[None], foot[None], pose, CAMERA, height, shade[:2])
     assert np.abs(found[0] - start).max() < 0.1
     # Without a shadow it is the body's middle that counts, half its height up.
-    alone = feet_below(body.mean(axis=0)[None], foot[None], pose, CAMERA, height, np.zeros(2))
+    alone = remove_shadow(body.mean(axis=0)[None], foot[None], pose, CAMERA, height, np.zeros(2))
     assert np.abs(alone[0] - start).max() < 0.1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.elevation import up
+from torchvision_dddas.geo.terrain import ground_height
 from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 
@@ -49,7 +49,7 @@ def test_heights_are_relative_to_the_origin_and_lie_where_they_belong(tmp_path):
     x, y = np.array(warp.transform("EPSG:4326", "EPSG:32612", *lonlat(places, ORIGIN).T)) - np.array(
         [[v] for v in centre("EPSG:32612")]
     )
-    np.testing.assert_allclose(up(found, places), 0.05 * x + 0.1 * y, atol=2e-3)
+    np.testing.assert_allclose(ground_height(found, places), 0.05 * x + 0.1 * y, atol=2e-3)
 
 
 def test_a_raster_in_degrees_gives_the_same_heights(tmp_path):
@@ -58,13 +58,13 @@ def test_a_raster_in_degrees_gives_the_same_heights(tmp_path):
     k = np.arange(cells) - cells // 2
     heights = (tall - 0.1 * k[:, None] * step * 110_900 + 0 * k[None]).astype("float32")
     found = read_elevation(write(tmp_path / "a.tif", heights, "EPSG:4326", step), HERE, ORIGIN, 60)
-    assert up(found, np.array([[0.0, 50.0]]))[0] == pytest.approx(5.0, abs=0.01)
+    assert ground_height(found, np.array([[0.0, 50.0]]))[0] == pytest.approx(5.0, abs=0.01)
 
 
 def test_local_metres_without_an_origin_are_those_of_the_raster(tmp_path):
     path = write(tmp_path / "a.tif", slope(), None, middle=(500.0, 700.0))
     found = read_elevation(path, np.array([[500.0, 700.0]]), None, 60)
-    first, second = up(found, np.array([[500.0, 700.0], [520.0, 730.0]]))
+    first, second = ground_height(found, np.array([[500.0, 700.0], [520.0, 730.0]]))
     assert second - first == pytest.approx(0.05 * 20 + 0.1 * 30, abs=1e-3)
 
 
@@ -74,7 +74,7 @@ def test_holes_are_unknown_whether_declared_or_not(tmp_path, declared):
     heights[40:60, 100:160] = -9999.0 if declared else -32768.0
     found = read_elevation(write(tmp_path / "a.tif", heights, **declared), HERE, ORIGIN, 80)
     row = np.array([[30.0, 50.0]])
-    assert np.isnan(up(found, row))
+    assert np.isnan(ground_height(found, row))
     known = found.up_m[np.isfinite(found.up_m)]
     assert known.min() > -20
 
@@ -84,8 +84,8 @@ def test_where_the_origin_is_not_covered_up_is_counted_from_the_landmarks(tmp_pa
     path = write(tmp_path / "a.tif", slope(base=900.0), middle=(x + 300, y))
     places = np.array([[0.0, 0.0], [280.0, 0.0], [320.0, 0.0]])
     found = read_elevation(path, places, ORIGIN, 50)
-    assert np.isnan(up(found, places[:1]))
-    assert up(found, places[1:]).mean() == pytest.approx(0, abs=0.1)
+    assert np.isnan(ground_height(found, places[:1]))
+    assert ground_height(found, places[1:]).mean() == pytest.approx(0, abs=0.1)
     assert found.base_m == pytest.approx(900, abs=0.5)
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.opencv_colours import OpenCVColourFinder
+from torchvision_dddas.geo.colours import OpenCVColourFinder
 from torchvision_dddas.tuning.colours import fit_colours
 
 NAMES = ("red", "green")

@@ -6,9 +6,9 @@ import torch
 
 from tests import airborne
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.plane import ground_points
-from torchvision_dddas.geo.solvers import load_solver
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import locate_pixels
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.tuning.aerial_examples import SPREADS, Seen, kept, look_at, of_settings, only_noise
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
@@ -45,8 +45,8 @@ def test_the_loss_is_that_of_the_hard_registrar():
     for seed in range(3):
         look = airborne.look(seed)
         flight = replace(look.flight, hfov_rad=HFOV)
-        fix = Registrar(airborne.CAMERA, settings, load_solver("onboard")).step(1, 0.0, flight, look.marks)
-        place, covariance = ground_points(fix, airborne.CAMERA, look.targets_px, 1.0)
+        fix = Georeferencer(airborne.CAMERA, settings, load_solver("onboard")).update(1, 0.0, flight, look.marks)
+        place, covariance = locate_pixels(fix, airborne.CAMERA, look.targets_px, 1.0)
         off = place - look.targets
         squared = np.einsum("ti,tij,tj->t", off, np.linalg.inv(covariance), off)
         wanted = (squared + np.log(np.linalg.det(covariance))) / 2 + np.log(2 * np.pi)

@@ -11,7 +11,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.metres import inside
 from torchvision_dddas.evaluation.metrics.truth import Positions
-from torchvision_dddas.geo.ranging import sight
+from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.ground_examples import KNOBS, sighted, sightings_of
@@ -56,7 +56,7 @@ def test_the_loss_is_that_of_the_hard_places():
     settings = Settings()
     one = example(0, settings)
     seen = one.content[0]
-    found = sight(seen.box_px, seen.cut, CAMERA, seen.poses, seen.here_m, settings.ground)
+    found = range_people(seen.box_px, seen.cut, CAMERA, seen.poses, seen.here_m, settings.ground)
     off, covariance = found.east_north_m - seen.true_m, found.covariance_m2
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
     wanted = (squared + np.log(np.linalg.det(covariance))) / 2 + np.log(2 * np.pi)
@@ -90,7 +90,7 @@ def test_ellipses_hold_as_many_places_as_they_say_on_people_not_tuned_on():
         shares = []
         for seed in range(100, 104):
             seen = example(seed, settings, 120, **errors).content[0]
-            found = sight(seen.box_px, seen.cut, CAMERA, seen.poses, seen.here_m, settings.ground)
+            found = range_people(seen.box_px, seen.cut, CAMERA, seen.poses, seen.here_m, settings.ground)
             shares.append(inside(found.east_north_m - seen.true_m, found.covariance_m2))
         return float(np.nanmean(np.concatenate(shares)))
 

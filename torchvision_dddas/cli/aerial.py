@@ -14,7 +14,7 @@ from torchvision_dddas.io.run_inputs import AerialInput, read_locator
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.geo import Locator
+    from torchvision_dddas.geo import AerialLocator
     from torchvision_dddas.io.output.location_output import GroundedJournal
     from torchvision_dddas.io.output.run_record import Record
 
@@ -85,8 +85,7 @@ def aerial_into(
     quiet: bool = False,
 ) -> "GroundedJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.geo import check_table, locate
-    from torchvision_dddas.geo.table_location import frames_of, outside
+    from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
     from torchvision_dddas.io.output.location_output import GroundedOutput
@@ -115,20 +114,20 @@ def aerial_into(
             journal.notes.append(
                 "the table has no identities: targets are numbered anew in every frame, tracks are none"
             )
-        if beyond := int(outside(locator, read.box_px[:, :2] + read.box_px[:, 2:] / 2).sum()):
+        if beyond := int(is_outside(locator, read.box_px[:, :2] + read.box_px[:, 2:] / 2).sum()):
             width, height = locator.camera.size_px
             journal.notes.append(
                 f"{beyond} of {len(read)} boxes lie far outside the camera's pictures of {width} x {height} px: is its "
                 "file for this size?"
             )
-        with progress("locate", len(frames_of(read, locator.site.landmarks)), quiet) as tick:
-            for grounded in locate(read, locator):
+        with progress("locate", len(frames_to_locate(read, locator.site.landmarks)), quiet) as tick:
+            for grounded in locator.locate_table(read):
                 output.write(grounded)
                 tick()
     return journal
 
 
-def about(locator: "Locator") -> dict[str, Any]:
+def about(locator: "AerialLocator") -> dict[str, Any]:
     """What run.json says of how pictures were laid on the ground."""
     camera = locator.camera
     return {
@@ -138,7 +137,7 @@ def about(locator: "Locator") -> dict[str, Any]:
     }
 
 
-def ground_facts(locator: "Locator", background: Path | None) -> dict[str, Any]:
+def ground_facts(locator: "AerialLocator", background: Path | None) -> dict[str, Any]:
     """What GroundedOutput.begin wants to know. Raises InputError for a background that cannot be read."""
     from functools import partial
 

@@ -119,9 +119,9 @@ def _from_person(table: Path | None, pixels: list[float], distance_m: float, bod
 def _focal(distance_m: list[float], height_px: list[float], body_height_m: float) -> Found:
     import numpy as np
 
-    from torchvision_dddas.geo.focal import focal_length
+    from torchvision_dddas.geo.camera_calibration import calibrate_focal_length
 
-    found = focal_length(np.array(distance_m), np.array(height_px), body_height_m)
+    found = calibrate_focal_length(np.array(distance_m), np.array(height_px), body_height_m)
     _check("focal_px", found.focal_px, "px")
     n = len(height_px)
     spread = "" if math.isnan(found.spread_px) else f", one measurement ± {found.spread_px:.1f} px"
@@ -138,7 +138,7 @@ def _focal(distance_m: list[float], height_px: list[float], body_height_m: float
 
 
 def _from_people(table: Path, camera: Path | None, body_height_m: float, settings: "Settings") -> Found:
-    from torchvision_dddas.geo.camera_calibration import stance
+    from torchvision_dddas.geo.camera_calibration import calibrate_pose
     from torchvision_dddas.geo.ranging import touches_border
     from torchvision_dddas.io.camera_files import read_camera
     from torchvision_dddas.io.detection_tables import read_detections
@@ -150,7 +150,7 @@ def _from_people(table: Path, camera: Path | None, body_height_m: float, setting
         )
     kind, read = read_camera(camera), read_detections(table)
     cut = touches_border(read.box_px, kind.size_px) if read.cut is None else read.cut
-    found = stance(read.box_px[~cut], kind, body_height_m, settings.ground.height_sigma)
+    found = calibrate_pose(read.box_px[~cut], kind, body_height_m, settings.ground.height_sigma)
     _check("height_m", found.height_m, "m")
     keys = {
         "height_m": found.height_m,

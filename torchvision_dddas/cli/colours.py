@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from torchvision_dddas.geo.colour_calibration import Sample
+    from torchvision_dddas.geo.colour_calibration import ColourSample
     from torchvision_dddas.types import Colours
 
 Box = tuple[int, int, int, int]
@@ -50,7 +50,7 @@ def colours(
     Writes a TOML for `dddas run --colours`, and beside it a picture of all that the ranges mark: look at it.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.geo.colour_calibration import hsv_of, ranges_of
+    from torchvision_dddas.geo.colour_calibration import build_ranges, to_hsv
     from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input
 
     least = load_config(config, set_ or []).landmarks.least_area_px
@@ -63,13 +63,13 @@ def colours(
     for path in (out, drawing):
         refuse_folder(path)
     images = [_picture(path) for path in pictures]
-    found = [hsv_of(image) for image in images]
+    found = [to_hsv(image) for image in images]
     if boxes:
         groups, called = _given(boxes, found[0], pictures[0]), [name for name, _ in boxes]
     else:
         groups = _found(found, least, count or (len(wanted) or None), pictures, quiet)
         called = _called(wanted, groups)
-    low, high, others = ranges_of(groups, found, least)
+    low, high, others = build_ranges(groups, found, least)
     ranges = _checked(called, low, high)
     _write(out, drawing, images, found, groups, ranges)
     if not quiet:
@@ -121,8 +121,8 @@ def _picture(path: Path) -> "np.ndarray":
     return np.ascontiguousarray(image)
 
 
-def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[list["Sample"]]:
-    from torchvision_dddas.geo.colour_calibration import in_box
+def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[list["ColourSample"]]:
+    from torchvision_dddas.geo.colour_calibration import sample_box
 
     groups = []
     height, width = hsv.shape[:2]
@@ -130,7 +130,7 @@ def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[
         x, y, wide, high = box
         if wide < 1 or high < 1 or x + wide > width or y + high > height:
             raise InputError(f"--at {name}: the box {x},{y},{wide},{high} is not in {path}, {width} x {height} px")
-        sample = in_box(hsv, box)
+        sample = sample_box(hsv, box)
         if sample is None:
             raise InputError(f"--at {name}: nothing in the box {x},{y},{wide},{high} of {path} has a strong colour")
         groups.append([sample])
@@ -139,15 +139,15 @@ def _given(boxes: list[tuple[str, Box]], hsv: "np.ndarray", path: Path) -> list[
 
 def _found(
     pictures: list["np.ndarray"], least: int, count: int | None, paths: list[Path], quiet: bool
-) -> list[list["Sample"]]:
-    from torchvision_dddas.geo.colour_calibration import pooled, standing_out
+) -> list[list["ColourSample"]]:
+    from torchvision_dddas.geo.colour_calibration import find_samples, pool_samples
 
     samples = []
     with progress("colours", len(pictures), quiet) as tick:
         for number, hsv in enumerate(pictures):
-            samples.append(standing_out(hsv, least, number))
+            samples.append(find_samples(hsv, least, number))
             tick()
-    groups = pooled(samples, count)
+    groups = pool_samples(samples, count)
     where = str(paths[0]) if len(paths) == 1 else f"the {len(paths)} pictures"
     if not groups or (count is not None and len(groups) < count):
         has = f"{len(groups)} of {count} colours stand" if groups else "no colour stands"
@@ -155,18 +155,18 @@ def _found(
     return sorted(groups, key=lambda group: group[0].hue)
 
 
-def _called(names: list[str], groups: Sequence[Sequence["Sample"]]) -> list[str]:
+def _called(names: list[str], groups: Sequence[Sequence["ColourSample"]]) -> list[str]:
     """A name for each colour: the words given that fit best, or the names given in the order of hues."""
     from scipy.optimize import linear_sum_assignment
 
-    from torchvision_dddas.geo.colour_calibration import HUES, hue_apart, named
+    from torchvision_dddas.geo.colour_calibration import HUES, hue_difference, name_hues
 
     hues = [group[0].hue for group in groups]
     if not names:
-        return named(hues)
+        return name_hues(hues)
     if not set(names) <= HUES.keys():
         return names
-    away = [[float(abs(hue_apart(HUES[name], hue))) for name in names] for hue in hues]
+    away = [[float(abs(hue_difference(HUES[name], hue))) for name in names] for hue in hues]
     return [names[place] for place in linear_sum_assignment(away)[1]]
 
 
@@ -187,19 +187,19 @@ def _write(
     drawing: Path,
     images: list["np.ndarray"],
     found: list["np.ndarray"],
-    groups: Sequence[Sequence["Sample"]],
+    groups: Sequence[Sequence["ColourSample"]],
     ranges: "Colours",
 ) -> None:
     import cv2
     import numpy as np
 
-    from torchvision_dddas.geo.colour_calibration import marked
+    from torchvision_dddas.geo.colour_calibration import mask_range
     from torchvision_dddas.io.atomic_files import cannot_write, write_whole
     from torchvision_dddas.io.colour_output import colours_picture, colours_toml
 
     sheets = []
     for number, (image, hsv) in enumerate(zip(images, found, strict=True)):
-        masks = np.stack([marked(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
+        masks = np.stack([mask_range(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
         own = [np.array([s.box_px for s in group if s.picture == number], float).reshape(-1, 4) for group in groups]
         sheet = colours_picture(image, masks, ranges, own)
         width = images[0].shape[1]
@@ -212,7 +212,9 @@ def _write(
         raise cannot_write(out, error) from error
 
 
-def _summary(ranges: "Colours", groups: Sequence[Sequence["Sample"]], others: list[int], pictures: int) -> list[str]:
+def _summary(
+    ranges: "Colours", groups: Sequence[Sequence["ColourSample"]], others: list[int], pictures: int
+) -> list[str]:
     lines = []
     where = "the picture" if pictures == 1 else "the pictures"
     for name, low, high, group, more in zip(ranges.names, ranges.low, ranges.high, groups, others, strict=True):

@@ -38,7 +38,7 @@ def path(
         # After an error nothing that remembers a frame is trusted.
         engine = next(visions, None) or load_engine(backend, shedding.settings)
         spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
-        watch = None if ready.watch is None else ready.watch.anew()
+        watch = None if ready.watch is None else ready.watch.restarted()
 
         def retune(frame: "Frame") -> "tuple[Settings, tuple[Adjustment, ...]]":
             settings, moved = shedding(frame)

@@ -60,8 +60,7 @@ def ground_into(
     quiet: bool = False,
 ) -> "PositionJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.geo.ground_locator import locate as located
-    from torchvision_dddas.geo.ground_locator import survey
+    from torchvision_dddas.geo.ground_locator import GroundLocator
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.camera_files import left_open, read_camera, read_poses
     from torchvision_dddas.io.detection_tables import read_detections
@@ -78,7 +77,8 @@ def ground_into(
         read = [read_detections(table) for table in tables]
         kinds = [read_camera(camera) for camera in cameras]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
-        found = survey(read, kinds, where, settings, rate_hz)
+        locator = GroundLocator(kinds, settings, poses=where, rate_hz=rate_hz)
+        frames = locator.locate_tables(read)
         facts = {
             "input": list(tables),
             "cameras": list(cameras),
@@ -86,10 +86,10 @@ def ground_into(
             "rows": [len(table) for table in read],
             "settings": settings.model_dump(),
         }
-        journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), found.origin_deg is not None)
+        journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), locator.origin_deg is not None)
         journal.notes += [note for file, pose in zip(cameras, where, strict=True) if (note := left_open(file, pose))]
         with progress("locate", None, quiet) as tick:
-            for frame in located(found, settings):
+            for frame in frames:
                 output.write(frame)
                 tick()
         if not any(len(table) for table in read):

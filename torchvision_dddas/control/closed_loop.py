@@ -11,9 +11,10 @@ from torchvision_dddas.control.ground_confirmation import CloserLook
 from torchvision_dddas.control.sensor_monitor import Notice, Vigilance
 from torchvision_dddas.control.steering_api import Steering
 from torchvision_dddas.control.vehicles import Instrument
-from torchvision_dddas.geo import Locator, Site, Watch, local, site_of
-from torchvision_dddas.geo.elevation import about
-from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.terrain import shift_origin
 from torchvision_dddas.people.detector import recognizer_of
 from torchvision_dddas.types import Command, Elevation, FrameResult, Landmarks, Order, Registration, Scene, Telemetry
 
@@ -30,14 +31,16 @@ def mission_of(source: Instrument, settings: Settings, backend: str, by_landmark
     settings = fitted(settings, source)
     site = _site_of(source)
     site = replace(site, elevation=_elevation(source, site), sun_rad=source.sun_rad)
-    locator = Locator(site, source.camera, settings, load_solver(backend), source.rate_hz, focal_known=True)
+    locator = AerialLocator.from_site(site, source.camera, settings, load_solver(backend), source.rate_hz, True)
     colours = source.colours
     by_landmarks = by_landmarks and len(colours) > 0
-    watch = Watch(locator, colours, load_colours(backend)) if by_landmarks else Watch(locator, None, None)
+    watch = (
+        LandmarkWatch(locator, colours, load_colours(backend)) if by_landmarks else LandmarkWatch(locator, None, None)
+    )
     closer = CloserLook(settings, recognizer_of(settings.people, backend)) if len(colours) else None
     steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
     if steering is not None:
-        source.steer(steering.begin(locator.flight(0.0)))
+        source.steer(steering.begin(locator.telemetry_at(0.0)))
     return Mission(source, watch, settings, closer, steering)
 
 
@@ -57,7 +60,7 @@ class Mission:
     def __init__(
         self,
         source: Instrument,
-        watch: Watch,
+        watch: LandmarkWatch,
         settings: Settings,
         closer: CloserLook | None,
         steering: Steering | None,
@@ -72,7 +75,7 @@ class Mission:
         locator, frame = self.watch.locator, scene.frame
         first = frame.number - MEMORY_S * self.source.rate_hz
         site = self._site(_recent(self.source.landmarks(), first), self.source.telemetry())
-        locator.learn(site)
+        locator.set_site(site)
         assert site.telemetry is not None
         self._vigilance.reports(self.source.last, site.landmarks, site.telemetry)
         if frame.image.any():  # no picture is all black, but what stands for a missing one
@@ -105,7 +108,7 @@ class Mission:
             now_s = (now - 1) / self.source.rate_hz
             locator = self.watch.locator
             there, moved = self._steering.step(
-                grounded, confirmed, now_s, locator.marks(now), locator.flight(now_s), step
+                grounded, confirmed, now_s, locator.landmarks_at(now), locator.telemetry_at(now_s), step
             )
             command = self._in_degrees(there)
             self.source.steer(command)
@@ -118,12 +121,12 @@ class Mission:
         """The reports in the metres of the site."""
         site = self.watch.locator.site
         if self._origin is not None:
-            landmarks, telemetry = local(landmarks, self._origin), local(telemetry, self._origin)
+            landmarks, telemetry = to_local(landmarks, self._origin), to_local(telemetry, self._origin)
         return replace(site, landmarks=landmarks, telemetry=telemetry)
 
     def _metres_per_px(self, time_s: float) -> float:
         """On level ground in the picture's middle; NaN where the UAV does not say how it flies."""
-        flight = self.watch.locator.flight(time_s)
+        flight = self.watch.locator.telemetry_at(time_s)
         if flight is None:
             return float("nan")
         down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
@@ -133,7 +136,7 @@ class Mission:
         """(P,) radius of each located target on the ground; 0 where unknown."""
         grounded = surveyed.grounded
         assert grounded is not None
-        return np.nan_to_num(self.watch.locator.radii(grounded.fix, grounded.box_px[grounded.row]))
+        return np.nan_to_num(self.watch.locator.ground_radii(grounded.fix, grounded.box_px[grounded.row]))
 
     def _in_degrees(self, command: Command) -> Command:
         """A command with the places that the vehicles understand."""
@@ -155,16 +158,16 @@ def _site_of(source: Instrument) -> Site:
     """The reports so far, about the first of them; about the source's own origin while no ground vehicle has any."""
     landmarks, telemetry = source.landmarks(), source.telemetry()
     if np.isfinite(landmarks.place).all(axis=1).any():
-        return site_of(landmarks, telemetry)
+        return build_site(landmarks, telemetry)
     origin = source.origin_deg
-    return Site(local(landmarks, origin), local(telemetry, origin), origin)
+    return Site(to_local(landmarks, origin), to_local(telemetry, origin), origin)
 
 
 def _elevation(source: Instrument, site: Site) -> Elevation:
     """The heights of the ground in the metres of the site."""
     if site.origin_deg is None:
         return source.elevation
-    return about(source.elevation, -geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
+    return shift_origin(source.elevation, -geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
 
 
 def _recent(landmarks: Landmarks, first: float) -> Landmarks:

@@ -8,7 +8,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.control.expected_regions import expected_regions
-from torchvision_dddas.geo.ranging import sight
+from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.people.collaboration import Beliefs, Look, look, view_of
 from torchvision_dddas.people.confirmation import confirmed_by
 from torchvision_dddas.people.detector import people_in
@@ -77,7 +77,7 @@ class CloserLook:
             np.full(len(people), camera.heading_rad),
             np.full(len(people), camera.pitch_rad),
         )
-        seen = sight(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
+        seen = range_people(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
         known = seen.by != "bearing"
         view = view_of(camera, place[0], camera.heading_rad, settings.people, settings.ground)
         # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.

@@ -1,25 +1,27 @@
-"""From the picture to the ground, seen from the air: landmarks and telemetry on one plane, then frame by frame."""
+"""From the picture to the ground: aerial cameras with telemetry and landmarks, and ranging by cameras on the ground."""
 
-from torchvision_dddas.geo.aerial_locator import Locator, Targets
-from torchvision_dddas.geo.crowd_grouping import gathered
-from torchvision_dddas.geo.landmark_watch import Watch, Watched, check_colours, unpictured
-from torchvision_dddas.geo.site import Site, camera_of, check_span, local, site_of, unknown_heights
-from torchvision_dddas.geo.table_location import check_table, locate
+from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix, check_table, frames_to_locate, is_outside
+from torchvision_dddas.geo.aerial_targets import Targets
+from torchvision_dddas.geo.crowds import group_crowds
+from torchvision_dddas.geo.landmark_watch import LandmarkWatch, WatchedScene, check_colours, without_pixels
+from torchvision_dddas.geo.site import Site, build_site, check_span, describe_unknown_heights, resolve_camera, to_local
 
 __all__ = [
-    "Locator",
+    "AerialLocator",
+    "FrameFix",
+    "LandmarkWatch",
     "Site",
     "Targets",
-    "Watch",
-    "Watched",
-    "camera_of",
+    "WatchedScene",
+    "build_site",
     "check_colours",
     "check_span",
     "check_table",
-    "gathered",
-    "local",
-    "locate",
-    "site_of",
-    "unknown_heights",
-    "unpictured",
+    "describe_unknown_heights",
+    "frames_to_locate",
+    "group_crowds",
+    "is_outside",
+    "resolve_camera",
+    "to_local",
+    "without_pixels",
 ]

@@ -1,50 +1,54 @@
-"""How the picture lies on the ground, frame by frame, and where that puts the targets."""
+"""How the pictures of a camera in the air map to the ground, frame by frame, and where that puts the targets."""
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import AerialParameters, Settings
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.elevation import surface, up
-from torchvision_dddas.geo.georeferencer import Registrar
-from torchvision_dddas.geo.landmark_selection import LandmarkUse, chosen
-from torchvision_dddas.geo.landmark_trajectories import Courses
-from torchvision_dddas.geo.plane import absolute, ground_points
-from torchvision_dddas.geo.site import Site
-from torchvision_dddas.geo.solvers import PlaneSolver
-from torchvision_dddas.geo.speeds import Movers
-from torchvision_dddas.geo.sun import feet_below, shadow_m, sun_at
+from torchvision_dddas.geo.aerial_targets import (
+    Targets,
+    TargetSpeeds,
+    point_sigma_px,
+    reference_points,
+    remove_shadow,
+    shadow_m,
+    sun_at,
+)
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, LandmarkUse, select_landmarks
+from torchvision_dddas.geo.plane_homography import LEAST, absolute_covariance, locate_pixels, relative_width
+from torchvision_dddas.geo.plane_solvers import PlaneSolver, load_solver
+from torchvision_dddas.geo.site import Site, build_site, resolve_camera
+from torchvision_dddas.geo.terrain import ground_height, surface_of
 from torchvision_dddas.io.telemetry import at
-from torchvision_dddas.types import Adjustment, AerialLocations, Camera, Fix, Flight, LandmarkObservations, Positions
+from torchvision_dddas.types import (
+    Adjustment,
+    AerialLocations,
+    Camera,
+    DetectionTable,
+    Elevation,
+    Fix,
+    Flight,
+    LandmarkObservations,
+    Landmarks,
+    Positions,
+    Telemetry,
+    TrackedFrame,
+    Tracks,
+)
+
+# A landmark or a target may show this far beyond the picture's edge, as a share of the picture's side.
+_OUTSIDE = 0.25
 
 
 @dataclass(frozen=True)
-class Targets:
-    """The boxes of one frame.
-
-    target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is an identity.
-    score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; None: of none.
-    bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v of what stands for it in place of the
-    box's centre, NaN where it does; None: for all.
-    """
-
-    box_px: np.ndarray
-    target: np.ndarray
-    lasting: np.ndarray
-    score: np.ndarray
-    feet_px: np.ndarray | None = None
-    bodies: bool = False
-    middle_px: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Look:
-    """How the picture of one frame lies on the ground, by which landmarks; adjustments and seconds as in Scene."""
+class FrameFix:
+    """How one frame maps to the ground, and the landmarks that were used; adjustments and seconds as in Scene."""
 
     fix: Fix
     marks: LandmarkObservations
@@ -52,88 +56,121 @@ class Look:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class Locator:
-    """How the picture lies on the ground, frame by frame, and where that puts targets. Feed it frames in order."""
+class AerialLocator:
+    """Locates targets seen from the air, by telemetry, landmarks of known place, or both. Call it with frames in order.
+
+    >>> locator = AerialLocator(camera, telemetry)
+    >>> places = locator.locate(tracks)
+    """
 
     def __init__(
+        self,
+        camera: Camera | None,
+        telemetry: Telemetry | None = None,
+        landmarks: Landmarks | None = None,
+        elevation: Elevation | None = None,
+        settings: Settings | None = None,
+        *,
+        rate_hz: float = 10.0,
+        backend: str = "auto",
+        size_px: tuple[int, int] | None = None,
+    ) -> None:
+        """Telemetry and landmarks may be in degrees or in local metres, both in one kind.
+
+        camera: None where the field of view is that of the telemetry or of the settings; then size_px is needed.
+        elevation: heights in metres about the first landmark, or about the vehicle's first place without landmarks.
+        rate_hz: frames a second. backend: auto, onboard or torch.
+        Raises InputError where neither telemetry nor landmarks are given, or they contradict each other.
+        """
+        for value, kind in ((camera, Camera), (telemetry, Telemetry), (landmarks, Landmarks), (elevation, Elevation)):
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"AerialLocator got {type(value).__name__} where a {kind.__name__} is wanted")
+        if not rate_hz > 0:
+            raise InputError(f"rate_hz must be positive, got {rate_hz}")
+        settings = settings or Settings()
+        site = replace(build_site(landmarks, telemetry), elevation=elevation)
+        camera, focal_known, self.notes = resolve_camera(camera, size_px, site.telemetry, settings)
+        self._begin(site, camera, settings, load_solver(backend), rate_hz, focal_known)
+
+    @classmethod
+    def from_site(
+        cls, site: Site, camera: Camera, settings: Settings, solver: PlaneSolver, rate_hz: float, focal_known: bool
+    ) -> "AerialLocator":
+        """A locator of prepared parts. Raises InputError for aerial.mode = paper with landmarks in metres."""
+        locator = cls.__new__(cls)
+        locator.notes = []
+        locator._begin(site, camera, settings, solver, rate_hz, focal_known)
+        return locator
+
+    def _begin(
         self, site: Site, camera: Camera, settings: Settings, solver: PlaneSolver, rate_hz: float, focal_known: bool
     ) -> None:
-        """Raises InputError for aerial.mode = paper, which works in degrees, where the landmarks are in metres."""
         if settings.aerial.mode == "paper" and site.origin_deg is None:
             raise InputError(
                 "aerial.mode = paper works in degrees of longitude and latitude, and the landmarks are in metres; give "
                 "longitude_deg,latitude_deg, or take another mode"
             )
-        self.site, self.camera, self.settings, self.rate_hz = site, camera, settings, rate_hz
-        self.courses = Courses(site.landmarks, settings.landmarks, rate_hz)
-        self._solver, self.focal_known = solver, focal_known
-        self._registrar = Registrar(camera, settings, solver, focal_known, site.landmarks.names)
-        self._movers = Movers()
+        self.camera, self.settings, self.rate_hz, self.focal_known = camera, settings, rate_hz, focal_known
+        self.set_site(site)
+        self._solver = solver
+        self._georeferencer = Georeferencer(camera, settings, solver, focal_known, site.landmarks.names)
+        self._speeds = TargetSpeeds()
         self._use = LandmarkUse()
-        self._ground = surface(site.elevation) if site.elevation is not None else None
+        self._ground = surface_of(site.elevation)
 
-    def anew(self) -> "Locator":
-        """The same, as before its first frame."""
-        return Locator(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
+    def restarted(self) -> "AerialLocator":
+        """The same locator as before its first frame."""
+        return self.from_site(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
 
-    def learn(self, site: Site) -> None:
-        """What landmarks and vehicle have reported by now, in the metres of the site so far."""
+    def set_site(self, site: Site) -> None:
+        """Take over what landmarks and vehicle have reported by now, in the metres of the site so far."""
         self.site = site
-        self.courses = Courses(site.landmarks, self.settings.landmarks, self.rate_hz)
+        self.trajectories = LandmarkTrajectories(site.landmarks, self.settings.landmarks, self.rate_hz)
 
-    def places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
-        """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
-        return ground_points(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
+    def locate(self, tracks: Tracks | TrackedFrame) -> AerialLocations:
+        """Where the targets of the next frame stand. Raises InputError for anything but Tracks or a TrackedFrame."""
+        if isinstance(tracks, TrackedFrame):
+            targets, frame = tracked_targets(tracks, bool(self.settings.crowds.join_m)), tracks.number
+        elif isinstance(tracks, Tracks):
+            seen = tracks.row >= 0
+            targets = Targets(tracks.box_px[seen], tracks.identity[seen], seen[seen], tracks.score[seen].clip(0, 1))
+            frame = tracks.frame
+        else:
+            raise InputError(f"locate wants Tracks or a TrackedFrame, got {type(tracks).__name__}")
+        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)
 
-    def radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
-        """(N,) m, of circles as large as the ellipses within boxes (N, 4) on the ground; NaN where it is not known."""
-        low, high = box_px[:, :2] - 0.5, box_px[:, :2] + box_px[:, 2:] - 0.5
-        corners = low, np.c_[high[:, 0], low[:, 1]], np.c_[low[:, 0], high[:, 1]]
-        start, right, below = np.split(self.places(fix, np.concatenate(corners)), 3)
-        return np.asarray(np.sqrt(np.linalg.norm(right - start, axis=1) * np.linalg.norm(below - start, axis=1)) / 2)
-
-    def feet(self, pixels: np.ndarray, fix: Fix, height_m: float) -> np.ndarray | None:
-        """Pixels (N, 2) of the feet of bodies so high that are seen together with their shadows.
-
-        None where shadows do not count, or it is not known how the camera stands or the sun.
-        """
-        sun = self._sun(self.time_s(fix.frame)) if self.settings.aerial.shadows else None
-        if sun is None or fix.pose is None:
-            return None
-        near = self.places(fix, pixels)
-        up_m = np.zeros(len(near)) if self._ground is None else self._ground(near)
-        return feet_below(pixels, np.c_[near, up_m], fix.pose, self.camera, height_m, shadow_m(sun, height_m))
+    def locate_table(self, table: DetectionTable) -> Iterator[AerialLocations]:
+        """Where the targets of a table stand, in each of its frames and in those between that show landmarks."""
+        lasting = table.identity > 0 if table.identity is not None else np.zeros(len(table), bool)
+        score = np.clip(table.score, 0, 1) if table.probable else np.ones(len(table))
+        for frame in frames_to_locate(table, self.site.landmarks):
+            rows = table.rows(frame)
+            feet = None if table.feet_px is None else table.feet_px[rows]
+            targets = Targets(table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours)
+            yield self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)
 
     def time_s(self, frame: int) -> float:
-        """Of a frame, since the clip's first."""
+        """Time of a frame since the clip's first."""
         return (frame - 1) / self.rate_hz
 
-    def marks(self, frame: int) -> LandmarkObservations:
-        """The landmarks of a frame, on the ground: those whose place and height are known."""
-        return self._standing(self.courses.at(frame))
+    def landmarks_at(self, frame: int) -> LandmarkObservations:
+        """The landmarks of a frame whose place and height are known."""
+        marks = self.trajectories.at(frame)
+        if self._ground is None or not len(marks):
+            return marks
+        marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
+        # Where the raster has no height, a landmark would be put on a plane that is not the ground's.
+        return marks[np.isfinite(marks.up_m)]
 
-    def look(self, frame: int, marks: LandmarkObservations) -> Look:
-        """How the picture of a frame lies on the ground; marks: those of `marks`, with their places in the picture."""
-        start = time.perf_counter()
-        speeds = self.courses.speed_m_s(frame)[marks.landmark]
-        rows, self._use, adjustments = chosen(frame, self._use, marks, speeds, self.settings.landmarks)
-        used = chosen_rows(marks, rows)
-        degrees = None
-        if self.settings.aerial.mode == "paper" and self.site.origin_deg is not None:
-            degrees = geometry.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
-        when = self.time_s(frame)
-        fix = self._registrar.step(frame, when, self.flight(when), used, degrees)
-        return Look(fix, used, adjustments, {"fix": time.perf_counter() - start})
-
-    def flight(self, time_s: float) -> Flight | None:
-        """What the telemetry says, its altitude counted from up = 0; unknown where that is below the ground."""
+    def telemetry_at(self, time_s: float) -> Flight | None:
+        """What the telemetry says, its altitude counted from up = 0; NaN where that is below the ground."""
         flight = at(self.site.telemetry, time_s) if self.site.telemetry is not None else None
         if flight is None:
             return None
         below, base = 0.0, 0.0
         if self.site.elevation is not None:
             base = self.site.elevation.base_m
-            below = float(up(self.site.elevation, np.array([flight.place]))[0])
+            below = float(ground_height(self.site.elevation, np.array([flight.place]))[0])
         altitude = flight.altitude_m + below
         if not math.isfinite(altitude) and self.site.elevation is not None:
             altitude = flight.above_sea_m - base
@@ -141,60 +178,95 @@ class Locator:
             altitude = math.nan
         return replace(flight, altitude_m=altitude)
 
-    def ground(
+    def fix_frame(self, frame: int, marks: LandmarkObservations) -> FrameFix:
+        """How a frame maps to the ground. marks: those of `landmarks_at`, with their places in the picture."""
+        start = time.perf_counter()
+        speeds = self.trajectories.speed_m_s(frame)[marks.landmark]
+        rows, self._use, adjustments = select_landmarks(frame, self._use, marks, speeds, self.settings.landmarks)
+        used = marks[rows]
+        degrees = None
+        if self.settings.aerial.mode == "paper" and self.site.origin_deg is not None:
+            degrees = geometry.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
+        when = self.time_s(frame)
+        fix = self._georeferencer.update(frame, when, self.telemetry_at(when), used, degrees)
+        return FrameFix(fix, used, adjustments, {"fix": time.perf_counter() - start})
+
+    def locate_targets(
         self,
-        look: Look,
+        fixed: FrameFix,
         targets: Targets,
         adjustments: Sequence[Adjustment] = (),
         seconds: Mapping[str, float] | None = None,
     ) -> AerialLocations:
-        """Where the targets of a frame stand by its fix; none that the fix cannot place. Feed it frames in order.
+        """Where the targets of a frame stand; those that the fix cannot place are left out.
 
-        adjustments, seconds: what happened to the frame before, for the record.
+        adjustments, seconds: of the stages before, for the record.
         """
-        fix = look.fix
+        fix = fixed.fix
         start = time.perf_counter()
-        place, relative, own = self._laid(fix, targets)
+        place, relative, own = self._placed(fix, targets)
         rows = np.flatnonzero(np.isfinite(place).all(axis=1))
         place, relative, own = place[rows], relative[rows], own[rows]
         when, target = self.time_s(fix.frame), targets.target[rows]
-        velocity = self._movers.step(when, np.where(targets.lasting[rows], target, -1), place, own)
+        velocity = self._speeds.update(when, np.where(targets.lasting[rows], target, -1), place, own)
         origin = self.site.origin_deg
         positions = Positions(
             np.full(len(rows), fix.frame),
             target,
             place,
-            absolute(relative, self.settings.landmarks.common_sigma_m),
+            absolute_covariance(relative, self.settings.landmarks.common_sigma_m),
             targets.score[rows],
             origin,
             None if origin is None else geometry.lonlat(place, origin),
         )
-        spent = {**(seconds or {}), **look.seconds, "ground": time.perf_counter() - start}
-        moved = (*adjustments, *look.adjustments)
+        spent = {**(seconds or {}), **fixed.seconds, "ground": time.perf_counter() - start}
+        made = (*adjustments, *fixed.adjustments)
         return AerialLocations(
-            fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, look.marks, moved, spent
+            fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, fixed.marks, made, spent
         )
 
-    def points(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) that stand for targets under a fix, and how high above the ground those are (N,) m."""
-        height = self.settings.aerial.target_height_m
-        pixels, lift = points_of(targets, self.settings.aerial, fix.pose is not None)
-        if targets.bodies and lift.any() and (feet := self.feet(pixels, fix, height)) is not None:
-            return feet, np.zeros(len(feet))
+    def ground_places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
+        """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
+        return locate_pixels(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
+
+    def ground_radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
+        """(N,) m, radii of circles as large as the ellipses within boxes (N, 4) on the ground; NaN where unknown."""
+        low, high = box_px[:, :2] - 0.5, box_px[:, :2] + box_px[:, 2:] - 0.5
+        corners = low, np.c_[high[:, 0], low[:, 1]], np.c_[low[:, 0], high[:, 1]]
+        start, right, below = np.split(self.ground_places(fix, np.concatenate(corners)), 3)
+        return np.asarray(np.sqrt(np.linalg.norm(right - start, axis=1) * np.linalg.norm(below - start, axis=1)) / 2)
+
+    def feet_px(self, pixels: np.ndarray, fix: Fix, height_m: float) -> np.ndarray | None:
+        """Pixels (N, 2) of the feet of bodies of a height that are seen together with their shadows.
+
+        None where shadows are not used, or the camera's pose or the sun is not known.
+        """
+        sun = self._sun(self.time_s(fix.frame)) if self.settings.aerial.shadows else None
+        if sun is None or fix.pose is None:
+            return None
+        near = self.ground_places(fix, pixels)
+        up_m = np.zeros(len(near)) if self._ground is None else self._ground(near)
+        return remove_shadow(pixels, np.c_[near, up_m], fix.pose, self.camera, height_m, shadow_m(sun, height_m))
+
+    def target_points(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (N, 2) that stand for targets under a fix, and their height above the ground (N,) m."""
+        pixels, lift = reference_points(targets, self.settings.aerial, fix.pose is not None)
+        if targets.bodies and lift.any():
+            feet = self.feet_px(pixels, fix, self.settings.aerial.target_height_m)
+            if feet is not None:
+                return feet, np.zeros(len(feet))
         return pixels, lift
 
-    def _laid(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _placed(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
-        parameters = self.settings.aerial
-        pixels, lift = self.points(fix, targets)
-        place, by_pixel = ground_points(fix, self.camera, pixels, 1.0, lift, self._ground)
-        _, shared = ground_points(fix, self.camera, pixels, 0.0, lift, self._ground)
-        variance = sigma_of(targets, parameters) ** 2
-        own = (by_pixel - shared) * variance[:, None, None]
+        pixels, lift = self.target_points(fix, targets)
+        place, by_pixel = locate_pixels(fix, self.camera, pixels, 1.0, lift, self._ground)
+        _, shared = locate_pixels(fix, self.camera, pixels, 0.0, lift, self._ground)
+        own = (by_pixel - shared) * (point_sigma_px(targets, self.settings.aerial) ** 2)[:, None, None]
         return place, shared + own, own
 
     def _sun(self, time_s: float) -> tuple[float, float] | None:
-        """Where the sun stands, azimuth and height, rad; None where nothing tells, and at night."""
+        """Azimuth and height of the sun, rad; None where unknown, and at night."""
         parameters, site = self.settings.aerial, self.site
         if parameters.sun_height_deg > 0:
             return math.radians(parameters.sun_azimuth_deg), math.radians(parameters.sun_height_deg)
@@ -204,44 +276,89 @@ class Locator:
             sun = sun_at(*site.origin_deg, start + time_s) if math.isfinite(start) else None
         return sun if sun is not None and sun[1] > 0 else None
 
-    def _standing(self, marks: LandmarkObservations) -> LandmarkObservations:
-        if self._ground is None or not len(marks):
-            return marks
-        marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
-        # Where the raster has no height, a landmark would be put on a plane that is not the ground's.
-        return chosen_rows(marks, np.isfinite(marks.up_m))
 
+def tracked_targets(tracked: TrackedFrame, with_middles: bool) -> Targets:
+    """The targets of a tracked frame that were seen: a box that bridges a gap has an identity, but no place.
 
-def chosen_rows(marks: LandmarkObservations, rows: np.ndarray) -> LandmarkObservations:
-    """Some of the landmarks."""
-    return LandmarkObservations(
-        marks.landmark[rows],
-        marks.image_px[rows],
-        marks.east_north_m[rows],
-        marks.sigma_m[rows],
-        marks.pixel_sigma[rows],
-        marks.up_m[rows],
+    with_middles: take the mean of a target's foreground for its place in the picture.
+    """
+    tracks = tracked.tracks
+    seen = tracks.row >= 0
+    middle = tracked.detections.middle_px[tracks.row[seen]] if with_middles else None
+    return Targets(
+        tracks.box_px[seen],
+        tracks.identity[seen],
+        seen[seen],
+        tracks.score[seen].clip(0, 1),
+        bodies=True,
+        middle_px=middle,
     )
 
 
-def sigma_of(targets: Targets, parameters: AerialParameters) -> np.ndarray:
-    """(N,) standard deviation in pixels, of u and of v each, of the points that stand for the targets."""
-    side = np.sqrt(np.maximum(targets.box_px[:, 2] * targets.box_px[:, 3], 0))
-    return np.hypot(parameters.target_sigma_px, side * (parameters.own_sigma if targets.bodies else 0.0))
+def frames_to_locate(table: DetectionTable, landmarks: Landmarks) -> list[int]:
+    """The frames of a table, and those between its first and last with landmarks in the picture."""
+    seen = landmarks.frame[np.isfinite(landmarks.image_px).all(axis=1)]
+    between = seen[(seen >= table.first) & (seen <= table.last)]
+    return np.unique(np.concatenate([table.frame, np.round(between).astype(np.int64)])).tolist()
 
 
-def points_of(targets: Targets, parameters: AerialParameters, posed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) that stand for the targets, and how high above the ground those are (N,) m.
+def check_table(table: DetectionTable, locator: AerialLocator) -> None:
+    """Raises InputError where the landmarks cannot place any frame of the table, and says what is missing.
 
-    A body's foot is where its middle, half its height up, has its place: that takes a pose of the camera (posed).
+    That is: no place in a picture, one far outside of it, no frame in common, and, without telemetry, fewer than four
+    landmarks in every frame or all of them on one line.
     """
-    centre = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
-    if targets.middle_px is not None:
-        centre = np.where(np.isfinite(targets.middle_px).all(axis=1)[:, None], targets.middle_px, centre)
-    lift = np.zeros(len(centre))
-    if parameters.point == "auto" and targets.feet_px is not None:
-        named = np.isfinite(targets.feet_px).all(axis=1)
-        return np.where(named[:, None], targets.feet_px, centre), lift
-    if posed and (parameters.point == "foot" or (parameters.point == "auto" and targets.bodies)):
-        lift += parameters.target_height_m / 2
-    return centre, lift
+    landmarks, parameters = locator.site.landmarks, locator.settings.aerial
+    seen = np.isfinite(landmarks.image_px).all(axis=1)
+    if not seen.any():
+        raise InputError(
+            f"landmarks {landmarks.path} say no places in pictures; wanted columns u_px,v_px beside the places"
+        )
+    _check_inside(locator)
+    if not len(table):
+        return
+    frames = np.unique(table.frame).tolist()
+    marks = [m[np.isfinite(m.image_px).all(axis=1)] for m in map(locator.landmarks_at, frames)]
+    counts = np.array([len(m) for m in marks])
+    if not counts.any():
+        first, last = np.round(landmarks.frame[seen][[0, -1]]).astype(int).tolist()
+        raise InputError(
+            f"the table has frames {table.first} to {table.last}, the landmarks are seen in {first} to {last}: none "
+            "in common has a landmark of known place; are both counted from the clip's first frame, as 1?"
+        )
+    if locator.site.telemetry is not None and parameters.mode == "pose":
+        return
+    if counts.max() < LEAST:
+        best = int(counts.argmax())
+        missing = LEAST - int(counts[best])
+        raise InputError(
+            f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has {counts[best]}, none more: "
+            f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
+        )
+    enough = [k for k, count in enumerate(counts.tolist()) if count >= LEAST]
+    if all(relative_width(marks[k]) < parameters.least_spread for k in enough):
+        raise InputError(
+            f"the {counts[enough[0]]} landmarks of frame {frames[enough[0]]} lie on one line, as in all others; "
+            "give --telemetry, or a landmark away from it"
+        )
+
+
+def is_outside(locator: AerialLocator, pixels: np.ndarray) -> np.ndarray:
+    """(N,) bool, which pixels (N, 2) lie far beyond the picture's edges; none where the picture's size is unknown."""
+    if locator.settings.aerial.mode != "pose":
+        return np.zeros(len(pixels), bool)
+    size = np.array(locator.camera.size_px, float)
+    beyond: np.ndarray = (pixels < -_OUTSIDE * size) | (pixels > (1 + _OUTSIDE) * size)
+    return np.any(beyond, axis=1)
+
+
+def _check_inside(locator: AerialLocator) -> None:
+    landmarks = locator.site.landmarks
+    away = is_outside(locator, landmarks.image_px)
+    if away.any():
+        k = int(np.where(away, landmarks.line, np.iinfo(np.int64).max).argmin())
+        (u, v), (columns, rows) = landmarks.image_px[k].tolist(), locator.camera.size_px
+        raise InputError(
+            f"landmarks {landmarks.path}, line {landmarks.line[k]}: u_px,v_px are {u:g}, {v:g}, far outside the "
+            f"camera's pictures of {columns} x {rows} px; give pixels, and the camera's file for this size"
+        )

@@ -10,9 +10,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from torchvision_dddas.geo.linearization import Glimpse
 from torchvision_dddas.geo.pose_estimation import EXACT_M, Expected, Prior, Solution
-from torchvision_dddas.types import LandmarkObservations
+from torchvision_dddas.geo.projection import project_with_slopes
+from torchvision_dddas.geometry import slope_of_turn
+from torchvision_dddas.types import Camera, LandmarkObservations
 
 FORGOTTEN = 4.0
 """A landmark not seen for so many time constants is forgotten."""
@@ -22,7 +23,37 @@ ANOTHER = 1.5
 
 
 @dataclass(frozen=True)
-class Lasting:
+class LinearizedImage:
+    """The pixels of k of n landmarks as a linear function of the errors of telemetry and reports: truth less report.
+
+    shown_px: (2k,) slopes times the errors, plus noise of variance_px2 (2k,). slopes: (2k, 7 + 2n). used: (n,) bool.
+    """
+
+    shown_px: np.ndarray
+    slopes: np.ndarray
+    variance_px2: np.ndarray
+    used: np.ndarray
+
+
+def linearize_image(
+    marks: LandmarkObservations, camera: Camera, used: np.ndarray, solution: Solution
+) -> LinearizedImage:
+    """The picture of one frame. The telemetry must tell all seven: a correction is then of what it says."""
+    points = np.column_stack([solution.places, marks.up_m])[used]
+    seen, by_pose, by_point = project_with_slopes(points, solution.pose, camera)
+    k = len(points)
+    slopes = np.zeros((k, 2, 7 + 2 * len(used)))
+    slopes[:, :, :7] = by_pose
+    slopes[:, :, :3] = by_pose[:, :, :3] @ np.linalg.inv(slope_of_turn(solution.correction[:3]))
+    for row, landmark in enumerate(np.flatnonzero(used).tolist()):
+        slopes[row, :, 7 + 2 * landmark : 9 + 2 * landmark] = by_point[row, :, :2]
+    flat = slopes.reshape(2 * k, -1)
+    missing = (marks.image_px[used] - seen).ravel()
+    return LinearizedImage(missing + flat @ solution.correction, flat, np.repeat(marks.pixel_sigma[used], 2) ** 2, used)
+
+
+@dataclass(frozen=True)
+class ErrorPersistence:
     """What of the errors lasts from frame to frame; the rest is new in every frame.
 
     telemetry: share of the variance of its angles and place: a gimbal shakes, samples are older than the picture.
@@ -36,7 +67,7 @@ class Lasting:
 
 
 @dataclass(frozen=True)
-class Memory:
+class BiasFilter:
     """What is known of the errors at a time: truth less report, telemetry's seven first, then two a landmark.
 
     covariance: with the mean, (7 + 2m,) of landmarks `ids` (m,), last seen at `seen_s`. sigma: (7 + 2m,) that they
@@ -49,14 +80,14 @@ class Memory:
     mean: np.ndarray = field(default_factory=lambda: np.zeros(7))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((7, 7)))
     sigma: np.ndarray = field(default_factory=lambda: np.full(7, np.nan))
-    lasting: Lasting = Lasting()
+    lasting: ErrorPersistence = ErrorPersistence()
 
     @property
     def told(self) -> bool:
         """Whether any frame has told anything."""
         return bool(self.mean.any())
 
-    def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "Memory":
+    def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "BiasFilter":
         """The same at a later time, with the landmarks that are new."""
         correlation_s /= self.lasting.pace
         gap_s = time_s - self.time_s
@@ -65,7 +96,7 @@ class Memory:
         was, size = before.sigma, len(before.mean)
         sigma = was.copy()
         sigma[known] = 1 / np.sqrt(np.diag(prior.information)[known])
-        sigma[places_of(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
+        sigma[error_rows(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
         with np.errstate(invalid="ignore"):
             grown = sigma / was
         # The telemetry's may be a share of the altitude, and grow with it.
@@ -78,7 +109,7 @@ class Memory:
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
         return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
 
-    def _of(self, time_s: float, marks: LandmarkObservations, forgotten_s: float) -> "Memory":
+    def _of(self, time_s: float, marks: LandmarkObservations, forgotten_s: float) -> "BiasFilter":
         """The same with the landmarks that are new, and without those not seen for too long."""
         seen, old = marks.landmark.tolist(), self.ids.tolist()
         staying = [
@@ -100,7 +131,7 @@ class Memory:
     def expected(self, prior: Prior, marks: LandmarkObservations) -> Expected:
         """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
         known, n = np.flatnonzero(prior.known), len(marks)
-        ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
+        ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
         mean, information = np.zeros(7 + 2 * n), np.zeros((7 + 2 * n, 7 + 2 * n))
         mean[theirs] = self.mean[ours]
@@ -108,12 +139,12 @@ class Memory:
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
-    def foretold(self, marks: LandmarkObservations, glimpse: Glimpse) -> tuple[float, "Memory"]:
+    def foretold(self, marks: LandmarkObservations, glimpse: LinearizedImage) -> tuple[float, "BiasFilter"]:
         """How well it foretold a picture, the log of the density of where the landmarks were, and itself after it.
 
         The telemetry must tell all seven.
         """
-        ours = np.concatenate([np.arange(7), places_of(self.ids, marks.landmark)])
+        ours = np.concatenate([np.arange(7), error_rows(self.ids, marks.landmark)])
         crossed = self.covariance[:, ours] @ glimpse.slopes.T
         expected = glimpse.slopes @ self._seen(ours) @ glimpse.slopes.T + np.diag(glimpse.variance_px2)
         surprise = glimpse.shown_px - glimpse.slopes @ self.mean[ours]
@@ -124,10 +155,10 @@ class Memory:
         mean = self.mean + white[:, 1:].T @ white[:, 0]
         return density, self._with(mean, covariance, marks.landmark[glimpse.used])
 
-    def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "Memory":
+    def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "BiasFilter":
         """With what a frame told: of errors that were not looked at too, as far as they go with those that were."""
         known, n = np.flatnonzero(prior.known), len(marks)
-        ours = np.concatenate([known, places_of(self.ids, marks.landmark)])
+        ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
         before = self._seen(ours)
         gain = np.linalg.solve(before, self.covariance[ours]).T
@@ -136,12 +167,12 @@ class Memory:
         covariance = self.covariance + gain @ (now - before) @ gain.T
         return self._with(mean, covariance, marks.landmark[used])
 
-    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "Memory":
+    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "BiasFilter":
         ids = set(seen.tolist())
         seen_s = np.array([self.time_s if i in ids else t for i, t in zip(self.ids.tolist(), self.seen_s, strict=True)])
         return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
 
-    def anew(self, rows: np.ndarray) -> "Memory":
+    def anew(self, rows: np.ndarray) -> "BiasFilter":
         """With some of its errors as if nothing were known of them."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[rows] = 0
@@ -161,7 +192,7 @@ class Memory:
 
 
 @lru_cache(maxsize=256)
-def _slow(lasting: Lasting, size: int) -> np.ndarray:
+def _slow(lasting: ErrorPersistence, size: int) -> np.ndarray:
     """Share of each standard deviation that lasts; a focal length does. It is shared, and not to be written to."""
     share = np.full(size, np.sqrt(lasting.landmarks))
     share[:6], share[6] = np.sqrt(lasting.telemetry), 1.0
@@ -169,7 +200,7 @@ def _slow(lasting: Lasting, size: int) -> np.ndarray:
     return share
 
 
-def places_of(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def error_rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Where the two errors of each wanted landmark stand."""
     row = {identity: 7 + 2 * k for k, identity in enumerate(ids.tolist())}
     return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import level
-from torchvision_dddas.types import Camera, Float
+from torchvision_dddas.types import Bool, Camera, Float
 
 FEWEST = 20
 """Boxes that it takes."""
@@ -36,7 +36,7 @@ UNSURE = 0.2
 
 
 @dataclass(frozen=True)
-class Stance:
+class MountedPose:
     """height_m: of the camera. pitch_rad: down. Each with its standard deviation. miss: a body's typical residual."""
 
     height_m: float
@@ -46,7 +46,9 @@ class Stance:
     miss: float
 
 
-def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: float, height_sigma: float) -> Stance:
+def calibrate_pose(
+    box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: float, height_sigma: float
+) -> MountedPose:
     """The camera's height and pitch, from boxes of upright people that the picture's border does not cut.
 
     box_px: in the order of time. height_sigma: standard deviation of a box's height, in heights; boxes that miss by
@@ -108,10 +110,10 @@ def stance(box_px: Float[np.ndarray, "N 4"], camera: Camera, body_height_m: floa
             f"no height and pitch fit these boxes: half of them miss by more than {min(miss, 99):.0%} of their height; "
             "check that they are upright people, and the camera's focal length and size"
         )
-    return Stance(height, float(best[0]), float(sigma[1]) * height, float(sigma[0]), miss)
+    return MountedPose(height, float(best[0]), float(sigma[1]) * height, float(sigma[0]), miss)
 
 
-def stood(camera: Camera, found: Stance) -> Camera:
+def with_pose(camera: Camera, found: MountedPose) -> Camera:
     """The camera, with what was found."""
     return replace(
         camera,
@@ -120,3 +122,53 @@ def stood(camera: Camera, found: Stance) -> Camera:
         height_sigma_m=found.height_sigma_m,
         pitch_sigma_rad=found.pitch_sigma_rad,
     )
+
+
+OUTLIER = 3.5
+"""A measurement is an outlier so many robust standard deviations from the median, or SURE of it where that is more."""
+
+SURE, FINEST = 0.03, 0.01
+"""Shares of the focal length. A box is never read more surely than SURE; no calibration of people is finer than FINEST,
+for all their boxes may be too tall or too low together."""
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """focal_px: the focal length. sigma_px: its standard deviation. outlier: (N,) the measurements that were not used.
+
+    spread_px: standard deviation of one measurement; NaN where there is but one.
+    """
+
+    focal_px: float
+    sigma_px: float
+    spread_px: float
+    outlier: np.ndarray
+
+
+def calibrate_focal_length(
+    distance_m: Float[np.ndarray, "N"], height_px: Float[np.ndarray, "N"], body_height_m: float
+) -> FocalLength:
+    """F = D h / H of each measurement, and of all: least squares of relative errors, which are alike at every distance.
+
+    distance_m: along the optical axis of a level camera. height_px: the body's, in the picture.
+    Raises InputError where there is no measurement, or one is not positive and finite.
+    """
+    distance, height = np.asarray(distance_m, float), np.asarray(height_px, float)
+    if len(height) == 0:
+        raise InputError("no measurement to calibrate by; wanted one or more heights in pixels, each with its distance")
+    for name, values in (("distance", distance), ("height in pixels", height), ("body height", [body_height_m])):
+        if not all(np.isfinite(v) and v > 0 for v in values):
+            wrong = next(v for v in values if not (np.isfinite(v) and v > 0))
+            raise InputError(f"a {name} of {wrong:g} will not do to calibrate by; wanted a number above 0")
+    with np.errstate(over="ignore"):
+        each = distance * height / body_height_m
+    if not np.isfinite(each).all():
+        raise InputError("a distance times a height in pixels is beyond all numbers; wanted metres and pixels")
+    middle = float(np.median(each))
+    spread = 1.4826 * float(np.median(np.abs(each - middle)))
+    outlier: Bool[np.ndarray, N] = np.abs(each - middle) > OUTLIER * max(spread, SURE * middle)
+    used = each[~outlier]
+    focal = float(used.mean())
+    deviation = float(used.std(ddof=1)) if len(used) > 1 else np.nan
+    single = np.fmax(deviation, SURE * focal)
+    return FocalLength(focal, float(max(single / np.sqrt(len(used)), FINEST * focal)), deviation, outlier)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from torchvision_dddas.geo.colour_patches import Patches, patches_of
+from torchvision_dddas.geo.colours import Patches, find_patches
 
 HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
 """Names of hues, in OpenCV's units."""
@@ -29,7 +29,7 @@ _ENDS = (2, 98)
 
 
 @dataclass(frozen=True)
-class Sample:
+class ColourSample:
     """A patch of a colour. hue: of most of its pixels. pixels: (P, 3) uint8 hue, saturation, value. score: in [0, 1].
 
     picture: which it is in, counted from 0. box_px: x, y, width, height.
@@ -42,12 +42,12 @@ class Sample:
     box_px: tuple[int, int, int, int]
 
 
-def hsv_of(image: np.ndarray) -> np.ndarray:
+def to_hsv(image: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
     return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
 
 
-def marked(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def mask_range(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
     if low[0] <= high[0]:
         return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
@@ -55,13 +55,13 @@ def marked(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return cv2.bitwise_or(below, cv2.inRange(hsv, np.array([0.0, *low[1:]]), np.asarray(high, float)))
 
 
-def standing_out(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[Sample]:
+def find_samples(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[ColourSample]:
     """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
 
     hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation in the picture and around
     it: ground and plants, of whatever hue, are in many places.
     """
-    found: list[Sample] = []
+    found: list[ColourSample] = []
     counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
     for saturation in _SATURATIONS:
         for hue in range(0, 180, _STEP):
@@ -69,15 +69,15 @@ def standing_out(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[
             if counts[window, saturation:].sum() > _GROUND * hsv[..., 0].size:
                 continue
             low = np.array([(hue - _HALF) % 180, saturation, _VALUE])
-            mask = marked(hsv, low, np.array([(hue + _HALF) % 180, 255, 255]))
+            mask = mask_range(hsv, low, np.array([(hue + _HALF) % 180, 255, 255]))
             total = int(np.count_nonzero(mask))
             if total >= least_area_px:
-                patches = patches_of(mask, least_area_px)
+                patches = find_patches(mask, least_area_px)
                 found += [_sample(hsv, mask, patches, k, total, picture) for k in _compact(patches, mask.size)]
     return _distinct(sorted(found, key=lambda sample: -sample.score))
 
 
-def in_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0) -> Sample | None:
+def sample_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0) -> ColourSample | None:
     """The saturated colour that most of a box x, y, width, height is of; None where nothing in it is saturated."""
     x, y, width, height = box_px
     part = hsv[y : y + height, x : x + width].reshape(-1, 3)
@@ -87,18 +87,18 @@ def in_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0)
     count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
     window = np.ones(2 * _HALF + 1)
     around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], window, "valid")
-    most = vivid[np.abs(hue_apart(vivid[:, 0], float(around.argmax()))) <= _HALF]
-    return Sample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
+    most = vivid[np.abs(hue_difference(vivid[:, 0], float(around.argmax()))) <= _HALF]
+    return ColourSample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
 
 
-def pooled(samples: Sequence[Sequence[Sample]], count: int | None) -> list[list[Sample]]:
+def pool_samples(samples: Sequence[Sequence[ColourSample]], count: int | None) -> list[list[ColourSample]]:
     """The colours of several pictures, those of one hue together, best first: `count` of them, or those that are clear.
 
     samples: of each picture.
     """
-    groups: list[list[Sample]] = []
+    groups: list[list[ColourSample]] = []
     for sample in sorted((one for of in samples for one in of), key=lambda one: -one.score):
-        near = [group for group in groups if abs(hue_apart(group[0].hue, sample.hue)) < _APART]
+        near = [group for group in groups if abs(hue_difference(group[0].hue, sample.hue)) < _APART]
         if not near:
             groups.append([sample])
         elif all(one.picture != sample.picture for one in near[0]):
@@ -109,8 +109,8 @@ def pooled(samples: Sequence[Sequence[Sample]], count: int | None) -> list[list[
     return [group for group in groups if sum(one.score for one in group) >= _CLEAR * len(samples)]
 
 
-def ranges_of(
-    groups: Sequence[Sequence[Sample]], pictures: Sequence[np.ndarray], least_area_px: int
+def build_ranges(
+    groups: Sequence[Sequence[ColourSample]], pictures: Sequence[np.ndarray], least_area_px: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
 
@@ -121,7 +121,7 @@ def ranges_of(
     ends = []
     for group, hue in zip(groups, middle, strict=True):
         pixels = np.concatenate([one.pixels for one in group]).astype(float)
-        away = np.percentile(hue_apart(pixels[:, 0], hue), _ENDS)
+        away = np.percentile(hue_difference(pixels[:, 0], hue), _ENDS)
         ends.append((away[0], away[1], *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
     low, high, others = (np.zeros((len(groups), n), np.int64) for n in (3, 3, 1))
     for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
@@ -140,13 +140,13 @@ def ranges_of(
     return low, high, others[:, 0]
 
 
-def named(hues: Sequence[float]) -> list[str]:
+def name_hues(hues: Sequence[float]) -> list[str]:
     """A name for each hue; those of one name are numbered."""
-    words = [min(HUES, key=lambda word: abs(hue_apart(HUES[word], hue))) for hue in hues]
+    words = [min(HUES, key=lambda word: abs(hue_difference(HUES[word], hue))) for hue in hues]
     return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
 
 
-def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> Sample:
+def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> ColourSample:
     x, y, width, height = (int(v) for v in patches.box_px[k])
     seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
     hue = _mean_hue(seen[:, 0])
@@ -155,9 +155,9 @@ def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: 
     share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
     # The middle of the box is all of it, also what the window of hue and saturation left out.
     inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
-    alike = inner[(np.abs(hue_apart(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
+    alike = inner[(np.abs(hue_difference(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
     pixels = np.concatenate([seen, alike])
-    return Sample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
+    return ColourSample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
 
 
 def _mean_hue(hues: np.ndarray) -> float:
@@ -172,10 +172,12 @@ def _compact(patches: Patches, picture_px: int) -> np.ndarray:
     return np.flatnonzero((fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * picture_px))
 
 
-def _distinct(samples: list[Sample]) -> list[Sample]:
-    kept: list[Sample] = []
+def _distinct(samples: list[ColourSample]) -> list[ColourSample]:
+    kept: list[ColourSample] = []
     for sample in samples:
-        if all(abs(hue_apart(sample.hue, one.hue)) >= _APART and not _meet(sample.box_px, one.box_px) for one in kept):
+        if all(
+            abs(hue_difference(sample.hue, one.hue)) >= _APART and not _meet(sample.box_px, one.box_px) for one in kept
+        ):
             kept.append(sample)
     return kept
 
@@ -196,15 +198,15 @@ def _rooms(k: int, middle: np.ndarray, ends: Sequence[tuple[float, ...]]) -> tup
 
 
 def _others(
-    hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[Sample], picture: int, least_area_px: int
+    hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[ColourSample], picture: int, least_area_px: int
 ) -> int:
     """How many patches a range marks in a picture that are none of the colour's own."""
-    patches = patches_of(marked(hsv, low, high), least_area_px)
+    patches = find_patches(mask_range(hsv, low, high), least_area_px)
     own = [one.box_px for one in group if one.picture == picture]
     boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in patches.box_px]
     return sum(not any(_meet(box, mine) for mine in own) for box in boxes)
 
 
-def hue_apart(hue: np.ndarray | float, other: float) -> np.ndarray:
+def hue_difference(hue: np.ndarray | float, other: float) -> np.ndarray:
     """How far hues are from another, in [-90, 90)."""
     return (np.asarray(hue, float) - other + 90) % 180 - 90

@@ -47,7 +47,7 @@ def fuse(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Fused:
     gate_sigmas: sightings are of one person if their distance, by its covariance, is as likely as this many sigmas.
     """
     members = associate(team, gate_sigmas)
-    where, joint, _ = together(team, members)
+    where, joint, _ = estimate_places(team, members)
     own = joint[np.arange(len(members)), :, np.arange(len(members))]
     return Fused(where, own, members)
 
@@ -73,12 +73,12 @@ def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.nda
     return members[np.lexsort(np.where(members < 0, np.iinfo(np.int64).max, members).T[::-1])]
 
 
-def gate(sigmas: float) -> float:
+def gate_distance(sigmas: float) -> float:
     """The squared distance, by its covariance in the plane, that is as likely exceeded as so many sigmas on a line."""
     return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
 
 
-def together(
+def estimate_places(
     team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
 ) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 P 2"], Float[np.ndarray, "V 6"]]:
     """Places of people, their joint covariance, and each vehicle's errors in sigmas: least squares over all sightings.
@@ -129,8 +129,8 @@ def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_si
     members = known.copy()
     left = np.ones(len(seen), bool)
     if len(known) and len(seen):
-        where, joint, _ = together(team, known)
-        for person, row in _pairs(where, joint, seen, gate(gate_sigmas)):
+        where, joint, _ = estimate_places(team, known)
+        for person, row in _pairs(where, joint, seen, gate_distance(gate_sigmas)):
             members[person, vehicle], left[row] = row, False
     new = np.full((left.sum(), len(team)), -1, np.int64)
     new[:, vehicle] = np.flatnonzero(left)

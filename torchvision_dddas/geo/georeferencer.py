@@ -6,13 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.geo.bias_filter import Lasting, Memory, places_of
-from torchvision_dddas.geo.initial_pose import find_pose, rows
-from torchvision_dddas.geo.landmark_faults import Verdict, judge, passes, reordered
-from torchvision_dddas.geo.linearization import glimpse_of
-from torchvision_dddas.geo.plane import LEAST, Solver, homography_fix, on_one_line, too_few
-from torchvision_dddas.geo.pose_estimation import Prior, Solution, bare_prior, expected_of, prior_of
-from torchvision_dddas.geo.projection import unbent
+from torchvision_dddas.geo.bias_filter import BiasFilter, ErrorPersistence, error_rows, linearize_image
+from torchvision_dddas.geo.landmark_faults import LandmarkCheck, check_landmarks, passes, reorder_pixels
+from torchvision_dddas.geo.plane_homography import LEAST, Solver, describe_one_line, describe_too_few, fix_by_homography
+from torchvision_dddas.geo.pose_estimation import (
+    Prior,
+    Solution,
+    find_pose,
+    focal_prior,
+    independent_expectation,
+    pose_prior,
+    rows,
+)
+from torchvision_dddas.geo.projection import undistort_pixels
 from torchvision_dddas.types import Camera, Fix, Flight, LandmarkObservations
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
@@ -21,13 +27,13 @@ Degrees = tuple[np.ndarray, tuple[float, float]]
 OF_POSE = ("heading", "heading", "heading", "place", "place", "altitude", "focal length")
 
 BELIEFS = (
-    Lasting(),
-    Lasting(pace=5.0),
-    Lasting(pace=25.0),
-    Lasting(telemetry=0.5),
-    Lasting(telemetry=0.0),
-    Lasting(landmarks=0.0),
-    Lasting(telemetry=0.0, landmarks=0.0, pace=np.inf),
+    ErrorPersistence(),
+    ErrorPersistence(pace=5.0),
+    ErrorPersistence(pace=25.0),
+    ErrorPersistence(telemetry=0.5),
+    ErrorPersistence(telemetry=0.0),
+    ErrorPersistence(landmarks=0.0),
+    ErrorPersistence(telemetry=0.0, landmarks=0.0, pace=np.inf),
 )
 """Nobody says which errors of a vehicle and its landmarks last. The belief that foretells the pictures best counts."""
 
@@ -46,7 +52,7 @@ class _Habit:
     without: frozenset[int]
 
 
-class Registrar:
+class Georeferencer:
     """Lays the frames of one clip on the ground; told of them in order.
 
     solver: of a back end, for the bare homography. focal_known: the camera's focal length is given, not guessed.
@@ -65,11 +71,11 @@ class Registrar:
         self.camera, self.settings, self.solver = camera, settings, solver
         self.focal_known, self.names, self.ground_up_m = focal_known, names, ground_up_m
         beliefs = BELIEFS if settings.aerial.correlation_s > 0 else BELIEFS[-1:]
-        self.memories = [Memory(lasting=belief) for belief in beliefs]
+        self.memories = [BiasFilter(lasting=belief) for belief in beliefs]
         self.credit = np.zeros(len(beliefs))
         self.habit = _Habit({}, frozenset())
 
-    def step(
+    def update(
         self,
         frame: int,
         time_s: float,
@@ -87,7 +93,7 @@ class Registrar:
         if degrees is not None:
             degrees = (np.asarray(degrees[0], float)[usable], degrees[1])
         seen = rows(marks, usable)
-        prior = prior_of(flight, self.camera, parameters, self.ground_up_m, self.focal_known)
+        prior = pose_prior(flight, self.camera, parameters, self.ground_up_m, self.focal_known)
         if parameters.mode == "pose":
             fix = self._by_pose(frame, time_s, prior, seen)
         else:
@@ -97,7 +103,7 @@ class Registrar:
     def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: LandmarkObservations) -> Fix:
         parameters, n = self.settings.aerial, len(marks)
         cause = _refused(frame, prior, marks, parameters.least_spread)
-        bare = bare_prior(self.camera, parameters, self.focal_known)
+        bare = focal_prior(self.camera, parameters, self.focal_known)
         self.memories = [memory.at(time_s, prior or bare, marks, parameters.correlation_s) for memory in self.memories]
         believed = int(self.credit.argmax())
         before = self.memories[believed]
@@ -113,12 +119,14 @@ class Registrar:
             cause = verdict.cause or no_pose
             return _nothing(frame, marks, cause)
         if prior is not None and verdict.passed and not verdict.alone:
-            self._learn(prior, reordered(marks, verdict.order), verdict.used, solution)
+            self._learn(prior, reorder_pixels(marks, verdict.order), verdict.used, solution)
             self.memories[believed] = before.after(prior, marks, verdict.used, solution)
         count = int(verdict.used.sum())
         cause = verdict.cause
         if not cause and count < LEAST:
-            cause = f"frame {frame} has no landmark: by telemetry alone" if count == 0 else too_few(frame, count)
+            cause = (
+                f"frame {frame} has no landmark: by telemetry alone" if count == 0 else describe_too_few(frame, count)
+            )
         return Fix(
             frame,
             "pose" if count else "telemetry",
@@ -136,36 +144,38 @@ class Registrar:
         """Hold what each belief foretold against what the picture shows, and let it learn from it."""
         if len(self.memories) == 1 or not (prior.known.all() and used.any()):
             return
-        glimpse = glimpse_of(marks, self.camera, used, solution)
+        glimpse = linearize_image(marks, self.camera, used, solution)
         told = [memory.foretold(marks, glimpse) for memory in self.memories]
         density = np.array([density for density, _ in told])
         self.credit = REMEMBERS * self.credit + np.maximum(density - density.max(), -MOST_SURPRISED)
         self.memories = [memory for _, memory in told]
 
     def _judged(
-        self, before: Memory, prior: Prior, marks: LandmarkObservations, bare: Prior | None
-    ) -> tuple[Verdict, Memory]:
+        self, before: BiasFilter, prior: Prior, marks: LandmarkObservations, bare: Prior | None
+    ) -> tuple[LandmarkCheck, BiasFilter]:
         """The landmarks tested against what is remembered, and what is to be remembered of the past then."""
         gate, n = self.settings.aerial.gate_probability, len(marks)
         everyone, itself = np.ones(n, bool), np.arange(n)
         solution = find_pose(marks, self.camera, before.expected(prior, marks))
         if passes(solution, gate):
             self.habit = _Habit({}, frozenset())
-            return Verdict(solution, itself, everyone), before
-        alone = None if bare is None else expected_of(bare, marks.sigma_m)
+            return LandmarkCheck(solution, itself, everyone), before
+        alone = None if bare is None else independent_expectation(bare, marks.sigma_m)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         known = self._as_before(marks)
         if known is not None:
-            verdict = judge(marks, self.camera, before.expected(prior, marks), gate, names, known=known, only=True)
+            verdict = check_landmarks(
+                marks, self.camera, before.expected(prior, marks), gate, names, known=known, only=True
+            )
             if verdict.passed:
                 return verdict, before
         for memory in self._less_and_less(before, prior, marks):
             expected = memory.expected(prior, marks)
             solution = find_pose(marks, self.camera, expected)
             if passes(solution, gate):
-                return Verdict(solution, itself, everyone), memory
+                return LandmarkCheck(solution, itself, everyone), memory
         for memory in (before, before.anew(np.arange(len(before.mean)))):
-            verdict = judge(marks, self.camera, memory.expected(prior, marks), gate, names, alone)
+            verdict = check_landmarks(marks, self.camera, memory.expected(prior, marks), gate, names, alone)
             if verdict.passed:
                 break
         identities = marks.landmark.tolist()
@@ -175,13 +185,13 @@ class Registrar:
         )
         return verdict, memory
 
-    def _less_and_less(self, before: Memory, prior: Prior, marks: LandmarkObservations) -> Iterator[Memory]:
+    def _less_and_less(self, before: BiasFilter, prior: Prior, marks: LandmarkObservations) -> Iterator[BiasFilter]:
         """What else to remember where all of it does not fit: a report may jump within its errors."""
         if not before.told:
             return
         yield before.anew(np.arange(7))
         for identity in marks.landmark:
-            yield before.anew(places_of(before.ids, np.array([identity])))
+            yield before.anew(error_rows(before.ids, np.array([identity])))
         yield before.anew(np.arange(len(before.mean)))
 
     def _by_homography(
@@ -192,13 +202,13 @@ class Registrar:
         paper = parameters.mode == "paper"
         if paper or prior is None or not prior.known.all() or n == 0:
             seen = marks if paper else self._unbent(marks)
-            return homography_fix(frame, seen, self.solver, parameters.least_spread, degrees, paper)
+            return fix_by_homography(frame, seen, self.solver, parameters.least_spread, degrees, paper)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
-        expected = expected_of(prior, marks.sigma_m)
-        verdict = judge(marks, self.camera, expected, parameters.gate_probability, names)
+        expected = independent_expectation(prior, marks.sigma_m)
+        verdict = check_landmarks(marks, self.camera, expected, parameters.gate_probability, names)
         # Where nothing explains the disagreement the telemetry may be wrong: the landmarks are taken at their word.
-        kept = rows(reordered(marks, verdict.order), verdict.used) if verdict.passed else marks
-        fix = homography_fix(frame, self._unbent(kept), self.solver, parameters.least_spread)
+        kept = rows(reorder_pixels(marks, verdict.order), verdict.used) if verdict.passed else marks
+        fix = fix_by_homography(frame, self._unbent(kept), self.solver, parameters.least_spread)
         solution = verdict.solution
         return replace(
             fix,
@@ -212,7 +222,7 @@ class Registrar:
 
     def _unbent(self, marks: LandmarkObservations) -> LandmarkObservations:
         """As a lens without distortion would show them: a bent picture of a plane is no homography's."""
-        return replace(marks, image_px=unbent(marks.image_px, self.camera))
+        return replace(marks, image_px=undistort_pixels(marks.image_px, self.camera))
 
     def _usable(self, marks: LandmarkObservations) -> tuple[np.ndarray, tuple[str, ...]]:
         """Which rows count: those with pixel and place, each landmark once; and of those that do not, why."""
@@ -248,8 +258,8 @@ def _refused(frame: int, prior: Prior | None, marks: LandmarkObservations, least
     n = len(marks)
     if prior is None:
         if n < LEAST:
-            return too_few(frame, n, " and no telemetry")
-        return on_one_line(frame, marks, least_spread)
+            return describe_too_few(frame, n, " and no telemetry")
+        return describe_one_line(frame, marks, least_spread)
     if 2 * n < int((~prior.known).sum()) or (n < 2 and not prior.known[2]):
         lacking = " and ".join(dict.fromkeys(np.array(OF_POSE)[~prior.known].tolist()))
         has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"

@@ -16,8 +16,7 @@ from itertools import combinations
 
 import numpy as np
 
-from torchvision_dddas.geo.initial_pose import find_pose
-from torchvision_dddas.geo.pose_estimation import Expected, Solution, moved
+from torchvision_dddas.geo.pose_estimation import Expected, Solution, find_pose, move_pose
 from torchvision_dddas.geo.projection import project_with_slopes
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import Bool, Camera, Int, LandmarkObservations
@@ -41,7 +40,7 @@ picture: a row of them agrees with poses of all kinds."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class LandmarkCheck:
     """What came of the test. order: (n,) whose pixel each landmark has got; used: (n,) whether it counts.
 
     solution: None where no pose explains anything, or all fit hopelessly. changes: in words. cause: why the result is
@@ -78,7 +77,7 @@ def _chance_above(freedom: int, value: float) -> float:
     return float(chdtrc(freedom, value))
 
 
-def judge(
+def check_landmarks(
     marks: LandmarkObservations,
     camera: Camera,
     expected: Expected,
@@ -87,7 +86,7 @@ def judge(
     alone: Expected | None = None,
     known: Hypothesis | None = None,
     only: bool = False,
-) -> Verdict:
+) -> LandmarkCheck:
     """Test the landmarks of a frame and repair what is wrong.
 
     names: (n,) of the landmarks, for the words. probability: share of right landmarks that pass. alone: what is
@@ -98,7 +97,7 @@ def judge(
     everyone, itself = np.ones(n, bool), np.arange(n)
     first = find_pose(marks, camera, expected)
     if passes(first, probability):
-        return Verdict(first, itself, everyone)
+        return LandmarkCheck(first, itself, everyone)
     as_before: list[Hypothesis] = [] if known is None else [known]
     others = () if only else (_one_change, _assignment, _two_changes)
     for hypotheses in (lambda *_: iter(as_before), *others):
@@ -107,17 +106,17 @@ def judge(
             if not expected.known[:6].any() and used.sum() < min(ENOUGH_ALONE, n - 1):
                 # Of six whose names are all wrong, some four fit a pose that is wrong as well.
                 continue
-            solution = find_pose(reordered(marks, order), camera, expected, used)
+            solution = find_pose(reorder_pixels(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
                 tried.append((_chance_above(solution.freedom, solution.cost), solution, order, used))
         if tried:
             _, solution, order, used = max(tried, key=lambda one: one[0])
-            return Verdict(solution, order, used, _words(order, used, first, names))
+            return LandmarkCheck(solution, order, used, _words(order, used, first, names))
     if alone is not None and n >= ENOUGH_ALONE and _spread_out(marks):
         solution = find_pose(marks, camera, alone)
         if passes(solution, probability):
             words = f"telemetry left out: the {n} landmarks agree with one another, not with it{_odds(first)}"
-            return Verdict(solution, itself, everyone, (words,), alone=True)
+            return LandmarkCheck(solution, itself, everyone, (words,), alone=True)
     beside = bool(expected.known[:6].any())
     cause = (
         f"{'landmarks and telemetry' if beside else 'the landmarks'} disagree{_odds(first)}, and no change explains it"
@@ -126,13 +125,13 @@ def judge(
         worse = first.cost / first.freedom
         if not beside and worse > HOPELESS**2:
             cause += f": their errors would have to be {np.sqrt(worse):.0f} times as large"
-            return Verdict(None, itself, ~everyone, cause=cause, passed=False)
+            return LandmarkCheck(None, itself, ~everyone, cause=cause, passed=False)
         first = replace(first, covariance=first.covariance * worse)
         cause += f": errors taken {np.sqrt(worse):.1f} times as large"
-    return Verdict(first, itself, everyone if first is not None else ~everyone, cause=cause, passed=False)
+    return LandmarkCheck(first, itself, everyone if first is not None else ~everyone, cause=cause, passed=False)
 
 
-def reordered(marks: LandmarkObservations, order: Int[np.ndarray, "n"]) -> LandmarkObservations:
+def reorder_pixels(marks: LandmarkObservations, order: Int[np.ndarray, "n"]) -> LandmarkObservations:
     """The landmarks with one another's pixels."""
     return replace(marks, image_px=marks.image_px[order], pixel_sigma=marks.pixel_sigma[order])
 
@@ -194,7 +193,7 @@ def _predicted(marks: LandmarkObservations, camera: Camera, expected: Expected) 
     """Where the landmarks are expected in the picture (n, 2), with derivatives by pose and places (2n, 7 + 2n)."""
     n = len(marks)
     places = marks.east_north_m + expected.mean[7:].reshape(n, 2)
-    pose = moved(expected.reference, expected.mean[:7])
+    pose = move_pose(expected.reference, expected.mean[:7])
     seen, by_pose, by_point = project_with_slopes(np.column_stack([places, marks.up_m]), pose, camera)
     slopes = np.zeros((2 * n, 7 + 2 * n))
     slopes[:, :7] = by_pose.reshape(-1, 7)

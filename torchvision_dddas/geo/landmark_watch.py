@@ -3,35 +3,36 @@
 import time
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.aerial_locator import Locator, Look
-from torchvision_dddas.geo.landmark_cutting import cut_out
-from torchvision_dddas.geo.landmark_tracking import LandmarkFollower, Sighted
-from torchvision_dddas.geo.plane import LEAST
-from torchvision_dddas.geo.projection import bent, project
-from torchvision_dddas.geo.solvers import ColourFinder
-from torchvision_dddas.geometry import transfer
-from torchvision_dddas.types import Colours, Detections, Fix, LandmarkObservations, Landmarks, Scene
+from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix
+from torchvision_dddas.geo.colours import ColourFinder
+from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
+from torchvision_dddas.geo.plane_homography import LEAST
+from torchvision_dddas.geo.projection import distort_pixels, project
+from torchvision_dddas.geometry import parts_of, transfer
+from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, LandmarkObservations, Landmarks, Scene
 
-REACH = 0.75
-"""How far from its colour a vehicle reaches, in its lengths: its corners, and its shadow."""
-
-LEAST_M2 = 0.4
-"""What is left of a blob beside a vehicle is a target from so much ground on: a person with a shadow."""
+# A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.
+_REACH = 0.75
+# What is left of a blob beside a vehicle is a target from this area on: a person with a shadow.
+_LEAST_M2 = 0.4
+# What is left of a vehicle's own blob must be this many times larger: as a rule it is the vehicle's shadow.
+_VEHICLE_REST = 4
 
 
 @dataclass(frozen=True)
-class Watched:
+class WatchedScene:
     """A scene without the landmarks, how it lies on the ground, and by what each of its landmarks was seen."""
 
     scene: Scene
-    look: Look
+    fixed: FrameFix
     sighted_by: tuple[str, ...]
 
 
-def unpictured(landmarks: Landmarks) -> Landmarks:
+def without_pixels(landmarks: Landmarks) -> Landmarks:
     """Without what the table says of places in pictures: colours tell them."""
     return replace(landmarks, image_px=np.full_like(landmarks.image_px, np.nan))
 
@@ -60,44 +61,44 @@ def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -
         )
 
 
-class Watch:
+class LandmarkWatch:
     """Takes the scenes of a clip in order, and keeps their landmarks from their targets."""
 
-    def __init__(self, locator: Locator, colours: Colours | None, finder: ColourFinder | None) -> None:
+    def __init__(self, locator: AerialLocator, colours: Colours | None, finder: ColourFinder | None) -> None:
         """colours, finder: None where the table of landmarks says where pictures show them."""
         self.locator, self._colours, self._finder = locator, colours, finder
         names = locator.site.landmarks.names
         self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
-        self._follower = LandmarkFollower(colours.names, locator.settings.landmarks) if colours else None
+        self._tracker = LandmarkTracker(colours.names, locator.settings.landmarks) if colours else None
         self._fix: Fix | None = None
 
-    def anew(self) -> "Watch":
+    def restarted(self) -> "LandmarkWatch":
         """The same, as before its first scene."""
-        return Watch(self.locator.anew(), self._colours, self._finder)
+        return LandmarkWatch(self.locator.restarted(), self._colours, self._finder)
 
-    def step(self, scene: Scene) -> Watched:
+    def update(self, scene: Scene) -> WatchedScene:
         """The next scene."""
         start = time.perf_counter()
         frame = scene.frame.number
-        marks = self.locator.marks(frame)
-        if self._follower is not None:
+        marks = self.locator.landmarks_at(frame)
+        if self._tracker is not None:
             marks, scene, by = self._found(scene, marks)
         else:
             by = ("table",) * len(marks)
-            scene = without(scene, _holding(scene.detections.box_px, marks.image_px))
+            scene = without_detections(scene, _holding(scene.detections.box_px, marks.image_px))
         spent = time.perf_counter() - start
-        look = self.locator.look(frame, marks)
-        self._fix = look.fix
+        fixed = self.locator.fix_frame(frame, marks)
+        self._fix = fixed.fix
         used = dict(zip(marks.landmark.tolist(), by, strict=True))
-        return Watched(
+        return WatchedScene(
             scene,
-            replace(look, seconds={"landmarks": spent, **look.seconds}),
-            tuple(used[which] for which in look.marks.landmark.tolist()),
+            replace(fixed, seconds={"landmarks": spent, **fixed.seconds}),
+            tuple(used[which] for which in fixed.marks.landmark.tolist()),
         )
 
     def _found(self, scene: Scene, marks: LandmarkObservations) -> tuple[LandmarkObservations, Scene, tuple[str, ...]]:
         """The landmarks with their places in the picture, the scene without them, and by what each was seen."""
-        assert self._follower is not None
+        assert self._tracker is not None
         assert self._finder is not None
         assert self._colours is not None
         image = scene.frame.image
@@ -112,7 +113,7 @@ class Watch:
                 expected[place[which]] = pixels[row]
                 length[place[which]] = self.locator.settings.landmarks.length_m * scale[row]
         masks = self._finder.masks(image, self._colours.low, self._colours.high)
-        seen = self._follower.step(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
+        seen = self._tracker.update(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
         pixels = np.full((len(marks), 2), np.nan)
         by = [""] * len(marks)
         for row, which in enumerate(marks.landmark.tolist()):
@@ -130,20 +131,22 @@ class Watch:
         if not height or not moving.any():
             return marks
         up_m, pixels = marks.up_m.copy(), marks.image_px.copy()
-        feet = None if self._fix is None else self.locator.feet(pixels[moving], self._fix, height)
+        feet = None if self._fix is None else self.locator.feet_px(pixels[moving], self._fix, height)
         up_m[moving] -= height / 2 if feet is None else height
         if feet is not None:
             pixels[moving] = feet
         return replace(marks, up_m=up_m, image_px=pixels)
 
-    def _cut(self, scene: Scene, seen: Sighted, length_px: np.ndarray) -> Scene:
+    def _cut(self, scene: Scene, seen: TrackedLandmarks, length_px: np.ndarray) -> Scene:
         """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
         parameters = self.locator.settings.landmarks
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
-            return without(scene, seen.rows)
+            return without_detections(scene, seen.rows)
         metre = np.nanmedian(length_px) / parameters.length_m if np.isfinite(length_px).any() else np.nan
-        least = max(self.locator.settings.small.min_area_px, LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
-        found, mask = cut_out(scene.detections, scene.mask, seen.rows, seen.colour_px, REACH * length_px, least)
+        least = max(self.locator.settings.small.min_area_px, _LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
+        found, mask = cut_out_landmarks(
+            scene.detections, scene.mask, seen.rows, seen.colour_px, _REACH * length_px, least
+        )
         return replace(scene, detections=found, mask=mask)
 
     def _expected(self, marks: LandmarkObservations, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +163,7 @@ class Watch:
         else:
             assert fix.image_from_ground is not None
             before = transfer(fix.image_from_ground, beside)
-            before = before if fix.by == "paper" else bent(before, self.locator.camera)
+            before = before if fix.by == "paper" else distort_pixels(before, self.locator.camera)
         here, east, north = np.split(transfer(step, before), 3)
         return here, np.maximum(*(np.linalg.norm(there - here, axis=1) for there in (east, north)))
 
@@ -186,20 +189,62 @@ def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
     return held
 
 
-def without(scene: Scene, rows: np.ndarray) -> Scene:
-    """A scene without some of its detections."""
+def without_detections(scene: Scene, rows: np.ndarray) -> Scene:
+    """A scene without some of its detections. rows: (N,) bool."""
     if not rows.any():
         return scene
-    kept, found = ~rows, scene.detections
+    kept = ~rows
     value = np.zeros(len(rows) + 1, np.uint16)
     value[1:][kept] = np.arange(1, kept.sum() + 1)
-    detections = Detections(
-        found.box_px[kept],
+    return replace(scene, detections=scene.detections[kept], mask=value[scene.mask])
+
+
+def cut_out_landmarks(
+    found: Detections,
+    mask: np.ndarray,
+    vehicles: Bool[np.ndarray, " N"],
+    middle_px: Float[np.ndarray, "K 2"],
+    radius_px: Float[np.ndarray, " K"],
+    least_px: float,
+) -> tuple[Detections, np.ndarray]:
+    """The detections without the discs about vehicles' middles, and the (H, W) mask of them.
+
+    vehicles: which of them are landmarks: of these stays what is left outside the discs, if it is large enough; where a
+    middle or radius is unknown (NaN), nothing. Parts smaller than least_px go, of landmarks those four times as large.
+    A target that no disc touches stays as it is.
+    """
+    known = np.isfinite(middle_px).all(axis=1) & np.isfinite(radius_px)
+    outside = mask.copy()
+    for (u, v), radius in zip(middle_px[known], radius_px[known], strict=True):
+        cv2.circle(outside, (round(float(u)), round(float(v))), max(round(float(radius)), 1), 0, cv2.FILLED)
+    rows, boxes, areas = [], [], []
+    numbered = np.zeros_like(mask)
+    for row in range(len(found)):
+        x, y, width, height = (int(side) for side in found.box_px[row])
+        # Boxes of blobs lie within the picture; a vehicle that no disc is known for goes whole.
+        window = np.s_[max(y, 0) : y + height, max(x, 0) : x + width]
+        left, whole = outside[window] == row + 1, mask[window] == row + 1
+        touched = left.sum() < whole.sum()
+        if vehicles[row] and not touched:
+            continue
+        # What a vehicle's own blob leaves outside is as a rule its shadow.
+        least = max(least_px * (_VEHICLE_REST if vehicles[row] else 1), 1)
+        parts = parts_of(left, (max(x, 0), max(y, 0), width, height), least) if touched else []
+        if not touched:
+            parts = [((x, y, width, height), whole)]
+        for box, part in parts:
+            rows.append(row)
+            boxes.append(box)
+            areas.append(float(part.sum()) if touched else float(found.area_px[row]))
+            there = numbered[max(box[1], 0) : box[1] + box[3], max(box[0], 0) : box[0] + box[2]]
+            there[part] = len(rows)
+    kept = np.array(rows, np.int64)
+    left_over = Detections(
+        np.array(boxes, float).reshape(-1, 4),
         found.score[kept],
-        found.area_px[kept],
+        np.array(areas, float),
         found.heading_rad[kept],
         found.speed_px[kept],
         found.kind,
-        found.middle_px[kept],
     )
-    return replace(scene, detections=detections, mask=value[scene.mask])
+    return left_over, numbered

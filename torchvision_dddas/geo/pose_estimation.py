@@ -6,12 +6,12 @@ weighs as much as it is known. What is expected of all of them comes as an infor
 of some. Levenberg and Marquardt's steps find the least sum of squares; its inverse curvature is the covariance.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from torchvision_dddas.config import AerialParameters
-from torchvision_dddas.geo.projection import axes_of, project_with_slopes
+from torchvision_dddas.geo.projection import axes_of, normalize, project_with_slopes, rays
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
@@ -81,7 +81,7 @@ class Solution:
     freedom: int
 
 
-def prior_of(
+def pose_prior(
     flight: Flight | None,
     camera: Camera,
     parameters: AerialParameters,
@@ -113,14 +113,14 @@ def prior_of(
     return Prior(pose, np.diag(1 / np.maximum(sigma, 1e-6) ** 2))
 
 
-def bare_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:
+def focal_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:
     """What is known without telemetry: the focal length."""
     focal, sigma = _focal_of(float("nan"), camera, parameters, focal_known)
     pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(parameters.pitch_deg), 0.0), focal)
     return Prior(pose, np.diag([0.0] * 6 + [1 / max(sigma, 1e-6) ** 2]))
 
 
-def expected_of(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
+def independent_expectation(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
     """A pose and landmarks that have nothing to do with each other, as in a single picture."""
     n = len(sigma_m)
     information = np.zeros((7 + 2 * n, 7 + 2 * n))
@@ -145,7 +145,7 @@ def fit_pose(
     n = len(marks)
     problem = _Problem(marks, camera, expected, np.ones(n, bool) if used is None else used)
     if start is None:
-        start = moved(expected.reference, expected.mean[:7])
+        start = move_pose(expected.reference, expected.mean[:7])
     state = problem.at(start, marks.east_north_m + expected.mean[7:].reshape(n, 2))
     if state is None:
         return None
@@ -160,7 +160,7 @@ def fit_pose(
             damping = max(10 * damping, 1e-6)
             continue
         gain = float(step @ downhill)
-        tried = problem.at(moved(state.pose, step[:7]), state.places + step[7:].reshape(n, 2))
+        tried = problem.at(move_pose(state.pose, step[:7]), state.places + step[7:].reshape(n, 2))
         for _ in range(0 if expected.known.all() else SETTLING):
             tried = problem.settled(tried)
         if tried is not None and tried.cost <= state.cost + 1e-9:
@@ -200,7 +200,7 @@ class Slopes:
     by_turn: np.ndarray
 
 
-def slopes_at(
+def linearize_pose(
     marks: LandmarkObservations,
     camera: Camera,
     expected: Expected,
@@ -212,7 +212,7 @@ def slopes_at(
     return _Problem(marks, camera, expected, np.ones(len(marks), bool) if used is None else used).slopes(pose, places)
 
 
-def moved(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
+def move_pose(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
     """A pose after a step, in the order of Fix."""
     return replace(
         pose,
@@ -302,3 +302,129 @@ def _focal_of(hfov_rad: float, camera: Camera, parameters: AerialParameters, kno
     if np.isfinite(hfov_rad) and 0 < hfov_rad < np.pi:
         return float(camera.size_px[0] / 2 / np.tan(hfov_rad / 2) / camera.focal_px[0]), parameters.focal_sigma
     return 1.0, camera.focal_sigma if known else parameters.focal_guess_sigma
+
+
+HEADINGS = 8
+"""So many are tried where nothing else tells one."""
+
+
+def find_pose(
+    marks: LandmarkObservations, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
+) -> Solution | None:
+    """The likeliest of the poses that the starts at hand lead to; None where none does.
+
+    used: the landmarks whose pixels count; all without it.
+    """
+    used = np.ones(len(marks), bool) if used is None else used
+    known = expected.known
+    if known.all():
+        first = fit_pose(marks, camera, expected, used=used)
+        if first is not None:
+            return first
+    seen = rows(marks, used)
+    starts = [] if known.all() else _turned_about_up(seen, camera, expected)
+    if len(seen) >= 4 and not (starts and known[:2].all() and known[5]):
+        starts += of_homography(_plain(seen, camera), camera, seen.east_north_m, seen.up_m)
+    if not starts and known[[0, 1, 3, 4, 5]].all():
+        starts = _all_headings(expected)
+    found = [one for start in starts if (one := fit_pose(marks, camera, expected, start, used)) is not None]
+    return min(found, key=lambda one: one.cost) if found else None
+
+
+def rows(marks: LandmarkObservations, which: np.ndarray) -> LandmarkObservations:
+    """Some of the landmarks of a frame: by their numbers or a (n,) bool."""
+    return replace(marks, **{column.name: getattr(marks, column.name)[which] for column in fields(marks)})
+
+
+def _turned_about_up(marks: LandmarkObservations, camera: Camera, expected: Expected) -> list[CameraPose]:
+    """With a known tilt the pixels lie on the ground but for turn, size and place, which the landmarks tell."""
+    known, pose = expected.known, move_pose(expected.reference, expected.mean[:7])
+    if not known[:2].all() or len(marks) == 0:
+        return []
+    way = rays(marks.image_px, pose, camera)
+    if not (way[:, 2] < -1e-3 * np.linalg.norm(way, axis=1)).all():
+        return []
+    east_north = marks.east_north_m
+    height = pose.place_m[2] - marks.up_m if known[5] else np.ones(len(marks))
+    seen = (way[:, :2] * (-height / way[:, 2])[:, None]) @ [1, 1j]
+    there = east_north @ [1, 1j]
+    seen_apart, there_apart = seen - seen.mean(), there - there.mean()
+    size = float((np.abs(seen_apart) ** 2).sum())
+    if size < 1e-12 and not (known[HEADING] and known[5]):
+        return []
+    across = complex(seen_apart.conj() @ there_apart) / max(size, 1e-12)
+    if not known[5] and known[HEADING]:
+        grown = max(across.real, 1e-6)
+    else:
+        grown = 1.0 if known[5] else abs(across)
+    turn = 0.0 if known[HEADING] else float(np.angle(across))
+    middle = there.mean() - grown * np.exp(1j * turn) * seen.mean()
+    place = pose.place_m.copy()
+    if not known[5]:
+        place[2] = grown + float(marks.up_m.mean())
+    place[:2] = np.where(known[3:5], place[:2], [middle.real, middle.imag])
+    axes = turned(np.array([0.0, 0.0, turn])) @ pose.axes
+    return [CameraPose(place, axes, pose.focal)]
+
+
+def _all_headings(expected: Expected) -> list[CameraPose]:
+    """With all known but the heading: looking every way."""
+    pose = move_pose(expected.reference, expected.mean[:7])
+    turns = np.linspace(0, 2 * np.pi, HEADINGS, endpoint=False)
+    return [replace(pose, axes=turned(np.array([0.0, 0.0, turn])) @ pose.axes) for turn in turns]
+
+
+def of_homography(flat_from_ground: np.ndarray, camera: Camera, east_north_m: np.ndarray, up_m: np.ndarray) -> list:
+    """Poses that see the ground as a homography says, and as its mirror does that is hard to tell from afar.
+
+    flat_from_ground: (3, 3) from local metres to metres right and down a metre of depth.
+    """
+    middle = east_north_m.mean(axis=0)
+    shift = np.eye(3)
+    shift[:2, 2] = middle
+    matrix = flat_from_ground @ shift
+    if not np.isfinite(matrix).all():
+        return []
+    scale = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
+    if not scale > 0:
+        return []
+    matrix = matrix / scale
+    # The ground's middle is before the camera.
+    matrix = matrix if matrix[2, 2] > 0 else -matrix
+    two, _, other = np.linalg.svd(matrix[:, :2], full_matrices=False)
+    east_north = two @ other
+    first = np.column_stack([east_north, np.cross(east_north[:, 0], east_north[:, 1])])  # camera axes from the world's
+    poses = [_seen_so(first, matrix[:, 2], middle, float(up_m.mean()))]
+    # The mirror: the ground's normal reflected at the line of sight to its middle.
+    sight = matrix[:, 2] / np.linalg.norm(matrix[:, 2])
+    normal = first[:, 2]
+    mirrored = 2 * (sight @ normal) * sight - normal
+    axis = np.cross(normal, mirrored)
+    sine = np.linalg.norm(axis)
+    if sine > 1e-6:
+        turn = turned(axis / sine * np.arctan2(sine, normal @ mirrored))
+        poses.append(_seen_so(turn @ first, matrix[:, 2], middle, float(up_m.mean())))
+    # Seen from below the ground it is no picture from the air.
+    return [pose for pose in poses if pose.place_m[2] > 0]
+
+
+def _seen_so(camera_from_world: np.ndarray, middle_seen: np.ndarray, middle: np.ndarray, up_m: float) -> CameraPose:
+    place = np.array([*middle, up_m]) - camera_from_world.T @ middle_seen
+    return CameraPose(place, camera_from_world.T)
+
+
+def _plain(marks: LandmarkObservations, camera: Camera) -> np.ndarray:
+    """(3, 3) homography from local metres to metres right and down a metre of depth, unweighed: a start."""
+    ground, flat = marks.east_north_m, normalize(marks.image_px, 1.0, camera)
+    middle, size = ground.mean(axis=0), max(float(np.abs(ground - ground.mean(axis=0)).max()), 1e-9)
+    x, y = ((ground - middle) / size).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    u, v = flat.T
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
+        ]
+    )
+    matrix = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    return matrix @ np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1]])

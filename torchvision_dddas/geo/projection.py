@@ -8,6 +8,8 @@ clockwise about forward. The lens bends a radius r to r (1 + k1 r² + k2 r⁴), 
 
 import numpy as np
 
+from torchvision_dddas.geo.terrain import Surface, intersect_surface
+from torchvision_dddas.geometry import cross
 from torchvision_dddas.types import Camera, CameraPose, Float
 
 NEAREST = 1e-6
@@ -29,37 +31,37 @@ def project(points_m: Float[np.ndarray, "N 3"], pose: CameraPose, camera: Camera
 
 def rays(pixels: Float[np.ndarray, "N 2"], pose: CameraPose, camera: Camera) -> Float[np.ndarray, "N 3"]:
     """Directions in east, north, up through pixels, a metre of depth long; NaN where the lens has none."""
-    straight_xy = lifted(pixels, pose.focal, camera)
+    straight_xy = normalize(pixels, pose.focal, camera)
     return np.c_[straight_xy, np.ones(len(straight_xy))] @ pose.axes.T
 
 
-def lifted(pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera) -> Float[np.ndarray, "N 2"]:
+def normalize(pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera) -> Float[np.ndarray, "N 2"]:
     """Pixels to metres right and down per metre of depth, distortion undone; focal: as a share of the camera's."""
     pixels = np.asarray(pixels, float).reshape(-1, 2)
     bent = (pixels - camera.centre_px) / (np.array(camera.focal_px) * focal)
     if not (camera.k1 or camera.k2):
         return bent
-    return np.stack(straight(bent[:, 0], bent[:, 1], camera), axis=1)
+    return np.stack(undistort(bent[:, 0], bent[:, 1], camera), axis=1)
 
 
-def unbent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+def undistort_pixels(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
     """Where a lens without distortion would show what is at these pixels."""
-    return lifted(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
+    return normalize(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
 
 
-def bent(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
+def distort_pixels(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
     """The other way: where the lens shows what one without distortion would show at these pixels; NaN where nowhere."""
     flat = (np.asarray(pixels, float).reshape(-1, 2) - camera.centre_px) / camera.focal_px
-    return bend(flat, camera)[0] * camera.focal_px + camera.centre_px
+    return distort(flat, camera)[0] * camera.focal_px + camera.centre_px
 
 
-def slopes_of_lift(
+def normalize_with_slopes(
     pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`lifted`, and how it grows with the pixel (N, 2, 2) and with the log of the focal length (N, 2)."""
-    flat = lifted(pixels, focal, camera)
+    flat = normalize(pixels, focal, camera)
     scale = np.array(camera.focal_px) * focal
-    bent, by_flat = bend(flat, camera)
+    bent, by_flat = distort(flat, camera)
     by_bent = inverse_2x2(by_flat)
     return flat, by_bent / scale, -(by_bent @ bent[:, :, None])[:, :, 0]
 
@@ -80,7 +82,7 @@ def project_with_slopes(
     by_seen[:, 0, 0] = by_seen[:, 1, 1] = 1 / depth
     by_seen[:, :, 2] = -flat / depth[:, None]
     if camera.k1 or camera.k2:
-        flat, by_flat = bend(flat, camera)
+        flat, by_flat = distort(flat, camera)
         by_seen = by_flat @ by_seen
     by_point = (scale[:, None] * by_seen) @ pose.axes.T
     by_pose = np.empty((len(seen), 2, 7))
@@ -96,7 +98,7 @@ def project_with_slopes(
 # The lens.
 
 
-def bend(flat: Float[np.ndarray, "N 2"], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def distort(flat: Float[np.ndarray, "N 2"], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """What the lens makes of (right, down) per metre of depth (N, 2), and how that grows (N, 2, 2).
 
     NaN beyond the radius where the lens folds the picture back.
@@ -120,7 +122,7 @@ def _fold(camera: Camera) -> float:
     return 2 * c / (-b + float(np.sqrt(inside)))
 
 
-def straight(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def undistort(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Undo r -> r (1 + k1 r² + k2 r⁴) by Newton's steps on the radius; NaN where the lens has no such radius."""
     bent = np.hypot(x, y)
     radius = bent.copy()
@@ -138,3 +140,62 @@ def inverse_2x2(matrices: Float[np.ndarray, "N 2 2"]) -> Float[np.ndarray, "N 2 
     """Inverses written out: so small, one by one would take longer."""
     (a, b), (c, d) = np.moveaxis(matrices, (1, 2), (0, 1))
     return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), (0, 1), (1, 2))
+
+
+def ground_from_rays(
+    pose: CameraPose,
+    covariance: Float[np.ndarray, "7 7"],
+    camera: Camera,
+    pixels: Float[np.ndarray, "N 2"],
+    sigma_px: float,
+    up_m: float | Float[np.ndarray, "N"] = 0.0,
+    surface: Surface | None = None,
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 2"]]:
+    """East and north of what pixels show, and their covariance; NaN where a ray meets no ground.
+
+    covariance: of the pose, in the order of Fix. sigma_px: standard deviation of u and of v each. up_m: height of what
+    is seen above the ground: the plane up = 0 or the surface.
+    """
+    place, by_pose, by_pixel = ground_with_slopes(pose, camera, pixels, up_m, surface)
+    spread_m2 = by_pose @ covariance @ by_pose.swapaxes(1, 2)
+    spread_m2 += sigma_px**2 * by_pixel @ by_pixel.swapaxes(1, 2)
+    return place, spread_m2
+
+
+def ground_with_slopes(
+    pose: CameraPose,
+    camera: Camera,
+    pixels: Float[np.ndarray, "N 2"],
+    up_m: float | Float[np.ndarray, "N"] = 0.0,
+    surface: Surface | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """East and north of what pixels show (N, 2), and their derivatives by the pose (N, 2, 7) and the pixel (N, 2, 2).
+
+    The pose in the order of Fix; up_m and surface as in `by_rays`.
+    """
+    flat, by_pixel, by_focal = normalize_with_slopes(pixels, pose.focal, camera)
+    way = np.c_[flat, np.ones(len(flat))] @ pose.axes.T
+    far, normal = _met(pose.place_m, way, np.broadcast_to(np.asarray(up_m, float), len(way)), surface)
+    offset = far[:, None] * way
+    # A change of the ray or of its start moves the place where it meets the ground along the ground.
+    steep = (way * normal).sum(axis=1)
+    along = np.eye(3) - way[:, :, None] * normal[:, None, :] / steep[:, None, None]
+    along = along[:, :2]
+    by_lift = far[:, None, None] * along @ pose.axes[:, :2]
+    by_pose = np.empty((len(way), 2, 7))
+    by_pose[:, :, :3] = -along @ cross(offset)
+    by_pose[:, :, 3:6] = along
+    by_pose[:, :, 6] = (by_lift @ by_focal[:, :, None])[:, :, 0]
+    return (pose.place_m + offset)[:, :2], by_pose, by_lift @ by_pixel
+
+
+def _met(
+    place_m: np.ndarray, way: np.ndarray, up_m: np.ndarray, surface: Surface | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far along rays the ground is (N,), and its normal there (N, 3), upward; NaN where a ray meets none."""
+    if surface is not None:
+        return intersect_surface(place_m, way, up_m, surface)
+    flat = np.broadcast_to(np.array([0.0, 0.0, 1.0]), way.shape)
+    down = np.where(way[:, 2] < -1e-9 * np.linalg.norm(way, axis=1), way[:, 2], np.nan)
+    far = (up_m - place_m[2]) / down
+    return np.where(far > 0, far, np.nan), flat

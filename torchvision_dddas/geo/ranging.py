@@ -20,7 +20,7 @@ import numpy as np
 
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.projection import straight
+from torchvision_dddas.geo.projection import undistort
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
 PIXEL_SIGMA = 0.5
@@ -36,7 +36,7 @@ COARSEST = 0.5
 """A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors."""
 
 
-def sight(
+def range_people(
     box_px: Float[np.ndarray, "N 4"],
     cut: Bool[np.ndarray, "N"],
     camera: Camera,
@@ -138,7 +138,7 @@ def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
     x, y = (u - camera.centre_px[0]) / camera.focal_px[0], (v - camera.centre_px[1]) / camera.focal_px[1]
     right, down = x, y
     if camera.k1 or camera.k2:
-        right, down = straight(x, y, camera)
+        right, down = undistort(x, y, camera)
     sine, cosine = np.sin(camera.roll_rad), np.cos(camera.roll_rad)
     return right * cosine - down * sine, right * sine + down * cosine
 

@@ -9,20 +9,18 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.elevation import up
+from torchvision_dddas.geo.terrain import ground_height
 from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)
 
+# Telemetry holds this long before its first and after its last sample.
 HOLDS_S = 1.0
-"""So long before its first and after its last sample telemetry holds."""
-
-HIGHEST_DEG = 20.0
-"""No camera that looks higher than this above the horizon, as a rule, shows landmarks: its angles go the other way."""
-
+# A camera that looks higher above the horizon shows no landmarks as a rule: its angles have the other sign.
+_HIGHEST_DEG = 20.0
+# No vehicle sees landmarks from further away: then the files are of two flights.
 FARTHEST_M = 100_000.0
-"""No vehicle sees landmarks from further away: then the files are of two flights."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +44,53 @@ class Site:
         return np.concatenate([place[np.isfinite(place).all(axis=1)] for place in known])
 
 
-def site_of(landmarks: Landmarks, telemetry: Telemetry | None) -> Site:
-    """Everything in local metres: those of the landmarks, or east and north of the first place of one.
+def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site:
+    """Everything in local metres: those of the landmarks, or east and north of their first place.
 
-    Raises InputError where no landmark has a place, degrees and metres are mixed, longitude and latitude look swapped,
-    or the vehicle's altitude is below the ground throughout.
+    Without landmarks the metres are those of the telemetry, or east and north of the vehicle's first place.
+    Raises InputError where neither gives a place, degrees and metres are mixed, longitude and latitude look swapped, or
+    the vehicle's altitude is below the ground throughout.
     """
+    if telemetry is not None:
+        _check_telemetry(telemetry)
+    flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)] if telemetry is not None else np.zeros((0, 2))
+    if landmarks is None:
+        return _without_landmarks(telemetry, flown)
     known = np.isfinite(landmarks.place).all(axis=1)
     if not known.any():
         raise InputError(f"landmarks {landmarks.path}: no row has a place; wanted longitude_deg,latitude_deg or metres")
-    flown = telemetry is not None and np.isfinite(telemetry.place).all(axis=1).any()
-    if telemetry is not None and flown and telemetry.geographic != landmarks.geographic:
+    if telemetry is not None and len(flown) and telemetry.geographic != landmarks.geographic:
         kinds = ("longitude and latitude", "local metres")
         first, second = kinds if landmarks.geographic else kinds[::-1]
         raise InputError(f"the landmarks are in {first}, the telemetry in {second}; give both in one kind")
+    origin = None
+    if landmarks.geographic:
+        if len(flown):
+            longitude, latitude = (float(v) for v in np.median(flown, axis=0))
+            if looks_swapped(landmarks, (longitude, latitude)):
+                raise InputError(
+                    f"landmarks {landmarks.path}: longitude and latitude look swapped; the vehicle is at longitude "
+                    f"{longitude:.5f}, latitude {latitude:.5f}"
+                )
+        longitude, latitude = landmarks.place[known][0].tolist()
+        origin = (longitude, latitude)
+        landmarks = to_local(landmarks, origin)
+        telemetry = None if telemetry is None else to_local(telemetry, origin)
     if telemetry is not None:
-        _above_ground(telemetry)
-        _looks_down(telemetry)
-    if not landmarks.geographic:
-        if telemetry is not None:
-            _near(landmarks, telemetry)
-        return Site(landmarks, telemetry, None)
-    if telemetry is not None and flown:
-        where = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
-        longitude, latitude = (float(v) for v in np.median(where, axis=0))
-        if looks_swapped(landmarks, (longitude, latitude)):
-            raise InputError(
-                f"landmarks {landmarks.path}: longitude and latitude look swapped; the vehicle is at longitude "
-                f"{longitude:.5f}, latitude {latitude:.5f}"
-            )
-    longitude, latitude = landmarks.place[known][0].tolist()
-    origin = (longitude, latitude)
-    landmarks = local(landmarks, origin)
-    if telemetry is not None:
-        telemetry = local(telemetry, origin)
-        _near(landmarks, telemetry)
+        _check_near(landmarks, telemetry)
     return Site(landmarks, telemetry, origin)
+
+
+def _without_landmarks(telemetry: Telemetry | None, flown: np.ndarray) -> Site:
+    if telemetry is None or not len(flown):
+        raise InputError("locating needs landmarks, or telemetry that says where the vehicle is; got neither")
+    empty = np.zeros((0, 2))
+    none = np.zeros(0, np.int64)
+    landmarks = Landmarks((), none.astype(float), none, empty, empty, np.zeros(0), none.astype(bool), none, False)
+    if not telemetry.geographic:
+        return Site(landmarks, telemetry, None)
+    origin = float(flown[0, 0]), float(flown[0, 1])
+    return Site(landmarks, to_local(telemetry, origin), origin)
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
@@ -95,31 +104,28 @@ def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> boo
     return swapped < FARTHEST_M and given > 10 * max(swapped, 300.0)
 
 
-def local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
+def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
     """What was reported in degrees, in metres east and north of (longitude, latitude)."""
     return replace(reports, place=geometry.east_north(reports.place, origin_deg), geographic=False)
 
 
-def _looks_down(telemetry: Telemetry) -> None:
-    """Raises InputError for angles that are counted upward, as some gimbals do."""
-    pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
-    if len(pitch) and np.median(pitch) < -HIGHEST_DEG:
-        raise InputError(
-            f"by the telemetry's pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
-            "below the horizon, 90 for straight down: turn the sign of pitch_deg"
-        )
-
-
-def _above_ground(telemetry: Telemetry) -> None:
+def _check_telemetry(telemetry: Telemetry) -> None:
+    """Raises InputError for altitudes at or below the ground throughout, and for pitch angles counted upward."""
     altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
     if len(altitude) and (altitude <= 0).all():
         raise InputError(
             f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
             "wanted metres above ground: correct it, or leave --telemetry out"
         )
+    pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
+    if len(pitch) and np.median(pitch) < -_HIGHEST_DEG:
+        raise InputError(
+            f"by the telemetry's pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
+            "below the horizon, 90 for straight down: turn the sign of pitch_deg"
+        )
 
 
-def _near(landmarks: Landmarks, telemetry: Telemetry) -> None:
+def _check_near(landmarks: Landmarks, telemetry: Telemetry) -> None:
     """Raises InputError for a vehicle that is never near the landmarks; both in local metres."""
     flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
     if not len(flown):
@@ -142,7 +148,7 @@ def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> N
         )
 
 
-def unknown_heights(site: Site) -> list[str]:
+def describe_unknown_heights(site: Site) -> list[str]:
     """What the user should know where no height is known of the vehicle, or of the ground below it or at landmarks."""
     telemetry, notes = site.telemetry, []
     if site.elevation is None:
@@ -163,13 +169,13 @@ def unknown_heights(site: Site) -> list[str]:
         ),
     ):
         known = places[np.isfinite(places).all(axis=1)]
-        missing = int(np.isnan(up(site.elevation, known)).sum())
+        missing = int(np.isnan(ground_height(site.elevation, known)).sum())
         if missing:
             notes.append("the elevation has no height " + what.format(missing, len(known)))
     return notes
 
 
-def camera_of(
+def resolve_camera(
     camera: Camera | None,
     size: tuple[int, int] | None,
     telemetry: Telemetry | None,

@@ -8,16 +8,17 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection.engine import Engine, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
-    Locator,
-    Watch,
-    camera_of,
+    AerialLocator,
+    LandmarkWatch,
+    build_site,
     check_colours,
     check_span,
-    site_of,
-    unknown_heights,
-    unpictured,
+    describe_unknown_heights,
+    resolve_camera,
+    without_pixels,
 )
-from torchvision_dddas.geo.solvers import load_colours, load_solver
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation
@@ -59,7 +60,7 @@ class PreparedRun:
 
     settings: Settings
     engine: Engine
-    watch: Watch | None
+    watch: LandmarkWatch | None
     flight: Telemetry | None
     notes: list[str]
 
@@ -95,12 +96,13 @@ def read_locator(
     clip: str | None,
     colours: Colours | None = None,
     extent: tuple[float, float] | None = None,
-) -> tuple[Locator, list[str]]:
+) -> tuple[AerialLocator, list[str]]:
     """Make the aerial locator from the files; also the notes that the user should read.
 
     size: (width, height) of the pictures; rate_hz; frames: numbers of the first and last; each None if unknown.
     what: whose frames these are, for messages. clip: the video, as for `read_telemetry`. colours: if given, they find
-    the landmarks in the pictures, whatever the table says. extent: as for `camera_of`. Raises InputError for bad input.
+    the landmarks in the pictures, whatever the table says. extent: as for `resolve_camera`.
+    Raises InputError for bad input.
     """
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
@@ -116,16 +118,19 @@ def read_locator(
         notes += telemetry.notes
     if rate_hz is None:
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
-    site = site_of(landmarks if colours is None else unpictured(landmarks), telemetry)
+    site = build_site(landmarks if colours is None else without_pixels(landmarks), telemetry)
     if given.dem is not None:
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
-    notes += unknown_heights(site)
+    notes += describe_unknown_heights(site)
     known = read_camera(given.camera) if given.camera is not None else None
-    camera, focal_known, more = camera_of(known, size, site.telemetry, settings, extent)
-    return Locator(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known), [*notes, *more]
+    camera, focal_known, more = resolve_camera(known, size, site.telemetry, settings, extent)
+    return AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known), [
+        *notes,
+        *more,
+    ]
 
 
-def _watch(given: AerialInput, settings: Settings, source: Source, backend: str) -> tuple[Watch, list[str]]:
+def _watch(given: AerialInput, settings: Settings, source: Source, backend: str) -> tuple[LandmarkWatch, list[str]]:
     colours = read_colours(given.colours) if given.colours is not None else None
     frames = None if source.count is None else (1, source.count)
     locator, notes = read_locator(
@@ -135,10 +140,10 @@ def _watch(given: AerialInput, settings: Settings, source: Source, backend: str)
     check_colours(locator.site.landmarks, colours, helped)
     if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
         notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
-    return Watch(locator, colours, load_colours(backend) if colours is not None else None), notes
+    return LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None), notes
 
 
-def _with_focal_length(settings: Settings, locator: Locator) -> tuple[Settings, list[str]]:
+def _with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
     """Take the camera's own focal length if telemetry gives the size of targets, unless another is set."""
     focal = locator.camera.focal_px[0]
     if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:

@@ -13,14 +13,20 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
 from torchvision_dddas.evaluation.studies.placing_score import whose_places
-from torchvision_dddas.geo import Locator, Targets
-from torchvision_dddas.geo.elevation import surface
-from torchvision_dddas.geo.ground_rays import met_with_slopes
-from torchvision_dddas.geo.initial_pose import find_pose
+from torchvision_dddas.geo import AerialLocator, Targets
 from torchvision_dddas.geo.landmark_faults import passes
-from torchvision_dddas.geo.landmark_trajectories import Courses
-from torchvision_dddas.geo.pose_estimation import EXACT_M, Prior, bare_prior, expected_of, prior_of, slopes_at
-from torchvision_dddas.geo.terrain_intersection import Surface
+from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
+from torchvision_dddas.geo.pose_estimation import (
+    EXACT_M,
+    Prior,
+    find_pose,
+    focal_prior,
+    independent_expectation,
+    linearize_pose,
+    pose_prior,
+)
+from torchvision_dddas.geo.projection import ground_with_slopes
+from torchvision_dddas.geo.terrain import Surface, surface_of
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.soft_places import Linear, Spread
 from torchvision_dddas.types import AerialLocations, Camera, CameraPose, Flight, LandmarkObservations
@@ -154,14 +160,14 @@ def fit_ground(look: Look, parameters: dict[str, torch.Tensor]) -> GroundFit | N
         pixel_sigma,
         look.marks.up_m,
     )
-    expected = expected_of(prior, sigma_m)
+    expected = independent_expectation(prior, sigma_m)
     solution = find_pose(marks, look.camera, expected)
     if solution is None:
         return None
-    here = slopes_at(marks, look.camera, expected, solution.pose, solution.places)
+    here = linearize_pose(marks, look.camera, expected, solution.pose, solution.places)
     if here is None:
         return None
-    place, by_pose, by_pixel = met_with_slopes(solution.pose, look.camera, look.targets_px, look.up_m, look.surface)
+    place, by_pose, by_pixel = ground_with_slopes(solution.pose, look.camera, look.targets_px, look.up_m, look.surface)
     if not all(np.isfinite(found).all() for found in (place, by_pose, by_pixel)):
         return None
     by_turn = np.eye(7 + 2 * n)
@@ -183,7 +189,7 @@ def only_noise(look: Look, parameters: dict[str, torch.Tensor], probability: flo
         NO_NOISE * pixel_sigma,
         look.marks.up_m,
     )
-    return passes(find_pose(marks, look.camera, expected_of(wide, marks.sigma_m)), probability)
+    return passes(find_pose(marks, look.camera, independent_expectation(wide, marks.sigma_m)), probability)
 
 
 def joined(parts: Sequence[Spread]) -> Spread:
@@ -202,7 +208,9 @@ def _hard(look: Look, parameters: dict[str, torch.Tensor]) -> tuple[Prior, np.nd
 
 
 def _prior(flight: Flight | None, camera: Camera, parameters: AerialParameters, focal_known: bool) -> Prior:
-    return prior_of(flight, camera, parameters, focal_known=focal_known) or bare_prior(camera, parameters, focal_known)
+    return pose_prior(flight, camera, parameters, focal_known=focal_known) or focal_prior(
+        camera, parameters, focal_known
+    )
 
 
 def _spread_of(flight: Flight | None, camera: Camera, focal_known: bool) -> Spread:
@@ -265,7 +273,7 @@ def looks_of(clip: Clip, settings: Settings, backend: str = "auto") -> Iterator[
     if truth is None or truth.positions is None:
         raise InputError(f"{clip.name} has no true places; ellipses cannot be tuned on it. Give clips with positions")
     found = _along(clip, settings, backend) if clip.pictures else _of_table(clip, settings, backend)
-    probes: dict[int, tuple[Courses, float]] = {}
+    probes: dict[int, tuple[LandmarkTrajectories, float]] = {}
     for locator, grounded, targets in found:
         if id(locator) not in probes:
             probes[id(locator)] = _probe(locator)
@@ -278,10 +286,10 @@ def _look(
     clip: Clip,
     truth: Truth,
     places: Positions,
-    locator: Locator,
+    locator: AerialLocator,
     grounded: AerialLocations,
     targets: Targets,
-    probe: Courses,
+    probe: LandmarkTrajectories,
     added: float,
 ) -> Example | None:
     """One frame; None where nothing of it is known to be true, or its landmarks are not where they are said to be."""
@@ -298,7 +306,7 @@ def _look(
     usable = np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1)
     if not known.any() or not here.any() or not usable.any():
         return None
-    pixels, lift = locator.points(grounded.fix, targets)
+    pixels, lift = locator.target_points(grounded.fix, targets)
     kept = row[known]
     box = targets.box_px[kept]
     side = np.sqrt(np.maximum(box[:, 2] * box[:, 3], 0)) if targets.bodies else np.zeros(len(kept))
@@ -308,7 +316,7 @@ def _look(
     marks = replace(marks, **{name: column[usable] for name, column in vars(marks).items()})
     look = look_at(
         locator.camera,
-        locator.flight(grounded.time_s),
+        locator.telemetry_at(grounded.time_s),
         marks,
         pixels[kept],
         true_m[whose[known]],
@@ -317,19 +325,19 @@ def _look(
         lift[kept],
         side,
         locator.focal_known,
-        None if locator.site.elevation is None else surface(locator.site.elevation),
+        surface_of(locator.site.elevation),
     )
     if not only_noise(look, of_settings(settings), settings.aerial.gate_probability):
         return None
     return Example(clip.name, grounded.frame, Seen(look, settings))
 
 
-def _probe(locator: Locator) -> tuple[Courses, float]:
+def _probe(locator: AerialLocator) -> tuple[LandmarkTrajectories, float]:
     """The landmarks' courses with another landmarks.sigma_m, and by how much its square is more."""
     parameters = locator.settings.landmarks
     wider = max(PROBE * parameters.sigma_m, 1.0)
     other = parameters.model_copy(update={"sigma_m": wider})
-    return Courses(locator.site.landmarks, other, locator.rate_hz), wider**2 - parameters.sigma_m**2
+    return LandmarkTrajectories(locator.site.landmarks, other, locator.rate_hz), wider**2 - parameters.sigma_m**2
 
 
 def _true_m(clip: Clip, places: Positions, origin: tuple[float, float] | None) -> np.ndarray:
@@ -350,7 +358,7 @@ def _given(clip: Clip) -> "AerialInput":
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
-def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
+def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
     from torchvision_dddas.evaluation.studies.stages import opened
     from torchvision_dddas.io.run_inputs import prepare_run
     from torchvision_dddas.pipeline import survey
@@ -367,8 +375,8 @@ def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locat
             yield ready.watch.locator, grounded, targets
 
 
-def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Locator, AerialLocations, Targets]]:
-    from torchvision_dddas.geo import check_table, locate
+def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
+    from torchvision_dddas.geo import check_table
     from torchvision_dddas.io.detection_tables import read_detections
     from torchvision_dddas.io.run_inputs import read_locator
 
@@ -380,7 +388,7 @@ def _of_table(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Lo
         _given(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
     )
     check_table(table, locator)
-    for grounded in locate(table, locator):
+    for grounded in locator.locate_table(table):
         rows = table.rows(grounded.frame)
         count = len(grounded.box_px)
         feet = None if table.feet_px is None else table.feet_px[rows]

@@ -17,7 +17,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.placing_score import whose_places
-from torchvision_dddas.geo.ranging import sight
+from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.soft_places import gaussian_nll
 from torchvision_dddas.types import Camera, Poses
@@ -47,7 +47,7 @@ def sightings_of(clip: Clip, settings: Settings) -> Iterator[Example]:
 
     Raises InputError where the clip lacks them or true places, and for ground.mode = paper, which knows no errors.
     """
-    from torchvision_dddas.geo.ground_locator import survey
+    from torchvision_dddas.geo.ground_locator import GroundLocator
     from torchvision_dddas.io.camera_files import read_camera
     from torchvision_dddas.io.detection_tables import read_detections
 
@@ -62,8 +62,7 @@ def sightings_of(clip: Clip, settings: Settings) -> Iterator[Example]:
     if camera.geographic:
         raise InputError(f"{clip.name}: the camera stands at degrees; wanted local metres, as the true places are")
     table = read_detections(clip.given)
-    found = survey([table], [camera], [None], settings, clip.rate_hz)
-    (view,) = found.views
+    (view,) = GroundLocator(camera, settings, rate_hz=clip.rate_hz).place_tables([table])
     places = truth.positions
     whose, _ = whose_places(truth, places, places.east_north_m, table.frame, table.box_px, view.sightings.east_north_m)
     whose = np.where(np.isfinite(view.sightings.east_north_m).all(axis=1), whose, -1)
@@ -88,7 +87,7 @@ def person_lost(seen: Sighted, settings: Settings, parameters: Mapping[str, Tens
 
     def hard(*given: float) -> np.ndarray:
         changed = dict(zip((name.partition(".")[2] for name in values), given, strict=True))
-        found = sight(
+        found = range_people(
             seen.box_px, seen.cut, seen.camera, seen.poses, seen.here_m, settings.ground.model_copy(update=changed)
         )
         off = found.east_north_m - seen.true_m

@@ -49,7 +49,7 @@ def _along(clip: Clip, settings: Settings, backend: str, interval: int, tick: Ti
 
 
 def _of_table(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
-    from torchvision_dddas.geo import check_table, locate
+    from torchvision_dddas.geo import check_table
     from torchvision_dddas.io.detection_tables import read_detections
     from torchvision_dddas.io.run_inputs import read_locator
 
@@ -61,7 +61,7 @@ def _of_table(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
         _given(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
     )
     check_table(table, locator)
-    for grounded in locate(table, locator):
+    for grounded in locator.locate_table(table):
         here = table.rows(grounded.frame)
         identity = np.full(here.stop - here.start, -1) if table.identity is None else table.identity[here]
         score = table.score[here].clip(0, 1)
@@ -72,14 +72,14 @@ def _of_table(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
 
 
 def _from_ground(clip: Clip, settings: Settings, tick: Tick) -> Rows:
-    from torchvision_dddas.geo.ground_locator import locate, survey
+    from torchvision_dddas.geo.ground_locator import GroundLocator
     from torchvision_dddas.io.camera_files import read_camera
     from torchvision_dddas.io.detection_tables import read_detections
 
     if clip.given is None or clip.camera is None:
         raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
     rows, table = Rows(), read_detections(clip.given)
-    for found in locate(survey([table], [read_camera(clip.camera)], [None], settings, clip.rate_hz), settings):
+    for found in GroundLocator(read_camera(clip.camera), settings, rate_hz=clip.rate_hz).locate_tables([table]):
         count, here = len(found.box_px), found.sightings.by != "bearing"
         identity = np.full(count, -1) if table.identity is None else table.identity[table.rows(found.frame)]
         places = _placed(count, np.flatnonzero(here), found.positions)

@@ -9,9 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from torchvision_dddas.geo.ground_rays import by_rays
-from torchvision_dddas.geo.projection import inverse_2x2, unbent
-from torchvision_dddas.geo.terrain_intersection import Surface
+from torchvision_dddas.geo.projection import ground_from_rays, inverse_2x2, undistort_pixels
+from torchvision_dddas.geo.terrain import Surface
 from torchvision_dddas.geometry import lonlat, transfer
 from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 
@@ -35,7 +34,7 @@ class Solver(Protocol):
         ...
 
 
-def homography_fix(
+def fix_by_homography(
     frame: int,
     marks: LandmarkObservations,
     solver: Solver,
@@ -50,8 +49,8 @@ def homography_fix(
     """
     ids, n = marks.landmark, len(marks)
     if n < LEAST:
-        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=too_few(frame, n))
-    cause = on_one_line(frame, marks, least_spread)
+        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=describe_too_few(frame, n))
+    cause = describe_one_line(frame, marks, least_spread)
     if cause:
         return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
     if paper:
@@ -99,17 +98,17 @@ def homography_fix(
     )
 
 
-def too_few(frame: int, n: int, without: str = "") -> str:
+def describe_too_few(frame: int, n: int, without: str = "") -> str:
     """The cause of a refusal, in words: how many landmarks are missing in which frame."""
     has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
     return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that are needed"
 
 
-def on_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
+def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
     """The cause of a refusal where landmarks stand on one line, or show in one spot; empty where they do not."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
-    wide = width(marks)
+    wide = relative_width(marks)
     if wide >= least_spread:
         return ""
     return (
@@ -118,7 +117,7 @@ def on_one_line(frame: int, marks: LandmarkObservations, least_spread: float) ->
     )
 
 
-def width(marks: LandmarkObservations) -> float:
+def relative_width(marks: LandmarkObservations) -> float:
     """How wide landmarks lie, as a share of how long, on the ground or in the picture, whichever is less.
 
     Receivers' errors make a row on the ground wider than it is; a picture shows a row as one whatever they err.
@@ -133,7 +132,7 @@ def spread(points: Float[np.ndarray, "n 2"]) -> float:
     return float(width / length) if length > 0 else 0.0
 
 
-def ground_points(
+def locate_pixels(
     fix: Fix,
     camera: Camera,
     pixels: Float[np.ndarray, "N 2"],
@@ -148,18 +147,18 @@ def ground_points(
     """
     pixels = np.asarray(pixels, float).reshape(-1, 2)
     if fix.pose is not None and fix.covariance is not None:
-        return by_rays(fix.pose, fix.covariance, camera, pixels, sigma_px, up_m, surface)
+        return ground_from_rays(fix.pose, fix.covariance, camera, pixels, sigma_px, up_m, surface)
     if fix.image_from_ground is None:
         return np.full((len(pixels), 2), np.nan), np.full((len(pixels), 2, 2), np.nan)
     if fix.by != "paper":
-        pixels = unbent(pixels, camera)
+        pixels = undistort_pixels(pixels, camera)
     middle = np.array(fix.about_m)
     matrix = _about(fix.image_from_ground, middle)
     ground, covariance = _by_inverse(matrix / matrix[2, 2], fix.matrix_covariance, pixels, sigma_px)
     return ground + middle, covariance
 
 
-def absolute(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m: float) -> Float[np.ndarray, "N 2 2"]:
+def absolute_covariance(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m: float) -> Float[np.ndarray, "N 2 2"]:
     """The covariance of absolute places: with the error that all receivers of the team share."""
     return relative_m2 + common_sigma_m**2 * np.eye(2)
 

@@ -1,0 +1,181 @@
+"""Targets seen from the air: the point in the picture that stands for each, its shadow, and its speed over time."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.config import AerialParameters
+from torchvision_dddas.geo.projection import project
+from torchvision_dddas.types import Camera, CameraPose, Float, Int
+
+# Width of a person from straight above, where no height shows.
+BODY_WIDTH_M = 0.5
+# Below this height of the sun shadows are too long and too weak to count on.
+_LOWEST_SUN_RAD = math.radians(8.0)
+_J2000_S = 946_728_000.0  # 2000-01-01 12:00 UTC, in seconds since 1970
+# The velocity filter: acceleration of people and vehicles; standard deviation above which a velocity is unknown; that
+# of a new target; and the gap after which a target starts anew.
+_ACCELERATION_M_S2, _KNOWN_M_S, _FASTEST_M_S, _FORGET_S = 0.5, 1.0, 10.0, 5.0
+
+
+@dataclass(frozen=True)
+class Targets:
+    """The boxes of one frame.
+
+    box_px: (N, 4). target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is
+    an identity. score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; or None.
+    bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v to use instead of the box's centre;
+    None, or NaN in a row: use the centre.
+    """
+
+    box_px: np.ndarray
+    target: np.ndarray
+    lasting: np.ndarray
+    score: np.ndarray
+    feet_px: np.ndarray | None = None
+    bodies: bool = False
+    middle_px: np.ndarray | None = None
+
+
+def reference_points(targets: Targets, parameters: AerialParameters, posed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) that stand for the targets, and how high above the ground they lie (N,) m.
+
+    posed: whether the camera's pose is known. Only then is the middle of a body taken at half its height.
+    """
+    centre = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
+    if targets.middle_px is not None:
+        centre = np.where(np.isfinite(targets.middle_px).all(axis=1)[:, None], targets.middle_px, centre)
+    lift = np.zeros(len(centre))
+    if parameters.point == "auto" and targets.feet_px is not None:
+        named = np.isfinite(targets.feet_px).all(axis=1)
+        return np.where(named[:, None], targets.feet_px, centre), lift
+    if posed and (parameters.point == "foot" or (parameters.point == "auto" and targets.bodies)):
+        lift += parameters.target_height_m / 2
+    return centre, lift
+
+
+def point_sigma_px(targets: Targets, parameters: AerialParameters) -> np.ndarray:
+    """(N,) standard deviation in pixels, of u and of v each, of the points that stand for the targets."""
+    side = np.sqrt(np.maximum(targets.box_px[:, 2] * targets.box_px[:, 3], 0))
+    return np.hypot(parameters.target_sigma_px, side * (parameters.own_sigma if targets.bodies else 0.0))
+
+
+def sun_at(longitude_deg: float, latitude_deg: float, utc_s: float) -> tuple[float, float]:
+    """Azimuth of the sun clockwise from north and its height above the horizon, rad, without refraction.
+
+    utc_s: seconds since 1970. Accurate to about 0.02 degrees from 1950 to 2050.
+    Source: the low-precision formulas of the Astronomical Almanac.
+    """
+    days = (utc_s - _J2000_S) / 86400
+    mean_longitude = math.radians(280.460 + 0.9856474 * days)
+    anomaly = math.radians(357.528 + 0.9856003 * days)
+    ecliptic = mean_longitude + math.radians(1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly))
+    tilt = math.radians(23.439 - 4e-7 * days)
+    ascension = math.atan2(math.cos(tilt) * math.sin(ecliptic), math.cos(ecliptic))
+    declination = math.asin(math.sin(tilt) * math.sin(ecliptic))
+    sidereal = math.radians(280.46062 + 360.98564737 * days + longitude_deg)
+    hour, latitude = sidereal - ascension, math.radians(latitude_deg)
+    height = math.asin(
+        math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(hour)
+    )
+    azimuth = math.atan2(
+        -math.sin(hour) * math.cos(declination),
+        math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.sin(latitude) * math.cos(hour),
+    )
+    return azimuth % (2 * math.pi), height
+
+
+def shadow_m(sun_rad: tuple[float, float], height_m: float) -> Float[np.ndarray, "2"]:
+    """East and north from the foot of an upright body to the end of its shadow on level ground.
+
+    sun_rad: azimuth and height. Zero for a sun so low that shadows tell nothing.
+    """
+    azimuth, up = sun_rad
+    if up < _LOWEST_SUN_RAD:
+        return np.zeros(2)
+    return -height_m / math.tan(up) * np.array([math.sin(azimuth), math.cos(azimuth)])
+
+
+def remove_shadow(
+    middle_px: Float[np.ndarray, "N 2"],
+    foot_m: Float[np.ndarray, "N 3"],
+    pose: CameraPose,
+    camera: Camera,
+    height_m: float,
+    shadow: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "N 2"]:
+    """Pixels of the feet of bodies whose foreground, body and shadow together, has its mean at middle_px.
+
+    From the air a walker's shadow is often larger than the walker. foot_m: about where the feet are. Body and shadow
+    are strips of one width, so each weighs as its length in the picture; from above at least a body's width shows.
+    """
+    foot = project(foot_m, pose, camera)
+
+    def away(*step_m: float) -> np.ndarray:
+        return project(foot_m + np.array(step_m), pose, camera) - foot
+
+    head, tip, aside = away(0, 0, height_m), away(*shadow, 0), away(BODY_WIDTH_M, 0, 0)
+    body, shade = np.hypot(np.linalg.norm(head, axis=1), np.linalg.norm(aside, axis=1)), np.linalg.norm(tip, axis=1)
+    mean = (body[:, None] * head / 2 + shade[:, None] * tip / 2) / (body + shade)[:, None]
+    return middle_px - mean
+
+
+class TargetSpeeds:
+    """Velocities of targets over the ground: a constant-velocity Kalman filter each, driven by white acceleration.
+
+    The measurement noise is that of the pixel. The error of the camera's pose is common to a frame and changes slowly,
+    so it hardly touches a velocity.
+    """
+
+    def __init__(self) -> None:
+        self._tracks: dict[int, _SpeedTrack] = {}
+
+    def update(
+        self,
+        time_s: float,
+        identity: Int[np.ndarray, " N"],
+        east_north_m: Float[np.ndarray, "N 2"],
+        covariance_m2: Float[np.ndarray, "N 2 2"],
+    ) -> Float[np.ndarray, "N 2"]:
+        """Velocities of the next frame, m/s east and north; NaN while unknown, or without an identity (below 1).
+
+        covariance_m2: of the errors that are new in every frame; 1 m is taken where it is unknown.
+        """
+        covariance_m2 = np.where(np.isfinite(covariance_m2), covariance_m2, np.eye(2))
+        velocity = np.full((len(identity), 2), np.nan)
+        for row, name in enumerate(identity.tolist()):
+            if name < 1:
+                continue
+            track = self._tracks.get(name)
+            if track is None or not 0 < time_s - track.time_s <= _FORGET_S:
+                self._tracks[name] = _SpeedTrack(time_s, east_north_m[row], covariance_m2[row])
+                continue
+            track.update(time_s, east_north_m[row], covariance_m2[row])
+            if track.covariance.diagonal()[2:].max() < _KNOWN_M_S**2:
+                velocity[row] = track.state[2:]
+        self._tracks = {name: track for name, track in self._tracks.items() if time_s - track.time_s <= _FORGET_S}
+        return velocity
+
+
+class _SpeedTrack:
+    """state: (4,) east, north and their velocities."""
+
+    def __init__(self, time_s: float, place: np.ndarray, covariance: np.ndarray) -> None:
+        self.time_s = time_s
+        self.state = np.array([*place, 0.0, 0.0])
+        self.covariance = np.zeros((4, 4))
+        self.covariance[:2, :2] = covariance
+        self.covariance[2:, 2:] = _FASTEST_M_S**2 * np.eye(2)
+
+    def update(self, time_s: float, place: np.ndarray, covariance: np.ndarray) -> None:
+        lapse = time_s - self.time_s
+        move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
+        drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
+        state, spread = move @ self.state, move @ self.covariance @ move.T + drive
+        # A place that is said to be exact would leave nothing to invert.
+        total = spread[:2, :2] + covariance + 1e-12 * np.eye(2)
+        gain = spread[:, :2] @ np.linalg.inv(total)
+        self.state = state + gain @ (place - state[:2])
+        self.covariance = spread - gain @ spread[:2]
+        self.time_s = time_s
