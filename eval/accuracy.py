@@ -20,8 +20,7 @@ import plain_chain
 import report
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.metrics import detection, segmentation
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
@@ -73,7 +72,7 @@ def by_us(config: str, backend: str) -> Callable[[Path], Iterator[Found]]:
     settings = load_config(None if config == "default" else config)
 
     def chain(place: Path) -> Iterator[Found]:
-        for scene in run(open_source(place / "frames"), load_engine(backend, settings), settings):
+        for scene in detect_motion(open_source(place / "frames"), settings, backend):
             yield scene.mask, scene.detections.box_px
 
     return chain

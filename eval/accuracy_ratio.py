@@ -21,7 +21,7 @@ import report
 from footage import film_of, sequences, truth_of
 
 from torchvision_dddas.config import Settings, load_config
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics import clear, identity, windows
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.windows import Windows

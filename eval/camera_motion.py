@@ -25,8 +25,7 @@ from simulated_camera import CAMERAS, Filmed, flight, seen, translation
 from synthetic import LEAST_PX, SIZE, render
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.detector import run, scenes
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.evaluation.metrics import clear, identity
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
@@ -154,11 +153,11 @@ def _clips(folder: Path) -> Iterator[tuple[str, list[Scene], TrackTable, tuple[i
         if truths.find(place) is not None:
             truth, source = truths.load(place), open_source(str(place / "frames"))
             labels = truth.tracks or _boxes({n: truths.read_mask(path) for n, path in truth.masks.items()})
-            yield place.name, list(run(source, load_engine("onboard", settings), settings)), labels, source.size
+            yield place.name, list(detect_motion(source, settings, "onboard")), labels, source.size
     for seed in _SEEDS:
         clip = render(seed)
         frames = [Frame(number, (number - 1) / 10, image) for number, image in enumerate(clip.images, 1)]
-        found = list(scenes(frames, load_engine("onboard", settings), settings))
+        found = list(detect_motion(frames, settings, "onboard"))
         yield f"demo, scene {seed}", found, _boxes(dict(enumerate(clip.masks, 1))), SIZE
 
 

@@ -20,8 +20,7 @@ import plain_chain
 from films import Size, there_and_back
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.detector import Loop
-from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, load_engine
+from torchvision_dddas.detection import Engine, Foreground, MotionDetector, View, Window, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Frame, Registration
 
@@ -106,7 +105,7 @@ class Chain:
         backend, config, *batch = name.split()
         settings = load_config(None if config == "default" else config)
         engine = Clocked(load_engine(backend, settings), self.watch)
-        self.loop = Loop(engine, settings, 10.0, batch=int(batch[0][1:]) if batch else 1)
+        self.loop = MotionDetector(settings, engine, 10.0, batch=int(batch[0][1:]) if batch else 1)
         self._one = self._ours
 
     def turn(self, frames: list[np.ndarray], start: int, count: int = TURN) -> None:
@@ -132,7 +131,7 @@ class Chain:
         self.boxes.append(len(boxes(mask)))
 
     def _ours(self, frames: list[np.ndarray], i: int) -> None:
-        for scene in self.loop.feed(Frame(i + 1, i / 10.0, frames[i])):
+        for scene in self.loop.update(Frame(i + 1, i / 10.0, frames[i])):
             self.boxes.append(len(scene.detections.box_px))
 
 
@@ -253,7 +252,7 @@ def alone(name: str, path: str, graphs: str = "") -> None:
         if name in ("plain", STEP):
             chain.turn(frames, 0, 1)
         else:
-            for _ in chain.loop.feed(frame):
+            for _ in chain.loop.update(frame):
                 pass
 
 

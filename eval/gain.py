@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection import detector as loop
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.segmentation import Pixels, count, measures
 from torchvision_dddas.io.sources import open_source
@@ -79,7 +78,7 @@ def score(
 ) -> tuple[float, int]:
     """F over the labelled frames, and how many frames were not to be trusted."""
     pixels, untrusted = Pixels(), 0
-    for scene in loop.scenes(frames, load_engine(backend, settings), settings):
+    for scene in detect_motion(frames, settings, backend):
         untrusted += not scene.reliable
         if path := truth.masks.get(scene.frame.number):
             pixels = pixels.plus(count(scene.mask, truths.read_mask(path)))

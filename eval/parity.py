@@ -15,9 +15,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection import detector as loop
-from torchvision_dddas.detection import windows
-from torchvision_dddas.detection.engine import Engine, View, Window, load_engine
+from torchvision_dddas.detection import Engine, View, Window, detect_motion, load_engine, windows
 from torchvision_dddas.geometry import chain, corner_error
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame, Registration
@@ -58,7 +56,7 @@ def compare(frames: Sequence[Frame], settings: parameters.Settings, masks: bool)
     words = [f"{np.median(errors):.3f} {max(errors):.3f} {one_sided}/{len(onboard.steps)} |"]
     words += [f"{np.mean(cores):.3f} {min(cores):.3f} |"]
     if masks:
-        found = [[scene.mask > 0 for scene in loop.scenes(frames, engine, settings)] for engine in engines]
+        found = [[scene.mask > 0 for scene in detect_motion(frames, settings, engine)] for engine in engines]
         least = min(iou(a, b) for a, b in zip(*found, strict=True))
         words += [f"{iou(np.array(found[0]), np.array(found[1])):.3f} {least:.3f} |"]
     for name in ("register", "foreground"):

@@ -22,8 +22,7 @@ from people_curves import CLIPS, matched
 
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection.detector import scenes
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.detector import recognize, recognizer_of
 from torchvision_dddas.people.scorer import WindowScorer
@@ -109,7 +108,7 @@ def movers(frames: Iterator[Frame], settings: Settings, rate_hz: float) -> Detec
     """What `dddas detect` finds, as a table."""
     found = [
         (scene.frame.number, *box)
-        for scene in scenes(frames, load_engine("onboard", settings), settings, rate_hz)
+        for scene in detect_motion(frames, settings, "onboard", rate_hz)
         for box in scene.detections.box_px
     ]
     rows = np.array(found, float).reshape(-1, 5)

@@ -13,7 +13,7 @@ import numpy as np
 import plain_chain
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.geometry import transfer
 
 

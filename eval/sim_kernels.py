@@ -17,8 +17,7 @@ import numpy as np
 from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, usual, walking
 
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.metrics import segmentation
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.simulation import SimulatorSource
@@ -46,7 +45,7 @@ def work(case: Case) -> Case:
         for size in sizes:
             settings = usual(source, {"crowds.join_m": 0.0, **FIXED[parameter], **case["set"], parameter: size})
             pixels, scorer = segmentation.Pixels(), CrowdScorer()
-            for scene in run(clip, load_engine("onboard", settings), settings, clip.log):
+            for scene in detect_motion(clip, settings, "onboard", clip.log):
                 number = scene.frame.number
                 if number <= SKIPPED:
                     continue

@@ -27,10 +27,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import report
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.detection.keypoint_grid import cell_side
-from torchvision_dddas.detection.opencv_registration import keypoints
+from torchvision_dddas.detection import cell_side, detect_motion, load_engine
+from torchvision_dddas.detection.opencv_registration import detect_keypoints
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation import (
@@ -151,7 +149,7 @@ def followed(
 ) -> dict[str, float]:
     """Keypoints of the earlier frame in the later one, and the difference of the two once they are registered."""
     parameters = settings.registration
-    start = keypoints(earlier, parameters)
+    start = detect_keypoints(earlier, parameters)
     guess = transfer(later_from_earlier, start).astype(np.float32)
     search = {"winSize": (21, 21), "maxLevel": 1, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     end, seen, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess.copy(), **search)
@@ -193,7 +191,7 @@ class Clip:
 def blobs(clip: Clip) -> float:
     """What the detector finds in a frame, in the mean."""
     settings = Settings()
-    counts = [len(scene.detections) for scene in run(clip, load_engine("onboard", settings), settings)]
+    counts = [len(scene.detections) for scene in detect_motion(clip, settings, "onboard")]
     return float(np.mean(counts))
 
 

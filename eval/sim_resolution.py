@@ -22,8 +22,7 @@ from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, walking
 
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.detection.detector import Loop
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Frame
 
@@ -51,7 +50,7 @@ def work(case: Case) -> Case:
         focal = source.camera.focal_px[0] * size[0] / largest[0]
         for config in CONFIGS:
             settings = with_parameters(load_config(config), {"gates.focal_px": focal})
-            loops[size, config] = Loop(load_engine("onboard", settings), settings, kept.rate_hz, kept.log)
+            loops[size, config] = MotionDetector(settings, "onboard", kept.rate_hz, kept.log)
     times: dict[tuple[tuple[int, int], str], list[float]] = {key: [] for key in loops}
     order = list(range(len(kept.frames)))
     order += order[-2:0:-1]
@@ -61,7 +60,7 @@ def work(case: Case) -> Case:
             for step in range(TURN):
                 number = turn * TURN + step
                 image = frames[size][order[number % len(order)]]
-                for _ in loop.feed(Frame(number + 1, number / kept.rate_hz, image)):
+                for _ in loop.update(Frame(number + 1, number / kept.rate_hz, image)):
                     pass
             if turn >= WARM_UP:
                 times[size, config].append((time.perf_counter() - start) / TURN)

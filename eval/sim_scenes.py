@@ -12,9 +12,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control.mission_api import Begun, fitted
 from torchvision_dddas.control.rules import every_least
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.detection.gates import pixels_per_metre
+from torchvision_dddas.detection import detect_motion, pixels_per_metre
 from torchvision_dddas.evaluation.metrics.crowd_frames import shown
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
@@ -208,7 +206,7 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
     scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
     least = every_least(scale, source.rate_hz, settings.steering)
     source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
-    for scene in run(begun, load_engine("onboard", settings), settings):
+    for scene in detect_motion(begun, settings, "onboard"):
         truths |= {truth.frame: truth for truth in source.truths()}
         truth = truths.pop(scene.frame.number, None)
         if truth is None:

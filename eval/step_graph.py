@@ -22,7 +22,7 @@ import numpy as np
 from plain_chain import LEAST_AREA_PX
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.keypoint_grid import cell_side
+from torchvision_dddas.detection import cell_side
 from torchvision_dddas.runtime import opened
 
 NAME = "graph step"

@@ -23,8 +23,7 @@ import report
 from synthetic import film_into
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import segmentation
@@ -107,7 +106,7 @@ def f(clip: Clip, settings: Settings) -> float:
     """Pixels' F of the hard pipeline."""
     assert clip.truth is not None
     total = Pixels()
-    for scene in run(opened(clip), load_engine("onboard", settings), settings):
+    for scene in detect_motion(opened(clip), settings, "onboard"):
         total = total.plus(segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
     return float(np.nan_to_num(segmentation.measures(total)["f"]))
 

@@ -24,7 +24,7 @@ from synthetic import RATE_HZ, flight
 from tune_recovery import BASE, FRAMES, SIZE, f, filmed
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.tuning.descent import Plan, descend

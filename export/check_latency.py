@@ -20,8 +20,7 @@ from itertools import islice
 import numpy as np
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.detector import Loop
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.sources import open_source
@@ -78,12 +77,12 @@ def checked(options: argparse.Namespace) -> bool:
     """Measure and print; whether the rate is kept."""
     width, _, height = options.size.partition("x")
     settings = load_config(options.config, [])
-    loop = Loop(load_engine("onboard", settings), settings, options.rate)
+    loop = MotionDetector(settings, "onboard", options.rate)
     ms: list[float] = []
     last = None
     for i, image in enumerate(pictures(options.clip, (int(width), int(height)), options.frames + WARM_UP)):
         frame = Frame(i + 1, i / options.rate, image)
-        ms.append(spent_ms(lambda frame=frame: list(loop.feed(frame))))  # type: ignore[misc]
+        ms.append(spent_ms(lambda frame=frame: loop.update(frame)))  # type: ignore[misc]
         last = image
     assert last is not None
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

@@ -130,10 +130,11 @@ def _disjoint(boxes: list[Box]) -> list[Box]:
     return apart
 
 
-def parts_of(
-    mask: np.ndarray, box: tuple[int, int, int, int], min_area_px: float
-) -> list[tuple[tuple[int, int, int, int], np.ndarray]]:
-    """The connected parts (8 neighbours) of a (height, width) mask in a box that are large enough: (box, mask) each."""
+def connected_parts(mask: np.ndarray, box: Box, min_area_px: float) -> list[tuple[Box, np.ndarray]]:
+    """The connected parts (8 neighbours) of a (height, width) bool mask in a box, (box, mask) each.
+
+    box: x, y, width, height in the picture. Parts of less than min_area_px pixels are left out.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
     parts = []
     for label in range(1, count):

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from torchvision_dddas import geometry
+from torchvision_dddas import detection, geometry
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection import detector as run
-from torchvision_dddas.detection.engine import Engine
+from torchvision_dddas.detection import Engine, Retune, detect_motion
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, group_crowds
 from torchvision_dddas.geo.aerial_locator import tracked_targets
 from torchvision_dddas.tracking import sequence as following
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.control.mission_api import Mission
 
 
-class Clip(run.Clip, Protocol):
+class Clip(detection.Clip, Protocol):
     """What the whole path needs of a source."""
 
     @property
@@ -38,20 +37,20 @@ def survey(
     interval: int = 1,
     mission: "Mission | None" = None,
     seen: Callable[[Scene], object] | None = None,
-    retune: run.Retune | None = None,
+    retune: Retune | None = None,
     pictures: bool = True,
 ) -> Iterator[FrameResult]:
     """Everything of each frame that is followed, in order.
 
     Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
     target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
-    retune: as in run.run. pictures: as `following.Follower` has it.
+    retune: as in detect_motion. pictures: as `following.Follower` has it.
     """
     waiting: dict[int, WatchedScene] = {}
     crowds = CrowdIdentities() if settings.crowds.join_m else None
 
     def scenes() -> Iterator[Scene]:
-        for scene in run.run(source, engine, settings, telemetry, retune=retune):
+        for scene in detect_motion(source, settings, engine, telemetry, retune=retune):
             if watch is None:
                 if seen is not None:
                     seen(scene)

@@ -1,5 +1,6 @@
 """The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -148,6 +149,61 @@ class Telemetry:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def at(self, time_s: float, tolerance_s: float = 1.0) -> "Flight | None":
+        """The flight at a time, linear between samples, angles and longitudes the short way round.
+
+        A field is NaN where either neighbouring sample does not say it. Up to tolerance_s outside the span the nearest
+        sample holds; beyond that nothing is known: None.
+        """
+        times, time_s = self.time_s, float(time_s)
+        count = len(times)
+        if count == 0 or not times.item(0) - tolerance_s <= time_s <= times.item(count - 1) + tolerance_s:
+            return None
+        after = min(int(times.searchsorted(time_s)), count - 1)
+        end_s = times.item(after)
+        before, share = after, 0.0
+        if after > 0 and time_s < end_s:  # else outside the span, or on a sample, which then counts alone
+            before = after - 1
+            share = (time_s - times.item(before)) / (end_s - times.item(before))
+
+        def between(values: np.ndarray, full: float = math.inf) -> float:
+            low = values.item(before)
+            return low + share * _wrap(values.item(after) - low, full)
+
+        first, second = self.place[before].tolist(), self.place[after].tolist()
+        around = 360.0 if self.geographic else math.inf
+        east = first[0] + share * _wrap(second[0] - first[0], around)
+        return Flight(
+            between(self.altitude_m),
+            between(self.speed_m_s),
+            (_wrap(east, around), first[1] + share * (second[1] - first[1])),
+            between(self.above_sea_m),
+            between(self.heading_rad, _TURN) % _TURN,
+            between(self.pitch_rad),
+            _wrap(between(self.roll_rad, _TURN), _TURN),
+            between(self.hfov_rad),
+            between(self.vehicle_heading_rad, _TURN) % _TURN,
+        )
+
+    def check_overlap(self, last_s: float) -> None:
+        """Raises InputError, with both spans, when no sample lies near a clip that lasts from 0 to last_s."""
+        if len(self) == 0:
+            raise InputError(f"the telemetry has no samples; the clip lasts from 0.0 to {last_s:.1f} s")
+        from_s, to_s = float(self.time_s[0]), float(self.time_s[-1])
+        if self.at(0.0) is None and self.at(last_s) is None and not 0 <= from_s <= last_s:
+            raise InputError(
+                f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to {last_s:.1f} s; "
+                "they do not overlap: count time_s from the clip's first frame"
+            )
+
+
+_TURN = 2 * math.pi
+
+
+def _wrap(value: float, full: float) -> float:
+    """A value or difference on a circle of circumference `full`, from minus half of it to half."""
+    return value if abs(value) <= full / 2 or full == math.inf else (value + full / 2) % full - full / 2
 
 
 COLUMNS_OF_TELEMETRY = (

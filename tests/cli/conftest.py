@@ -1,6 +1,5 @@
 """Stand-ins for the engine, so that these tests are about the command line alone."""
 
-import sys
 import types
 
 import cv2
@@ -8,13 +7,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from torchvision_dddas import detection, pipeline
+from torchvision_dddas.io import run_inputs
 from torchvision_dddas.types import Detections, Scene
 
 
 def stub_engine(found=True, after=None):
-    """Modules `detector` and `engine` that find one target a frame; `after(scene)` runs after each scene."""
+    """`detect_motion` and `load_engine` that find one target a frame; `after(scene)` runs after each scene."""
 
-    def run(source, engine, settings, telemetry=None, retune=None):
+    def detect_motion(source, settings=None, backend="auto", telemetry=None, retune=None):
         for frame in source:
             mask = np.zeros(frame.image.shape[:2], np.uint16)
             mask[2:8, 3:9] = found
@@ -27,24 +28,18 @@ def stub_engine(found=True, after=None):
             if after:
                 after(scene)
 
-    def load(backend, settings):
+    def load_engine(backend, settings):
         return types.SimpleNamespace(name=f"stub {backend}")
 
-    modules = {f"torchvision_dddas.detection.{name}": types.ModuleType(name) for name in ("detector", "engine")}
-    modules["torchvision_dddas.detection.detector"].__dict__["run"] = run
-    modules["torchvision_dddas.detection.engine"].__dict__["load_engine"] = load
-    return modules
+    return {"detect_motion": detect_motion, "load_engine": load_engine}
 
 
 @pytest.fixture
 def engine(monkeypatch):
-    from torchvision_dddas import pipeline as surveying
-
     def install(**how):
-        stubs = stub_engine(**how)
-        for name, module in stubs.items():
-            monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.setattr(surveying, "run", stubs["torchvision_dddas.detection.detector"])
+        for name, stub in stub_engine(**how).items():
+            for module in (detection, pipeline, run_inputs):
+                monkeypatch.setattr(module, name, stub, raising=False)
 
     install()
     return install

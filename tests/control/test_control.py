@@ -1,13 +1,11 @@
 """The feedback rules, by hand."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
 
 from torchvision_dddas.config import (
-    IntervalParameters,
     LandmarkParameters,
     Settings,
     SteeringParameters,
@@ -16,130 +14,14 @@ from torchvision_dddas.config import (
 from torchvision_dddas.control.rules import (
     SAMPLING,
     Load,
-    Regime,
-    adjusted,
-    bounded,
     every_least,
     every_wanted,
-    interval_from_flow,
-    interval_from_telemetry,
-    regime_at,
     rungs,
     sampled,
     shed,
-    steered,
 )
 from torchvision_dddas.geo.landmark_trajectories import LandmarkUse, best_spread, select_landmarks, spread_m2
 from torchvision_dddas.types import Adjustment, LandmarkObservations
-
-KNOBS = IntervalParameters(minimum_frames=1, maximum_frames=12)
-BASE = with_parameters(
-    Settings(),
-    {
-        "gates.min_area_px": 300,
-        "gates.focal_px": 1000.0,
-        "gates.expected_size_m": 2.0,
-        "gates.expected_share": 0.1,
-        "small.min_area_px": 12,
-        "small.max_box_px": 1600,
-        "small.on": True,
-    },
-)
-
-
-@pytest.mark.parametrize(
-    ("altitude", "speed", "rate", "interval"),
-    [(20, 5, 10, 1), (40, 5, 10, 2), (20, 2.5, 10, 2), (20, 5, 30, 3), (60, 10, 20, 3)],
-)
-def test_the_interval_is_one_at_the_reference_and_proportional_to_altitude_rate_and_one_over_speed(
-    altitude, speed, rate, interval
-):
-    assert interval_from_telemetry(altitude, speed, rate, KNOBS) == pytest.approx(interval)
-
-
-def test_hovering_gives_a_finite_interval_and_the_longest_after_bounds():
-    wanted = interval_from_telemetry(100, 0.0, 10, KNOBS)
-    assert math.isfinite(wanted)
-    assert bounded(wanted, KNOBS) == KNOBS.maximum_frames
-
-
-def test_without_telemetry_the_interval_is_inverse_to_the_background_flow_and_independent_of_the_size():
-    once = interval_from_flow([12.8], 640, KNOBS)
-    assert once == pytest.approx(KNOBS.reference_flow / 0.02)
-    assert interval_from_flow([6.4], 640, KNOBS) == pytest.approx(2 * once)
-    assert interval_from_flow([25.6], 1280, KNOBS) == pytest.approx(once)
-
-
-def test_one_wild_step_does_not_move_the_interval():
-    assert interval_from_flow([5, 5, 5, 5, 300], 640, KNOBS) == interval_from_flow([5], 640, KNOBS)
-
-
-def test_a_still_camera_gives_the_longest_interval():
-    assert bounded(interval_from_flow([0.0], 640, KNOBS), KNOBS) == KNOBS.maximum_frames
-
-
-@pytest.mark.parametrize(("wanted", "interval"), [(0.0, 1), (1.4, 1), (3.6, 4), (500, 12), (1e30, 12)])
-def test_the_interval_is_rounded_and_bounded(wanted, interval):
-    assert bounded(wanted, KNOBS) == interval
-
-
-def test_a_change_is_recorded_with_its_cause_and_no_change_is_not():
-    new, (record,) = adjusted(7, 3, 6.1, "altitude 90 m", KNOBS)
-    assert new == 6
-    assert (record.frame, record.parameter, record.old, record.new, record.cause) == (
-        *(7, "interval.frames", 3, 6),
-        "altitude 90 m",
-    )
-    assert adjusted(7, 3, 3.2, "", KNOBS) == (3, ())
-
-
-def test_noise_around_the_middle_between_two_intervals_does_not_make_it_flutter():
-    now, changes = 3, 0
-    for k in range(40):
-        now, records = adjusted(k, now, 3.5 + 0.2 * (-1) ** k, "", KNOBS)
-        changes += len(records)
-    assert changes == 0
-
-
-def test_the_expected_size_sets_the_smallest_area_between_its_bounds():
-    """2 m at 1000 px focal length are 2000 / altitude px; a tenth of its square at 50 m is 160 px."""
-    assert regime_at(50.0, 10, BASE).settings.gates.min_area_px == 160
-    assert regime_at(10.0, 10, BASE).settings.gates.min_area_px == 300
-    assert regime_at(500.0, 10, BASE).settings.gates.min_area_px == 12
-
-
-def test_the_small_path_is_on_while_targets_are_expected_to_fit_its_boxes():
-    assert regime_at(50.5, 10, BASE).settings.small.on
-    assert not regime_at(49.5, 10, BASE).settings.small.on
-    off = with_parameters(BASE, {"small.on": False})
-    assert not regime_at(200.0, 10, off).settings.small.on
-
-
-def test_nothing_else_of_the_settings_changes_with_the_altitude():
-    there = regime_at(90.0, 10, BASE).settings
-    back = {"gates.min_area_px": BASE.gates.min_area_px, "small.on": BASE.small.on}
-    assert with_parameters(there, back) == BASE
-
-
-def test_the_regime_moves_only_when_the_altitude_has_changed_by_a_fifth():
-    regime, first = steered(1, Regime(BASE), 100.0, 10, BASE)
-    assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
-    assert all("altitude 100.0 m" in record.cause for record in first)
-    assert steered(2, regime, 119.0, 10, BASE) == (regime, ())
-    higher, records = steered(3, regime, 121.0, 10, BASE)
-    assert higher.altitude_m == 121.0
-    bound = next(r for r in records if r.parameter == "gates.max_size_px")
-    assert bound.new == pytest.approx(bound.old * 100 / 121)
-    assert "was 100.0 m" in bound.cause
-
-
-def test_where_telemetry_ends_the_bounds_in_metres_end_and_that_is_recorded():
-    regime, _ = steered(1, Regime(BASE), 100.0, 10, BASE)
-    after, records = steered(9, regime, None, 10, BASE)
-    assert after == Regime(BASE)
-    assert {r.cause for r in records} == {"no telemetry for this frame"}
-    assert steered(10, after, None, 10, BASE) == (after, ())
-
 
 # Of how many frames one is looked at.
 
@@ -255,14 +137,6 @@ def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmark
 def test_landmarks_all_on_one_line_are_taken_as_far_apart_as_they_are():
     row = np.array([[k, 2.0 * k] for k in range(6)])
     assert {0, 5} <= set(best_spread(row, 4).tolist())
-
-
-def test_gaps_are_closed_in_metres_where_that_is_asked_for_and_never_wider_than_in_pixels():
-    base = with_parameters(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
-    closes = [regime_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
-    assert closes == [base.morphology.close_px, 17, 4]
-    plain = regime_at(200.0, 10.0, Settings())
-    assert plain.settings.morphology.close_px == Settings().morphology.close_px
 
 
 def test_from_look_to_look_a_walker_moves_far_enough_to_show():

@@ -9,7 +9,7 @@ from tests.simulation.small import small
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control.mission_api import Begun, Mission, mission_of
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.pipeline import survey
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Command, FrameResult

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.detection.blob_motion import DenseFlow, blob_motion, robust_affine
+from torchvision_dddas.detection.blob_motion import DenseFlow, blob_motion, fit_robust_affine
 from torchvision_dddas.detection.blobs import Blob
 
 SHAPE = (120, 160)
@@ -86,7 +86,7 @@ def test_outliers_do_not_pull_the_affine_fit():
     u, v = rng.uniform(-0.5, 0.5, (2, 400))
     flow = np.c_[2 + u, -1 + v] + rng.normal(0, 0.05, (400, 2))
     flow[:120] = (-8, 5)
-    np.testing.assert_allclose(robust_affine(u, v, flow)[0], (2, -1), atol=0.2)
+    np.testing.assert_allclose(fit_robust_affine(u, v, flow)[0], (2, -1), atol=0.2)
 
 
 @pytest.mark.parametrize("box", [(0, 0, 9, 7), (151, 113, 9, 7), (0, 0, 160, 120), (77, 50, 1, 1)])

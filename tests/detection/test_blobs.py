@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import MorphologyParameters
-from torchvision_dddas.detection.blobs import filled_hull, find_blobs, weak_blobs
+from torchvision_dddas.detection.blobs import fill_hull, find_blobs, find_weak_blobs
 
 SIZE = (101, 67)
 
@@ -68,8 +68,8 @@ def test_a_hull_fills_the_notch_of_an_l_and_only_that(painted):
 
 def test_the_hull_of_a_convex_region_is_itself():
     disc = cv2.circle(np.zeros((41, 41), np.uint8), (20, 20), 18, 1, -1) > 0
-    assert filled_hull(disc)[disc].all() and (filled_hull(disc) != disc).mean() < 0.03
-    assert not filled_hull(np.zeros((5, 7), bool)).any()
+    assert fill_hull(disc)[disc].all() and (fill_hull(disc) != disc).mean() < 0.03
+    assert not fill_hull(np.zeros((5, 7), bool)).any()
 
 
 def test_a_region_inside_another_ones_hull_is_swallowed(painted):
@@ -86,13 +86,13 @@ def test_a_region_in_another_ones_box_but_outside_its_hull_is_kept(painted):
 def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted):
     wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
     strong = found(painted(SIZE, (5, 6, 10, 10)))
-    (weak,) = weak_blobs(wide, strong, 10, MorphologyParameters(erode_px=1, close_px=1), 1, 0)
+    (weak,) = find_weak_blobs(wide, strong, 10, MorphologyParameters(erode_px=1, close_px=1), 1, 0)
     assert weak.weak and weak.box == (50, 30, 20, 20)
     assert not strong[0].weak
 
 
-def test_without_wide_evidence_there_are_no_weak_blobs(painted):
-    assert weak_blobs(painted(SIZE), [], 10, MorphologyParameters(), 1, 0) == []
+def test_without_wide_evidence_there_are_no_find_weak_blobs(painted):
+    assert find_weak_blobs(painted(SIZE), [], 10, MorphologyParameters(), 1, 0) == []
 
 
 @pytest.mark.parametrize("hull", [False, True])

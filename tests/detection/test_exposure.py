@@ -8,8 +8,8 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection.engine import View, Window, load_engine
-from torchvision_dddas.detection.exposure import exposure, in_one_light, to_light_of
+from torchvision_dddas.detection import View, Window, load_engine
+from torchvision_dddas.detection.registration import exposure_between, fit_exposure, match_exposure
 from torchvision_dddas.geometry import corner_error
 
 SIZE = (320, 240)
@@ -35,7 +35,7 @@ def view(grey: np.ndarray) -> View:
 )
 def test_the_later_frame_comes_back_to_the_earlier_ones_light_though_the_camera_moved(greys, gain, offset) -> None:
     same, moved = greys[0].astype(int), greys[1]
-    earlier, later = in_one_light(view(greys[0]), view(lit(moved, gain, offset)))
+    earlier, later = match_exposure(view(greys[0]), view(lit(moved, gain, offset)))
     # One of the two was brought to the other, the darker one.
     changed = later if gain * 128 + offset < 128 else earlier
     wanted = moved if gain * 128 + offset < 128 else lit(same, gain, offset)
@@ -45,7 +45,7 @@ def test_the_later_frame_comes_back_to_the_earlier_ones_light_though_the_camera_
 
 def test_frames_of_one_light_are_left_as_they_are_however_the_camera_moves(greys) -> None:
     for a, b in [*pairwise(greys), (greys[0], greys[5])]:
-        earlier, later = in_one_light(view(a), view(b))
+        earlier, later = match_exposure(view(a), view(b))
         assert earlier is a and later is b
 
 
@@ -54,16 +54,16 @@ def test_a_pan_over_an_enlarged_picture_is_no_change_of_light(scale) -> None:
     coarse = np.random.default_rng(5).integers(0, 256, (360 // scale, 480 // scale)).astype(np.uint8)
     ground = cv2.resize(coarse, (480, 360), interpolation=cv2.INTER_CUBIC)
     views = [view(ground[k : k + 240, k : k + 320]) for k in range(8)]
-    assert {to_light_of(views[0], other) for other in views} == {(1.0, 0.0)}
+    assert {exposure_between(views[0], other) for other in views} == {(1.0, 0.0)}
 
 
 def test_levels_that_change_otherwise_than_by_a_gain_and_an_offset_are_content() -> None:
     wanted = np.linspace(40, 200, 33)
-    assert exposure(wanted, wanted / 1.1 - 3) == pytest.approx((1.1, 3.3))
-    assert exposure(wanted, wanted + 8 * np.sin(np.linspace(0, 12, 33))) == (1.0, 0.0)
+    assert fit_exposure(wanted, wanted / 1.1 - 3) == pytest.approx((1.1, 3.3))
+    assert fit_exposure(wanted, wanted + 8 * np.sin(np.linspace(0, 12, 33))) == (1.0, 0.0)
     # A bright thing that came in moves the upper levels only.
-    assert exposure(wanted, wanted + 30 * (wanted > 160)) == (1.0, 0.0)
-    gain, offset = exposure(wanted, wanted / 1.1 + 30 * (wanted > 160))
+    assert fit_exposure(wanted, wanted + 30 * (wanted > 160)) == (1.0, 0.0)
+    gain, offset = fit_exposure(wanted, wanted / 1.1 + 30 * (wanted > 160))
     assert gain * 100 / 1.1 + offset == pytest.approx(100, abs=2)
 
 
@@ -71,16 +71,16 @@ def test_what_white_has_cut_off_is_cut_off_in_both(greys) -> None:
     bright = np.clip(greys[0].astype(int) + 90, 0, 255).astype(np.uint8)
     lighter = lit(bright, 1.15)
     assert (lighter == 255).mean() > 0.02
-    earlier, later = in_one_light(view(bright), view(lighter))
+    earlier, later = match_exposure(view(bright), view(lighter))
     assert later is lighter
     assert (earlier[lighter == 255] >= 250).mean() > 0.95
 
 
 def test_too_few_levels_tell_nothing() -> None:
     dark, white = np.zeros(33), np.full(33, 255.0)
-    assert exposure(dark, white) == (1.0, 0.0)
+    assert fit_exposure(dark, white) == (1.0, 0.0)
     flat = np.full(33, 100.0)
-    gain, offset = exposure(flat, flat + 20)
+    gain, offset = fit_exposure(flat, flat + 20)
     assert gain == 1.0 and offset == pytest.approx(-20)
 
 

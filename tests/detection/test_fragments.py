@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.detection.fragments import groups
+from torchvision_dddas.detection.blobs import group_fragments
 
 TORSO, LEGS = (50, 20, 20, 40), (52, 64, 16, 30)
 
 
 def grouped(boxes, velocities):
-    return sorted(sorted(g) for g in groups(np.array(boxes, float).reshape(-1, 4), np.array(velocities, float)))
+    return sorted(
+        sorted(g) for g in group_fragments(np.array(boxes, float).reshape(-1, 4), np.array(velocities, float))
+    )
 
 
 def test_fragments_near_each_other_that_move_alike_are_one():
@@ -39,4 +41,4 @@ def test_a_chain_of_fragments_is_one_group_whatever_their_order():
 
 
 def test_no_boxes_make_no_groups():
-    assert groups(np.zeros((0, 4)), np.zeros((0, 2))) == []
+    assert group_fragments(np.zeros((0, 4)), np.zeros((0, 2))) == []

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from torchvision_dddas.detection.motion_history import NEWEST, MotionHistory, gradient, region_orientation
+from torchvision_dddas.detection.motion_history import NEWEST, MotionHistory, motion_gradient, region_orientation
 
 SIZE = (67, 43)
 ALL = (0, 0, *SIZE)
@@ -84,7 +84,7 @@ def test_the_orientation_of_a_trail_is_where_its_maker_went(velocity, painted):
         history.move(number, np.eye(3))
         history.add(painted(SIZE, (28 + velocity[0] * (number - 3), 16 + velocity[1] * (number - 3), 12, 12)))
     stamps = history.stamps(ALL)
-    angle, valid = gradient(stamps, 0.5, 4.0)
+    angle, valid = motion_gradient(stamps, 0.5, 4.0)
     direction, agreement = region_orientation(angle, valid, stamps, stamps > 0, 6.0)
     turn = direction - math.atan2(velocity[1], velocity[0])
     assert abs(math.atan2(math.sin(turn), math.cos(turn))) < 0.02
@@ -97,7 +97,7 @@ def test_a_still_silhouette_has_no_direction(painted):
         history.move(number, np.eye(3))
         history.add(painted(SIZE, (28, 16, 12, 12)))
     stamps = history.stamps(ALL)
-    angle, valid = gradient(stamps, 0.5, 4.0)
+    angle, valid = motion_gradient(stamps, 0.5, 4.0)
     assert not valid.any()
     direction, agreement = region_orientation(angle, valid, stamps, stamps > 0, 6.0)
     assert math.isnan(direction) and agreement == 0
@@ -108,38 +108,3 @@ def test_trails_that_point_opposite_ways_cancel():
     stamps = np.full((1, 2), 254, np.uint8)
     every = np.ones((1, 2), bool)
     assert math.isnan(region_orientation(angle, every, stamps, every, 6.0)[0])
-
-
-def test_stamps_gradient_and_orientation_agree_with_the_batched_operations(painted):
-    torch = pytest.importorskip("torch")
-    from torchvision_dddas.functional import history as ops
-
-    rng = np.random.default_rng(3)
-    duration, past = 5.0, MotionHistory(5.0)
-    batched = torch.zeros(1, 1, SIZE[1], SIZE[0])
-    for number in range(1, 9):
-        step = shift(int(rng.integers(-2, 3)), int(rng.integers(-2, 3)))
-        silhouette = painted(SIZE, (6 * number, 10, 11, 9), (60 - 5 * number, 24, 9, 12))
-        past.move(number, step)
-        past.add(silhouette)
-        now = 100.0 + number
-        batched = ops.carry(batched, torch.from_numpy(step[None]).float())
-        batched = ops.update(batched, torch.from_numpy(silhouette[None, None] / 255.0).float(), now, duration)
-    wanted = torch.where(batched > 0, batched - now + NEWEST, 0.0)
-    stamps = past.stamps(ALL)
-    np.testing.assert_array_equal(stamps, wanted[0, 0].numpy())
-    assert len(np.unique(stamps)) >= 5
-
-    for aperture in (3, 5):
-        angle, valid = gradient(stamps, 0.5, 4.0, aperture)
-        their_angle, their_valid = ops.gradient(batched, 0.5, 4.0, aperture)
-        np.testing.assert_array_equal(valid, their_valid[0, 0].numpy())
-        np.testing.assert_allclose(angle, their_angle[0, 0].numpy(), atol=1e-5)
-        assert valid.sum() > 50
-        upper = np.zeros(stamps.shape, bool)
-        upper[:22] = True
-        theirs, found = ops.region_orientation(
-            their_angle, their_valid, batched, torch.from_numpy(upper[None, None]), now, duration
-        )
-        assert found.all()
-        assert region_orientation(angle, valid, stamps, upper, duration)[0] == pytest.approx(float(theirs), abs=1e-4)

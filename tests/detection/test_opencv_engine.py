@@ -8,10 +8,10 @@ import pytest
 
 from tests.synthetic_clip import flight, render
 from torchvision_dddas.config import load_config
+from torchvision_dddas.detection import cell_side
 from torchvision_dddas.detection import opencv_foreground as onboard_pixels
 from torchvision_dddas.detection import opencv_registration as onboard_registration
-from torchvision_dddas.detection.keypoint_grid import cell_side
-from torchvision_dddas.detection.mask_cleaning import closed
+from torchvision_dddas.detection.blobs import close_mask
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.geometry import corner_error, transfer
 
@@ -67,7 +67,7 @@ def test_the_view_as_a_polygon_is_the_view_of_every_pixel_but_for_its_border(per
     place = transfer(matrix, np.c_[u.ravel(), v.ravel()]).reshape(height, width, 2)
     low, high = np.array([border, border]), np.array([width - 1 - border, height - 1 - border])
     each = np.asarray(((place >= low) & (place <= high)).all(axis=2)).astype(np.uint8)
-    ours = onboard_pixels.inside(matrix, SIZE, border) > 0
+    ours = onboard_pixels.find_seen(matrix, SIZE, border) > 0
     cross = np.ones((3, 3), np.uint8)
     assert not ((cv2.erode(each, cross) > 0) & ~ours).any()
     assert not (ours & (cv2.dilate(each, cross) == 0)).any()
@@ -78,7 +78,7 @@ def test_gradients_and_corners_in_strips_are_those_of_the_whole(size: tuple[int,
     grey = textured(size)
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=0.5) for order in ((1, 0), (0, 1)))
     whole = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
-    assert np.array_equal(onboard_pixels.texture_of(grey), whole)
+    assert np.array_equal(onboard_pixels.measure_texture(grey), whole)
     for block in (3, 5, 7):
         corners = cv2.cornerMinEigenVal(grey, block, ksize=3)
         np.testing.assert_allclose(onboard_registration._corners(grey, block), corners, rtol=1e-3, atol=1e-8)
@@ -93,7 +93,7 @@ def test_closing_only_where_something_is_is_closing_everywhere(seed: int, side: 
         row, column = rng.integers(0, mask.shape[0]), rng.integers(0, mask.shape[1])
         mask[row : row + rng.integers(1, 25), column : column + rng.integers(1, 25)] = 255
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    assert np.array_equal(closed(mask, side), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
+    assert np.array_equal(close_mask(mask, side), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel))
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.15, -4.0), (0.85, 6.0), (1.0, 25.0)])
@@ -102,7 +102,7 @@ def test_exposure_is_taken_back_although_something_moved(gain: float, offset: fl
     other = cv2.convertScaleAbs(reference.astype(np.float32), alpha=gain, beta=offset)
     other[60:120, 80:180] = 250
     seen = np.full(reference.shape, 255, np.uint8)
-    off = np.abs(onboard_pixels.exposed(reference, other, seen).astype(int) - reference)
+    off = np.abs(onboard_pixels.match_light(reference, other, seen).astype(int) - reference)
     off[60:120, 80:180] = 0
     assert off.max() <= 1
 
@@ -112,7 +112,7 @@ def test_exposure_heeds_only_what_both_see() -> None:
     other = cv2.convertScaleAbs(reference, alpha=0.8)
     seen[:, :200] = 255
     other[:, 200:] = 0
-    off = np.abs(onboard_pixels.exposed(reference, other, seen).astype(int) - reference)
+    off = np.abs(onboard_pixels.match_light(reference, other, seen).astype(int) - reference)
     assert off[:, :200].max() <= 2
 
 
@@ -137,7 +137,7 @@ def test_keypoints_are_the_best_pixel_of_every_cell(images: list[np.ndarray]) ->
             row, column = np.unravel_index(part.argmax(), part.shape)
             if part.max() > parameters.quality * corner.max():
                 wanted.add((left + int(column), top + int(row)))
-    found = onboard_registration.keypoints(grey, parameters)
+    found = onboard_registration.detect_keypoints(grey, parameters)
     assert cell_side(320, 240, parameters) == cell
     assert {(int(u), int(v)) for u, v in found} == wanted
 
@@ -155,13 +155,13 @@ def test_registrations_follow_the_ground(images: list[np.ndarray], truth: list[n
 def test_carried_keypoints_are_detected_anew_every_so_many_frames(
     images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    detect, detections = onboard_registration.keypoints, []
+    detect, detections = onboard_registration.detect_keypoints, []
 
     def counted(grey: np.ndarray, *rest: object, **named: object) -> np.ndarray:
         detections.append(grey)
         return detect(grey, *rest, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(onboard_registration, "keypoints", counted)
+    monkeypatch.setattr(onboard_registration, "detect_keypoints", counted)
     engine = OpenCVEngine(load_config("fast"))
     views = [engine.prepare(image) for image in images]
     for at, pair in enumerate(pairwise(views)):

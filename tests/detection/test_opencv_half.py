@@ -1,5 +1,6 @@
 """Half the resolution: the same places, the same targets."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import cv2
@@ -8,11 +9,11 @@ import pytest
 
 from tests.synthetic_clip import flight, render
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.detection import opencv_engine as onboard_vision
-from torchvision_dddas.detection import opencv_half as onboard_half
-from torchvision_dddas.detection.detector import scenes
-from torchvision_dddas.detection.engine import Foreground, View
+from torchvision_dddas.detection import detect_motion
+from torchvision_dddas.detection import opencv_engine as onboard_half
+from torchvision_dddas.detection.engine import Foreground, View, Window
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.detection.opencv_foreground import find_foreground
 from torchvision_dddas.geometry import corner_error
 from torchvision_dddas.types import Frame
 
@@ -32,20 +33,20 @@ def textured(size: tuple[int, int]) -> np.ndarray:
 def test_a_pixel_of_the_half_picture_is_the_mean_of_four() -> None:
     grey = textured((8, 6))
     mean = grey.reshape(3, 2, 4, 2).mean(axis=(1, 3))
-    assert np.abs(onboard_half.half_of(View(grey, grey)).grey - mean).max() <= 0.5
+    assert np.abs(onboard_half.halve_view(View(grey, grey)).grey - mean).max() <= 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (2, 9), (8, 6)])
 def test_any_size_is_halved_and_made_whole_again(size: tuple[int, int]) -> None:
     grey = np.full((size[1], size[0]), 9, np.uint8)
-    half = onboard_half.half_of(View(grey, grey))
+    half = onboard_half.halve_view(View(grey, grey))
     assert half.size == (max(size[0] // 2, 1), max(size[1] // 2, 1))
-    assert np.array_equal(onboard_half._whole(half.grey, size), grey)
+    assert np.array_equal(onboard_half._double(half.grey, size), grey)
 
 
 def test_the_half_picture_is_made_once() -> None:
     view = View(textured(SIZE), textured(SIZE))
-    assert onboard_half.half_of(view) is onboard_half.half_of(view)
+    assert onboard_half.halve_view(view) is onboard_half.halve_view(view)
 
 
 def test_registration_at_half_the_size_has_the_whole_pictures_pixels(images: list[np.ndarray]) -> None:
@@ -65,7 +66,7 @@ def test_targets_found_at_half_the_size_lie_where_those_of_the_whole_size_do(ima
     def masks(config: str) -> list[np.ndarray]:
         settings = load_config(config, ["gates.min_area_px=60"])
         frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
-        return [scene.mask > 0 for scene in scenes(frames, OpenCVEngine(settings), settings)]
+        return [scene.mask > 0 for scene in detect_motion(frames, settings, OpenCVEngine(settings))]
 
     both = [(a, b) for a, b in zip(masks("fast"), masks("half"), strict=True) if a.any() and b.any()]
     assert len(both) >= 5
@@ -76,29 +77,29 @@ def test_targets_found_at_half_the_size_lie_where_those_of_the_whole_size_do(ima
 def test_every_kind_of_difference_and_refinement_can_be_halved(size: tuple[int, int]) -> None:
     settings = with_parameters(load_config(), {"difference.halved": True, "registration.halved": True})
     frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(render(seed=2, frames=6, size=size).images))
-    found = list(scenes(frames, OpenCVEngine(settings), settings))
+    found = list(detect_motion(frames, settings, OpenCVEngine(settings)))
     assert len(found) == 6 and all(scene.mask.shape == size[::-1] for scene in found)
 
 
-def test_a_chain_that_only_looks_for_blobs_keeps_half_maps_and_finds_what_whole_maps_show(
+def test_a_chain_that_only_looks_for_blobs_keeps_half_maps_and_finds_what_double_maps_show(
     images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = load_config("half", ["gates.min_area_px=60"])
 
     def found() -> list[np.ndarray]:
         frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
-        return [scene.mask for scene in scenes(frames, OpenCVEngine(settings), settings)]
+        return [scene.mask for scene in detect_motion(frames, settings, OpenCVEngine(settings))]
 
-    scales = []
-
-    def whole(half: Foreground, **kept: int) -> Foreground:
-        scales.append(kept["scale"])
-        return onboard_half.whole_maps(half, SIZE, False)
+    def whole(engine: OpenCVEngine, windows: Sequence[Window]) -> list[Foreground]:
+        half = onboard_half.halve_settings(engine.parameters)
+        maps = [find_foreground(onboard_half.halve_window(window), half) for window in windows]
+        return [
+            onboard_half.double_maps(m, window.reference.size, False) for m, window in zip(maps, windows, strict=True)
+        ]
 
     halves = found()
-    monkeypatch.setattr(onboard_vision, "replace", whole)
+    monkeypatch.setattr(OpenCVEngine, "foreground", whole)
     wholes = found()
-    assert scales and set(scales) == {2}
     assert any(mask.any() for mask in halves)
     for half, other in zip(halves, wholes, strict=True):
         np.testing.assert_array_equal(half, other)

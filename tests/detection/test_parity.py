@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 
 from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection.engine import Engine, View, Window, load_engine
+from torchvision_dddas.detection import Engine, View, Window, load_engine
 from torchvision_dddas.geometry import chain, corner_error
 
 SIZES = [(320, 240), (251, 187)]

@@ -8,7 +8,7 @@ import pytest
 from torchvision_dddas.config import PersistenceParameters
 from torchvision_dddas.detection.blob_motion import Motion
 from torchvision_dddas.detection.blobs import Blob
-from torchvision_dddas.detection.persistence import Sighting, persistent
+from torchvision_dddas.detection.persistence import Sighting, find_persistent
 
 SIZE = (640, 480)
 NOTHING = np.zeros((3, 2))
@@ -40,7 +40,7 @@ def verdict(frames, index=2, parameters=STRICT) -> bool:
     """Of the first blob of a frame; a second one far off in every frame is there so that blobs come in crowds."""
     off = Blob((500, 400, 9, 9), np.ones((9, 9), bool), np.ones((9, 9), bool), 1.0)
     crowds = [Sighting([*f.blobs, off], [*f.motions, motion()], f.next_from_this) for f in frames]
-    return persistent(crowds, index, SIZE, parameters)[0]
+    return find_persistent(crowds, index, SIZE, parameters)[0]
 
 
 def test_a_blob_seen_all_along_and_moving_steadily_is_a_target(sightings):
@@ -72,7 +72,7 @@ def test_a_chain_ends_at_a_cut(sightings):
 def test_at_the_ends_of_a_clip_fewer_frames_do(sightings):
     frames = sightings()
     assert verdict(frames, 0) and verdict(frames, 4)
-    assert persistent(frames[:1], 0, SIZE, STRICT) == [True]
+    assert find_persistent(frames[:1], 0, SIZE, STRICT) == [True]
 
 
 def test_a_large_blob_is_believed_without_steady_flow(sightings):
@@ -100,7 +100,7 @@ def test_a_blob_that_changes_its_size_too_much_is_not_the_same(box_blob):
 
 
 def test_no_blobs_give_no_verdicts():
-    assert persistent([Sighting([], [], None)], 0, SIZE, STRICT) == []
+    assert find_persistent([Sighting([], [], None)], 0, SIZE, STRICT) == []
 
 
 def test_a_weak_blob_must_be_linked_and_steady_however_few_blobs_there_are(sightings):
@@ -108,10 +108,10 @@ def test_a_weak_blob_must_be_linked_and_steady_however_few_blobs_there_are(sight
         return [Sighting([replace(b, weak=True) for b in f.blobs], f.motions, f.next_from_this) for f in frames]
 
     few = STRICT.model_copy(update={"trusted_blobs": 4, "weak_links": 4, "weak_passes": 3})
-    assert persistent(weak(sightings()), 2, SIZE, few) == [True]
-    assert persistent(weak(sightings(steady=0.0)), 2, SIZE, few) == [False]
-    assert persistent(weak(sightings(there=(0, 0, 1, 1, 1))), 2, SIZE, few) == [False]
-    assert persistent(sightings(there=(0, 0, 1, 1, 1)), 2, SIZE, few) == [True]
+    assert find_persistent(weak(sightings()), 2, SIZE, few) == [True]
+    assert find_persistent(weak(sightings(steady=0.0)), 2, SIZE, few) == [False]
+    assert find_persistent(weak(sightings(there=(0, 0, 1, 1, 1))), 2, SIZE, few) == [False]
+    assert find_persistent(sightings(there=(0, 0, 1, 1, 1)), 2, SIZE, few) == [True]
 
 
 def test_a_large_blob_among_crowds_still_needs_a_link(sightings):

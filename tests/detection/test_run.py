@@ -10,9 +10,8 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection.detector import Loop, run, scenes
-from torchvision_dddas.detection.engine import load_engine
-from torchvision_dddas.detection.windows import delay, reach
+from torchvision_dddas.detection import MotionDetector, detect_motion
+from torchvision_dddas.detection.windows import look_ahead, settling_delay
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Frame, Scene, Telemetry
 
@@ -26,8 +25,8 @@ def frames_of(images: Sequence[np.ndarray]) -> list[Frame]:
 
 
 def detect(frames: Sequence[Frame], settings: Settings, batch: int = 1) -> list[Scene]:
-    loop = Loop(load_engine("onboard", settings), settings, RATE_HZ, batch=batch)
-    return [scene for frame in frames for scene in loop.feed(frame)] + list(loop.end())
+    loop = MotionDetector(settings, "onboard", RATE_HZ, batch=batch)
+    return [scene for frame in frames for scene in loop.update(frame)] + loop.flush()
 
 
 class Film:
@@ -163,11 +162,11 @@ def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_scene_comes_out_two_intervals_after_its_frame_at_the_latest(config, film):
     settings = load_config(config)
-    loop = Loop(load_engine("onboard", settings), settings, RATE_HZ, batch=1)
+    loop = MotionDetector(settings, "onboard", RATE_HZ, batch=1)
     out: list[Scene] = []
     for t, frame in enumerate(frames_of(film.images)):
-        out += loop.feed(frame)
-        interval = max([loop.interval, *(slot.interval for slot in loop.slots)])
+        out += loop.update(frame)
+        interval = max([loop.interval, *(slot.interval for slot in loop._slots)])
         assert len(out) >= t + 1 - 2 * interval, f"after frame {t + 1}"
 
 
@@ -258,7 +257,7 @@ def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film
 
 def test_last_frames_that_cannot_be_read_get_their_empty_scenes_too(film):
     settings = load_config("fast")
-    told = list(run(Film(film.images[:10], last=12), load_engine("onboard", settings), settings))
+    told = list(detect_motion(Film(film.images[:10], last=12), settings, "onboard"))
     assert [s.frame.number for s in told] == list(range(1, 13))
     assert [s.reliable for s in told[-3:]] == [True, False, False]
     assert not told[-1].mask.any() and len(told[-1].detections) == 0
@@ -289,15 +288,14 @@ def flight(time_s, altitude_m=60.0, speed_m_s=5.0) -> Telemetry:
 @pytest.mark.parametrize(("from_s", "to_s"), [(50.0, 60.0), (-60.0, -50.0)])
 def test_telemetry_of_another_time_is_refused_naming_both_spans(count, from_s, to_s, film):
     settings = load_config("fast")
-    told = run(Film(film.images, count), load_engine("onboard", settings), settings, flight([from_s, to_s]))
+    told = detect_motion(Film(film.images, count), settings, "onboard", flight([from_s, to_s]))
     with pytest.raises(InputError, match=f"{from_s} to {to_s} s, the clip 0.0 to 1.5 s"):
         list(told)
 
 
 def test_telemetry_of_a_part_of_the_clip_is_taken_for_that_part(film):
     settings = load_config("fast")
-    engine = load_engine("onboard", settings)
-    told = list(run(Film(film.images, 16), engine, settings, flight([0.9, 1.0])))
+    told = list(detect_motion(Film(film.images, 16), settings, "onboard", flight([0.9, 1.0])))
     assert len(told) == 16
 
 
@@ -306,9 +304,7 @@ def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
         load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
     )
     altitude = np.where(np.arange(16) < 8, 60.0, 100.0)
-    told = list(
-        run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
-    )
+    told = list(detect_motion(Film(film.images), settings, "onboard", flight(np.arange(16) / 10, altitude)))
     assert [s.interval_frames for s in told] == [3] * 8 + [5] * 8
     (moved,) = [a for s in told for a in s.adjustments if a.parameter == "interval.frames"]
     assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
@@ -320,11 +316,10 @@ def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
 @pytest.mark.parametrize(("altitude_m", "speed_m_s"), [(np.nan, 5.0), (60.0, np.nan), (np.nan, np.nan)])
 def test_where_telemetry_lacks_altitude_or_speed_the_interval_follows_the_flow(altitude_m, speed_m_s, film):
     settings = with_parameters(load_config("fast"), {"interval.minimum_frames": 3, "interval.maximum_frames": 9})
-    engine = load_engine("onboard", settings)
     time_s = np.arange(16) / 10
     silent = Telemetry(time_s, np.full(16, altitude_m), np.full(16, speed_m_s))
-    told = list(run(Film(film.images), engine, settings, silent))
-    alone = list(run(Film(film.images), engine, settings))
+    told = list(detect_motion(Film(film.images), settings, "onboard", silent))
+    alone = list(detect_motion(Film(film.images), settings, "onboard"))
     assert [s.interval_frames for s in told] == [s.interval_frames for s in alone]
     causes = {a.cause for s in told for a in s.adjustments if a.parameter == "interval.frames"}
     assert all("background flow" in cause for cause in causes)
@@ -336,9 +331,7 @@ def test_telemetry_that_falls_silent_in_flight_gives_the_steering_back_to_the_fl
         load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
     )
     altitude = np.where(np.arange(16) < 8, 100.0, np.nan)
-    told = list(
-        run(Film(film.images), load_engine("onboard", settings), settings, flight(np.arange(16) / 10, altitude))
-    )
+    told = list(detect_motion(Film(film.images), settings, "onboard", flight(np.arange(16) / 10, altitude)))
     first = next(a for s in told for a in s.adjustments if a.parameter == "interval.frames")
     assert "altitude 100.0 m" in first.cause
     after = [a.cause for s in told[8:] for a in s.adjustments]
@@ -351,8 +344,7 @@ def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left
 
     def count(**parameters: float) -> int:
         settings = with_parameters(load_config("fast"), base | {f"gates.{k}": v for k, v in parameters.items()})
-        engine = load_engine("onboard", settings)
-        told = run(Film(images), engine, settings, flight([0, 1.1], altitude_m=100.0))
+        told = detect_motion(Film(images), settings, "onboard", flight([0, 1.1], altitude_m=100.0))
         return sum(len(s.detections) for s in told)
 
     seen = count()
@@ -365,32 +357,31 @@ def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left
 def test_no_altitude_however_odd_breaks_a_run(config, film):
     settings = load_config(config)
     for altitude in (0.0, -5.0, 1e5):
-        told = run(Film(film.images[:5]), load_engine("onboard", settings), settings, flight([0, 1], altitude))
+        told = detect_motion(Film(film.images[:5]), settings, "onboard", flight([0, 1], altitude))
         assert len(list(told)) == 5
 
 
 def test_scenes_of_frames_at_hand_are_those_of_a_run(film):
     settings = load_config("fast")
-    engine = load_engine("onboard", settings)
-    at_hand = list(scenes(frames_of(film.images), engine, settings, RATE_HZ))
-    assert all(same(a, b) for a, b in zip(at_hand, run(Film(film.images), engine, settings), strict=True))
+    at_hand = list(detect_motion(frames_of(film.images), settings, "onboard"))
+    assert all(same(a, b) for a, b in zip(at_hand, detect_motion(Film(film.images), settings, "onboard"), strict=True))
 
 
 @pytest.mark.parametrize("config", [None, "fast"])
 def test_what_no_window_looks_at_again_is_let_go(config, film):
     """No more colour pictures are held than a window spans, however long the clip; a settled frame's is not."""
     settings = with_parameters(load_config(config), {"interval.rule": False})
-    loop, there_and_back = Loop(load_engine("onboard", settings), settings, RATE_HZ), [*film.images, *film.images[::-1]]
+    loop, there_and_back = MotionDetector(settings, "onboard", RATE_HZ), [*film.images, *film.images[::-1]]
     held = []
     for frame in frames_of(there_and_back * 2):
-        for _ in loop.feed(frame):
+        for _ in loop.update(frame):
             pass
-        colours = {id(picture) for slot in loop.slots for picture in (slot.frame.image, slot.view.image)}
-        colours -= {id(slot.view.grey) for slot in loop.slots}
-        held.append((len(loop.slots), len(colours)))
+        colours = {id(picture) for slot in loop._slots for picture in (slot.frame.image, slot.view.image)}
+        colours -= {id(slot.view.grey) for slot in loop._slots}
+        held.append((len(loop._slots), len(colours)))
     assert max(held) == max(held[-10:])
     parameters = settings.difference
-    ahead = reach(settings.interval.frames, settings) + delay(settings.interval.frames, settings)
+    ahead = look_ahead(settings.interval.frames, settings) + settling_delay(settings.interval.frames, settings)
     assert max(colours for _, colours in held) <= parameters.wide_frames + ahead + 1
 
 

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import SmallParameters
-from torchvision_dddas.detection.small_targets import SmallTracks, candidates
+from torchvision_dddas.detection.small_targets import SmallTracks, find_candidates
 
 KNOBS = SmallParameters()
+
+
+def confirmed(tracks):
+    return [track for track in tracks.tracks if track.confirmed]
 
 
 def follow(place, frames=30, camera=(0.0, 0.0), size=(10, 6), parameters=KNOBS, seen=lambda k: True):
@@ -21,30 +25,30 @@ def follow(place, frames=30, camera=(0.0, 0.0), size=(10, 6), parameters=KNOBS, 
 
 
 def test_a_slow_straight_traveller_is_confirmed():
-    (track,) = follow(lambda k: (50 + 0.8 * k, 60)).confirmed()
+    (track,) = confirmed(follow(lambda k: (50 + 0.8 * k, 60)))
     np.testing.assert_allclose(track.velocity_px, (0.8, 0), atol=0.1)
 
 
 def test_a_camera_that_pans_and_shakes_does_not_matter():
-    (track,) = follow(lambda k: (50 + 0.8 * k, 60), camera=(7.0, -3.0)).confirmed()
+    (track,) = confirmed(follow(lambda k: (50 + 0.8 * k, 60), camera=(7.0, -3.0)))
     np.testing.assert_allclose(track.velocity_px, (0.8, 0), atol=0.1)
 
 
 def test_what_stands_is_never_confirmed_however_the_camera_moves():
-    assert follow(lambda k: (50, 60), camera=(7.0, -3.0)).confirmed() == []
+    assert confirmed(follow(lambda k: (50, 60), camera=(7.0, -3.0))) == []
 
 
 def test_what_sways_to_and_fro_is_never_confirmed():
-    assert follow(lambda k: (50 + 6 * np.sin(k), 60)).confirmed() == []
+    assert confirmed(follow(lambda k: (50 + 6 * np.sin(k), 60))) == []
 
 
 def test_travel_of_less_than_a_quarter_of_its_own_length_is_not_enough():
-    assert follow(lambda k: (50 + 0.25 * k, 60), size=(40, 6)).confirmed() == []
+    assert confirmed(follow(lambda k: (50 + 0.25 * k, 60), size=(40, 6))) == []
 
 
 def test_too_few_sightings_confirm_nothing():
-    assert follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits - 1).confirmed() == []
-    assert len(follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits).confirmed()) == 1
+    assert confirmed(follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits - 1)) == []
+    assert len(confirmed(follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits))) == 1
 
 
 def test_a_few_misses_are_bridged_and_more_end_the_track():
@@ -56,24 +60,24 @@ def test_a_few_misses_are_bridged_and_more_end_the_track():
 def test_a_cut_ends_all_tracks():
     tracks = follow(lambda k: (50 + 0.8 * k, 60))
     tracks.step(30, None, [(74, 60, 10, 6)])
-    assert tracks.confirmed() == [] and len(tracks.tracks) == 1
+    assert confirmed(tracks) == [] and len(tracks.tracks) == 1
 
 
 def test_two_that_pass_near_each_other_keep_their_tracks():
     tracks = SmallTracks(KNOBS)
     for k in range(30):
         tracks.step(k, np.eye(3), [(30 + k, 60, 8, 6), (60 - k, 67, 8, 6)])
-    speeds = sorted(round(float(t.velocity_px[0])) for t in tracks.confirmed())
+    speeds = sorted(round(float(t.velocity_px[0])) for t in confirmed(tracks))
     assert speeds == [-1, 1]
 
 
 def test_candidates_are_gated_by_area_and_box(painted):
     mask = painted((101, 67), (5, 5, 3, 3), (20, 5, 4, 3), (40, 5, 60, 60))
-    assert candidates(mask, KNOBS) == [(20, 5, 4, 3)]
-    assert candidates(painted((101, 67)), KNOBS) == []
+    assert find_candidates(mask, KNOBS) == [(20, 5, 4, 3)]
+    assert find_candidates(painted((101, 67)), KNOBS) == []
 
 
 @pytest.mark.parametrize(("most", "count"), [(12, 12), (11, 0)])
 def test_too_many_candidates_are_none(most, count, painted):
     mask = painted((200, 40), *((16 * k + 2, 10, 5, 5) for k in range(12)))
-    assert len(candidates(mask, SmallParameters(max_candidates=most))) == count
+    assert len(find_candidates(mask, SmallParameters(max_candidates=most))) == count

@@ -203,16 +203,16 @@ def _scenario(path: Path) -> None:
 
 
 def _telemetry(path: Path) -> None:
-    from torchvision_dddas.io.telemetry import at, check_overlap, read_telemetry
+    from torchvision_dddas.io.telemetry import read_telemetry
 
     found = read_telemetry(path)
     rising = bool((np.diff(found.time_s) > 0).all()) and bool(np.isfinite(found.time_s).all())
     assert rising, "times that do not rise"
     columns = (found.altitude_m, found.speed_m_s, found.above_sea_m, found.heading_rad, found.pitch_rad, found.place)
     assert not any(np.isinf(column).any() for column in columns), "infinite numbers in a record"
-    assert at(found, float(found.time_s[len(found) // 2])) is not None
+    assert found.at(float(found.time_s[len(found) // 2])) is not None
     assert all(note.isprintable() for note in found.notes), "a note that no terminal shows"
-    check_overlap(found, 5.0)
+    found.check_overlap(5.0)
 
 
 def _classifier(path: Path) -> None:

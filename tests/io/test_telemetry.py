@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import at, check_overlap, read_telemetry
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Telemetry
 
 HEADER = "time_s,altitude_m,speed_m_s\n"
@@ -76,7 +76,7 @@ def test_a_file_that_is_absent_or_no_text_is_refused(tmp_path: Path) -> None:
 
 
 def _told(flown: Telemetry, time_s: float) -> tuple[float, float]:
-    flight = at(flown, time_s)
+    flight = flown.at(time_s)
     assert flight is not None
     return flight.altitude_m, flight.speed_m_s
 
@@ -87,13 +87,13 @@ def test_between_samples_it_is_linear_and_far_outside_nothing_is_known() -> None
     assert _told(flown, 3) == (40, 8)
     assert _told(flown, 0.5) == (20, 4)
     assert _told(flown, 3.9) == (40, 8)
-    assert at(flown, 4.1) is None
-    assert at(flown, -0.1) is None
-    assert at(flown, 0.5, tolerance_s=0.1) is None
+    assert flown.at(4.1) is None
+    assert flown.at(-0.1) is None
+    assert flown.at(0.5, tolerance_s=0.1) is None
 
 
 def test_without_samples_nothing_is_known() -> None:
-    assert at(Telemetry(np.zeros(0), np.zeros(0), np.zeros(0)), 0) is None
+    assert Telemetry(np.zeros(0), np.zeros(0), np.zeros(0)).at(0) is None
 
 
 def test_every_column_of_ours_comes_back_in_the_records_units(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def _turning(first_deg: float, last_deg: float) -> Telemetry:
 
 @pytest.mark.parametrize(("first", "last", "middle"), [(350, 20, 5), (20, 350, 5), (170, 200, 185), (0, 90, 45)])
 def test_angles_and_longitudes_go_the_short_way_round(first: float, last: float, middle: float) -> None:
-    flight = at(_turning(first, last), 0.5)
+    flight = _turning(first, last).at(0.5)
     assert flight is not None
     assert math.degrees(flight.heading_rad) == pytest.approx(middle)
     assert math.degrees(flight.vehicle_heading_rad) == pytest.approx(middle)
@@ -199,12 +199,12 @@ def test_angles_and_longitudes_go_the_short_way_round(first: float, last: float,
 
 def test_local_metres_are_not_taken_for_longitudes() -> None:
     flown = replace(_turning(0, 0), place=np.array([[900.0, 0.0], [1100.0, 10.0]]), geographic=False)
-    flight = at(flown, 0.25)
+    flight = flown.at(0.25)
     assert flight is not None and flight.place == (950, 2.5)
 
 
 def test_what_is_not_said_stays_unknown() -> None:
-    flight = at(Telemetry(np.array([1.0, 3.0]), np.array([20.0, 40.0]), np.array([4.0, 8.0])), 2.0)
+    flight = Telemetry(np.array([1.0, 3.0]), np.array([20.0, 40.0]), np.array([4.0, 8.0])).at(2.0)
     assert flight is not None
     unknown = [*flight.place, flight.above_sea_m, flight.heading_rad, flight.pitch_rad, flight.roll_rad]
     assert np.isnan([*unknown, flight.hfov_rad, flight.vehicle_heading_rad]).all()
@@ -223,15 +223,15 @@ def test_a_moment_agrees_with_plain_interpolation(time_s: float) -> None:
 def test_whether_telemetry_covers_a_clip_is_told_with_both_spans(from_s: float, to_s: float, good: bool) -> None:
     flown = Telemetry(np.array([from_s, to_s], float), np.zeros(2), np.zeros(2))
     if good:
-        check_overlap(flown, 15.0)
+        flown.check_overlap(15.0)
     else:
         with pytest.raises(InputError, match=rf"covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to 15.0 s"):
-            check_overlap(flown, 15.0)
+            flown.check_overlap(15.0)
 
 
 def test_no_samples_cover_no_clip() -> None:
     with pytest.raises(InputError, match="no samples"):
-        check_overlap(Telemetry(np.zeros(0), np.zeros(0), np.zeros(0)), 15.0)
+        Telemetry(np.zeros(0), np.zeros(0), np.zeros(0)).check_overlap(15.0)
 
 
 # -- tables of other programs ------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import at, read_telemetry
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Telemetry
 
 pytest.importorskip("pymavlink")
@@ -50,7 +50,7 @@ def damaged(whole: bytes, rng: random.Random) -> bytes:
 def sound(found: Telemetry) -> bool:
     rising = bool((np.diff(found.time_s) > 0).all()) and bool(np.isfinite(found.time_s).all())
     columns = (found.altitude_m, found.speed_m_s, found.above_sea_m, found.heading_rad, found.pitch_rad, found.place)
-    told = at(found, float(found.time_s[len(found) // 2]))
+    told = found.at(float(found.time_s[len(found) // 2]))
     return rising and told is not None and not any(np.isinf(column).any() for column in columns)
 
 

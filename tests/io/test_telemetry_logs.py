@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import at, read_telemetry
+from torchvision_dddas.io.telemetry import read_telemetry
 
 pytest.importorskip("pymavlink")
 pytest.importorskip("pyulog")
@@ -54,7 +54,7 @@ def test_positions_of_a_mavlink_log_since_the_first_of_them(tmp_path: Path, vers
     content = tlog([(CLOCK_S - 2, "HEARTBEAT", heartbeat), *flown()], version=version)
     found = read_telemetry(written(tmp_path, content, "flight.tlog"), clock_offset_s=-1.0)
     assert found.time_s[0] == -1.0 and found.start_utc_s == pytest.approx(CLOCK_S + 1.0, abs=0.02)
-    flight = at(found, 1.5)  # the eleventh position
+    flight = found.at(1.5)  # the eleventh position
     assert flight is not None
     assert flight.place == pytest.approx((149.0001, -35.0), abs=1e-9)
     assert (flight.altitude_m, flight.above_sea_m) == pytest.approx((60, 160))
@@ -67,14 +67,14 @@ def test_messages_that_come_late_keep_the_times_at_which_they_were_sent(tmp_path
     in_order = sorted(flown(60, delay_s=delay), key=lambda row: row[0])
     found = read_telemetry(written(tmp_path, tlog(in_order), "flight.tlog"))
     for i in (7, 20, 41):
-        flight = at(found, i * 0.25)
+        flight = found.at(i * 0.25)
         assert flight is not None and flight.altitude_m == pytest.approx(50 + i, abs=0.1)
 
 
 def test_a_gap_of_seconds_in_a_mavlink_log_is_noted_and_not_bridged(tmp_path: Path) -> None:
     said = flown(40)
     found = read_telemetry(written(tmp_path, tlog(said[:20] + said[60:]), "flight.tlog"))
-    flight = at(found, 5.0)
+    flight = found.at(5.0)
     assert flight is not None and math.isnan(flight.place[0]) and math.isnan(flight.altitude_m)
     assert any("place is unknown" in note and "5.2 s" in note for note in found.notes)
 
@@ -95,7 +95,7 @@ def test_a_gimbal_turns_against_the_vehicle_or_against_north(tmp_path: Path, fla
     for i in range(8):
         said.append((CLOCK_S + i * 0.25, "GIMBAL_DEVICE_ATTITUDE_STATUS", {"time_boot_ms": 5000 + 250 * i, **gimbal}))
     found = read_telemetry(written(tmp_path, tlog(sorted(said, key=lambda row: row[0])), "flight.tlog"))
-    flight = at(found, 1.0)
+    flight = found.at(1.0)
     assert flight is not None
     degrees = [math.degrees(a) for a in (flight.heading_rad, flight.pitch_rad, flight.roll_rad)]
     assert degrees == pytest.approx([heading, 60, 3], abs=1e-4)
@@ -105,7 +105,7 @@ def test_an_old_mount_is_levelled_and_turns_with_the_vehicle(tmp_path: Path) -> 
     mount = {"target_system": 0, "target_component": 0, "pointing_a": -4500, "pointing_b": 200, "pointing_c": 3000}
     said = [part for row in flown(8) for part in (row, (row[0], "MOUNT_STATUS", mount))]
     found = read_telemetry(written(tmp_path, tlog(said), "flight.tlog"))
-    flight = at(found, 1.0)
+    flight = found.at(1.0)
     assert flight is not None
     degrees = [math.degrees(a) for a in (flight.heading_rad, flight.pitch_rad, flight.roll_rad)]
     assert degrees == pytest.approx([130, 45, 2], abs=1e-4)
@@ -190,7 +190,7 @@ def test_the_places_heights_and_speeds_of_a_px4_log(tmp_path: Path) -> None:
         }
     )
     found = read_telemetry(written(tmp_path, content, "flight.ulg"))
-    flight = at(found, 2.0)
+    flight = found.at(2.0)
     assert flight is not None
     assert flight.place == pytest.approx((10.4, 63.40002), abs=1e-9)
     assert flight.altitude_m == pytest.approx(30 + 40 - 2) and flight.above_sea_m == pytest.approx(80)
@@ -223,7 +223,7 @@ def test_a_gimbal_of_a_px4_log_turns_with_the_vehicle(tmp_path: Path) -> None:
     gimbal = (("float[4] q", "uint16_t device_flags"), [(i * 100_000, *quaternion(30, -90, 0), 32) for i in range(20)])
     content = ulog({"vehicle_attitude": attitude, "gimbal_device_attitude_status": gimbal})
     found = read_telemetry(written(tmp_path, content, "flight.ulg"))
-    flight = at(found, 1.0)
+    flight = found.at(1.0)
     assert flight is not None
     assert [math.degrees(flight.heading_rad), math.degrees(flight.pitch_rad)] == pytest.approx([20, 90], abs=0.05)
 

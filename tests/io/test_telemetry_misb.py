@@ -9,7 +9,7 @@ import pytest
 from tests.io.flights import local_set, spread, transport_stream
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
-from torchvision_dddas.io.telemetry import at, read_telemetry
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.attitude import angles, axes, axes_of_quaternion
 from torchvision_dddas.io.telemetry.klv import imap, local_sets, mapped
 
@@ -144,7 +144,7 @@ def test_what_is_told_in_some_packets_alone_goes_on_between_them(tmp_path: Path)
     view = {"t16": spread(13, 0, 180, 2)}
     metadata = [(3600 * i, packet(i, **(view if i % 10 == 0 else {}))) for i in range(41)]
     found = read_telemetry(written(tmp_path, transport_stream([0], metadata)))
-    flight = at(found, 0.7)
+    flight = found.at(0.7)
     assert flight is not None and math.degrees(flight.hfov_rad) == pytest.approx(13, abs=0.01)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import at, read_telemetry
+from torchvision_dddas.io.telemetry import read_telemetry
 
 pytest.importorskip("pynmea2")
 from tests.io.flights import sentence
@@ -53,7 +53,7 @@ def test_without_a_fix_nothing_is_known(tmp_path: Path) -> None:
     lines = [gga("120000"), gga("120001", quality=0), gga("120002"), gga("120003")]
     found = read_telemetry(written(tmp_path, lines))
     assert np.isnan(found.place[:, 0]).tolist() == [False, True, False, False]
-    flight = at(found, 1.2)
+    flight = found.at(1.2)
     assert flight is not None and math.isnan(flight.place[0])
 
 

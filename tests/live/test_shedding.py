@@ -5,8 +5,7 @@ import pytest
 
 from tests.live.streams import FakeClock
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.live import Health, Shedding
 from torchvision_dddas.types import Adjustment, Frame
 
@@ -99,7 +98,7 @@ def test_other_settings_between_frames_are_what_the_next_frames_are_seen_with(ke
     class Clip(list):
         rate_hz = 10.0
 
-    scenes = list(run(Clip(frames), load_engine("onboard", BASE), BASE, retune=retune))
+    scenes = list(detect_motion(Clip(frames), BASE, "onboard", retune=retune))
     assert [scene.frame.number for scene in scenes] == list(range(1, 15))
     assert [record in scene.adjustments for scene in scenes] == [n == 8 for n in range(1, 15)]
     assert all(scene.reliable for scene in scenes)

@@ -6,7 +6,7 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.geometry import chain, corner_error, transfer
 from torchvision_dddas.tracking.camera_motion import Camera
 

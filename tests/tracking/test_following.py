@@ -9,8 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from tests.synthetic_clip import LEAST_PX, render
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene
 
@@ -319,7 +318,7 @@ def test_the_true_boxes_of_the_simulated_clip_get_one_identity_a_mover(film, int
 def test_the_simulated_clip_s_own_detections_are_followed_end_to_end(film, interval):
     """Walkers that cross become one blob and part again; nearly all boxes of a mover are of one identity even so."""
     settings = load_config(overrides=["gates.min_area_px=150"])
-    scenes = run(Film(film), load_engine("onboard", settings), settings)
+    scenes = detect_motion(Film(film), settings, "onboard")
     counts = together(follow_scenes(scenes, settings, interval, (480, 360)), movers_of(film), 0.3)
     assert (counts.max(axis=1) > 5).sum() >= 4
     assert counts[linear_sum_assignment(-counts)].sum() > 0.85 * counts.sum()

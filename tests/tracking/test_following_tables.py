@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
 from torchvision_dddas.tracking.source_tracker import PaperTracker
 from torchvision_dddas.tracking.tracker import Tracker

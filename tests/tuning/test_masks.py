@@ -5,8 +5,7 @@ import torch
 
 from tests.synthetic_clip import film_into
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
@@ -37,7 +36,7 @@ def examples(clip: Clip) -> list[Example]:
 
 def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example]) -> None:
     """At the settings that the examples were prepared with: what comes after the hulls is then as it was."""
-    final = {s.frame.number: s.mask > 0 for s in run(opened(clip), load_engine("onboard", SETTINGS), SETTINGS)}
+    final = {s.frame.number: s.mask > 0 for s in detect_motion(opened(clip), SETTINGS, "onboard")}
     assert [example.frame for example in examples] == list(range(1, 10))
     for example in examples:
         mask = masks_of(together([example.content], CPU), {}, 0.0)[0, 0] > 0.5

@@ -9,7 +9,7 @@ import torch
 
 from tests.synthetic_clip import film_into
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip

@@ -71,8 +71,7 @@ def detect_clip(
 
     refuse_own_input([Path(clip)], [folder / name for name in Output.files], "folder with --out")
     with Output(folder, save) as output:
-        from torchvision_dddas.detection.detector import run
-        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.detection import detect_motion, load_engine
         from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.io.telemetry import read_telemetry
 
@@ -90,7 +89,7 @@ def detect_clip(
         journal.notes += flight.notes if flight is not None else ()
         try:
             with progress(source.name, source.count, quiet) as tick:
-                for scene in run(source, engine, settings, flight):
+                for scene in detect_motion(source, settings, engine, flight):
                     output.write(scene)
                     tick()
         finally:

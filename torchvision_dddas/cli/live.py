@@ -43,7 +43,7 @@ def run_live(
 
     Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
     """
-    from torchvision_dddas.detection.detector import check_length
+    from torchvision_dddas.detection import check_length
     from torchvision_dddas.io.output.live_session import RESULTS, claim
     from torchvision_dddas.io.stream_capture import without_secrets
     from torchvision_dddas.live import LiveSource

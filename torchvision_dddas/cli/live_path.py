@@ -17,7 +17,7 @@ def path(
 ) -> "Callable[[Feed], Iterator[Result]]":
     """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
     from torchvision_dddas.config import with_parameters
-    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.detection import load_engine
     from torchvision_dddas.live.load_shedding import Shedding
     from torchvision_dddas.pipeline import survey
 

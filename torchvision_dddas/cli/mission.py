@@ -75,7 +75,7 @@ def fly_into(
         from torchvision_dddas import geometry
         from torchvision_dddas.config import load_config
         from torchvision_dddas.control.mission_api import Begun, mission_of
-        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.detection import load_engine
         from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
         from torchvision_dddas.pipeline import survey
         from torchvision_dddas.simulation import SimulatorSource, name_scenario_in_errors, scenario_settings

@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.detection.engine import Engine
+    from torchvision_dddas.detection import Engine
     from torchvision_dddas.io.output.track_output import TrackJournal
     from torchvision_dddas.types import DetectionTable, Source, TrackedFrame
 
@@ -84,7 +84,7 @@ def track_into(
     given = [Path(name) for name in (clip, detections) if name is not None]
     refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
     with TrackOutput(folder, save) as output:
-        from torchvision_dddas.detection.engine import load_engine
+        from torchvision_dddas.detection import load_engine
         from torchvision_dddas.io.detection_tables import check_birth_score, check_table, read_detections
         from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.types import is_sampled
@@ -137,9 +137,9 @@ def _followed(
         return follow_table(table, settings, interval)
     if table is not None:
         return follow_clip(source, table, engine, settings, interval)
-    from torchvision_dddas.detection.detector import run
+    from torchvision_dddas.detection import detect_motion
 
-    return follow_scenes(run(source, engine, settings), settings, interval, source.size)
+    return follow_scenes(detect_motion(source, settings, engine), settings, interval, source.size)
 
 
 def looks(table: "DetectionTable | None", source: "Source | None", interval: int) -> int | None:

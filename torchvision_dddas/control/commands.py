@@ -12,13 +12,11 @@ from torchvision_dddas.control.prediction import Memory, Outlook
 from torchvision_dddas.control.rules import (
     every_least,
     every_wanted,
-    interval_from_flow,
-    interval_from_telemetry,
     sampled,
 )
 from torchvision_dddas.control.uav_commands import Follow
 from torchvision_dddas.control.ugv_commands import Team
-from torchvision_dddas.detection.gates import pixels_per_metre
+from torchvision_dddas.detection import interval_from_flow, interval_from_telemetry, pixels_per_metre
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

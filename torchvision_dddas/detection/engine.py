@@ -1,4 +1,4 @@
-"""The seam between pixels and targets: what a back end offers. Everything is in lists, so that an engine may batch."""
+"""The protocol of engines, which do the pixel work, and the records that they exchange with the detector."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,22 +7,21 @@ from typing import Any, Protocol
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Registration
 
-# Evidence crosses the seam as 8-bit maps: in sixteenths of the local noise, cut off at 15 noise units.
+# Evidence is kept in 8-bit maps: in sixteenths of the local noise, clipped at 15 noise units.
 EVIDENCE_SCALE = 16.0
 EVIDENCE_CAP = 240
-# From this grey level on a pixel may be cut off.
+# From this grey level on a pixel may be clipped.
 WHITE = 248
 
 
 @dataclass
 class View:
-    """One frame as the back end holds it. Made by `Engine.prepare`.
+    """One frame as an engine holds it, made by `Engine.prepare`.
 
     image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W).
-    kept: what the engine computed for this frame and will want again (pyramid, tensor, keypoints); its own affair.
+    kept: what the engine computed for this frame and will use again (pyramid, tensor, keypoints).
     """
 
     image: np.ndarray
@@ -41,8 +40,8 @@ class Window:
 
     neighbour_from_reference: (K, 3, 3). offsets: (K,) frames from the reference, negative = past.
     near: pairs of indices of neighbours whose evidence is combined; the last one is the widest and shows the motion.
-    wide, small: a pair further apart that fills the inside of large targets, and one that shows small slow ones.
-    close_px: ellipse that closes gaps between fragments of a target; 0: as the settings have it.
+    wide: a pair further apart, which fills the inside of large targets. small: one that shows small slow targets.
+    close_px: side of the ellipse that closes gaps between fragments of a target; 0: that of the settings.
     """
 
     reference: View
@@ -59,13 +58,12 @@ class Window:
 class Foreground:
     """What differs from the background at the reference frame; all maps (H, W) uint8 in its pixel coordinates.
 
-    scale: pixels of the frame to one of the maps', along either side; above 1 only where nothing but blobs is asked of
-    the maps.
     core: 255 where a target is certain, cleaned by morphology.
     evidence: 16 x the difference in units of the local noise, the largest over the near pairs; `wide` the same for the
     wide pair. texture: mean gradient, 4 x grey levels a pixel.
-    small: 255 where something small may move; None when not asked for.
+    small: 255 where something small may move; None when it is not wanted.
     warped: the two neighbours of the widest near pair, in the reference's frame and exposure; `offsets` their frames.
+    scale: side of a map's pixel in pixels of the frame; above 1 only where the maps are used for nothing but blobs.
     """
 
     core: np.ndarray
@@ -79,13 +77,16 @@ class Foreground:
 
 
 class Engine(Protocol):
-    """A back end. parameters: the settings in force; others may be put in their place between two frames."""
+    """What an engine offers. Lists go in and out, so that it may batch.
+
+    parameters: the settings in force; they may be replaced between two frames.
+    """
 
     name: str
     parameters: Settings
 
     def prepare(self, image: np.ndarray) -> View:
-        """Whatever is computed once per frame."""
+        """The view of a frame, with what is computed once per frame."""
         ...
 
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
@@ -95,17 +96,3 @@ class Engine(Protocol):
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """What moves in each window's reference frame."""
         ...
-
-
-def load_engine(backend: str, settings: Settings) -> Engine:
-    """The back end `torch` or `onboard`; `auto` takes onboard, the quicker one for a single stream on a CPU.
-
-    Raises InputError for another name, and for `torch` where the extra is not installed.
-    """
-    if not wants_torch(backend):
-        from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-
-        return OpenCVEngine(settings)
-    from torchvision_dddas.detection.torch_engine import TorchEngine
-
-    return TorchEngine(settings)

@@ -1,9 +1,7 @@
-"""Motion history of one clip: when each place last moved, seen from the current frame (appendix B, step S5).
+"""Motion history (appendix B, step S5): when each place last moved, and what that tells of blobs.
 
-The counterpart of `ops.history` for one 8-bit stream. Stamps are uint8: 255 is now, 254 one frame ago, 0 longer ago
-than the duration. The outlines of past silhouettes are kept with their composed registrations, and the stamps are
-painted once a frame if anyone asks: warping stamps on at every step would round to whole pixels each time, so that a
-camera moving by 0.4 px a frame would never move its history at all.
+A blob leaves a trail in the history, which gives its heading and speed. Where its trail falls into regions that point
+clearly different ways, the blob is several targets that touch.
 """
 
 from collections import deque
@@ -12,17 +10,27 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from torchvision_dddas.config import HistoryParameters
+from torchvision_dddas.detection.blobs import Blob, Box
 from torchvision_dddas.geometry import transfer
 
 NEWEST = 255
 # Corners are painted to 1/16 px; further off than this they are beyond any picture.
 _SHIFT, _FAR_PX = 4, 1e5
-Box = tuple[int, int, int, int]
+# How far behind a blob its trail is searched, px.
+_REACH_PX = 48
+# A trail shows the motion across its edge only, so one motion can leave two trails that point up to a right angle
+# apart, with noise somewhat more. A larger angle means two motions.
+_APART_RAD = np.radians(120)
+# The gradients of flicker do not agree with each other, or it hardly moves (px a frame).
+_MIN_AGREEMENT, _MIN_SPEED_PX = 0.5, 0.5
+# Smaller trails (share of all) and smaller parts (share of the blob) are noise.
+_MIN_SHARE = 0.2
 
 
 @dataclass
-class _Past:
-    """outlines: (N, 2) corners of a silhouette's outlines, holes too, one after another. ends: where each ends."""
+class _Silhouette:
+    """outlines: (N, 2) corners of its outlines, holes too, one after another. ends: (K,) where each outline ends."""
 
     number: int
     outlines: np.ndarray
@@ -31,12 +39,17 @@ class _Past:
 
 
 class MotionHistory:
-    """A clip's silhouettes of the last `duration_frames`. Move it on to every frame in order, then add its own."""
+    """The silhouettes of the last `duration_frames` of one clip: move it on to every frame in order, then add its own.
+
+    Stamps are uint8: 255 is now, 254 one frame ago, 0 longer ago than the duration. Outlines are kept with their
+    composed registrations and painted at most once a frame. Warping the stamps at every step would round to whole
+    pixels each time, and a camera that moves by 0.4 px a frame would never move its history.
+    """
 
     def __init__(self, duration_frames: float) -> None:
         self.duration_frames = duration_frames
         self.number = 0
-        self._past: deque[_Past] = deque()
+        self._past: deque[_Silhouette] = deque()
         self._shape = (0, 0)
         self._painted: np.ndarray | None = None
 
@@ -55,7 +68,8 @@ class MotionHistory:
         """Stamp the (H, W) uint8 silhouette of the current frame, nonzero where something moves."""
         outlines, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         corners = np.concatenate([np.zeros((0, 2)), *(outline[:, 0] for outline in outlines)])
-        self._past.append(_Past(self.number, corners, np.cumsum([len(o) for o in outlines], dtype=int), np.eye(3)))
+        ends = np.cumsum([len(outline) for outline in outlines], dtype=int)
+        self._past.append(_Silhouette(self.number, corners, ends, np.eye(3)))
         self._shape = silhouette.shape[:2]
         self._painted = None
 
@@ -65,13 +79,12 @@ class MotionHistory:
         if not self._past:
             return np.zeros((height, width), np.uint8)
         if self._painted is None:
-            self._painted = self._all()
+            self._painted = self._paint()
         return self._painted[y : y + height, x : x + width].copy()
 
-    def _all(self) -> np.ndarray:
-        """The stamps of the whole picture."""
+    def _paint(self) -> np.ndarray:
         stamps = np.zeros(self._shape, np.uint8)
-        for past in self._past:  # the newest last: it overwrites
+        for past in self._past:  # the newest is last and overwrites
             if len(past.ends):
                 places = np.clip(transfer(past.now_from_then, past.outlines), -_FAR_PX, _FAR_PX)
                 corners = np.round(places * 2**_SHIFT).astype(np.int32)
@@ -80,13 +93,13 @@ class MotionHistory:
         return stamps
 
 
-def gradient(
+def motion_gradient(
     stamps: np.ndarray, delta_min_frames: float, delta_max_frames: float, aperture: int = 3
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Direction of motion (radians, 0 = right, pi/2 = down) and where it may be believed, (H, W) each.
+    """Direction of motion (radians, 0 = right, pi/2 = down) and where it is valid, (H, W) each.
 
-    As `ops.history.gradient`: Sobel over aperture x aperture px (odd), valid where the stamps under it span at least
-    delta_min_frames and at most delta_max_frames.
+    The Sobel gradient over aperture x aperture px (odd), valid where the stamps under it span at least
+    delta_min_frames and at most delta_max_frames, as in OpenCV's calcMotionGradient, which the source used.
     """
     along_u = cv2.Sobel(stamps, cv2.CV_32F, 1, 0, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
     along_v = cv2.Sobel(stamps, cv2.CV_32F, 0, 1, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
@@ -100,9 +113,9 @@ def gradient(
 def region_orientation(
     orientation_rad: np.ndarray, valid: np.ndarray, stamps: np.ndarray, region: np.ndarray, duration_frames: float
 ) -> tuple[float, float]:
-    """Mean direction of a (H, W) bool region in radians, NaN where it has none, and their agreement, 0 to 1.
+    """Mean direction of a (H, W) bool region in radians, NaN where it has none, and the agreement on it, 0 to 1.
 
-    The weighted circular mean of the valid gradients, the newest weighing most: as `ops.history.region_orientation`.
+    The weighted circular mean of the valid gradients: a stamp weighs 1 when new and 0 after the duration.
     """
     inside = region & valid
     age = NEWEST - stamps[inside].astype(np.float32)
@@ -111,3 +124,108 @@ def region_orientation(
     cos, sin = float((weight * np.cos(angle)).sum()), float((weight * np.sin(angle)).sum())
     agreement = float(np.hypot(cos, sin)) / max(float(weight.sum()), 1e-6)
     return (float(np.arctan2(sin, cos)), agreement) if agreement > 1e-3 else (float("nan"), 0.0)
+
+
+def flood_regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float) -> list[np.ndarray]:
+    """(H, W) bool masks of the regions of a flood fill that hold a seed.
+
+    Neighbours (8) whose stamps differ by at most the threshold are of one region; stamp 0 is of none.
+    stamps: (H, W) uint8. seeds: (H, W) bool.
+    """
+    # OpenCV's mask is one pixel larger on every side; nonzero is a wall.
+    wall = np.ones((stamps.shape[0] + 2, stamps.shape[1] + 2), np.uint8)
+    wall[1:-1, 1:-1] = stamps == 0
+    threshold = int(min(threshold_frames, 254))  # stamps are whole frames
+    flags = 8 | (2 << 8) | cv2.FLOODFILL_MASK_ONLY
+    left, found = seeds & (stamps > 0), []
+    while left.any():
+        row, column = np.unravel_index(int(left.argmax()), left.shape)
+        cv2.floodFill(stamps, wall, (int(column), int(row)), 0, threshold, threshold, flags)
+        region = wall[1:-1, 1:-1] == 2
+        wall[1:-1, 1:-1][region] = 1
+        left &= ~region
+        found.append(region)
+    return found
+
+
+def split_by_trail(
+    blob: Blob, history: MotionHistory, size: tuple[int, int], parameters: HistoryParameters
+) -> list[tuple[Blob, np.ndarray]]:
+    """The blob with its velocity, or its two parts with theirs where its trail shows two motions.
+
+    The history has the current frame's silhouette. size: (width, height) of the picture. velocity: (2,) pixels a frame
+    over the background; NaN for a blob that leaves no usable trail, because it is slower than the trail is broad or
+    faster than its own length a frame.
+    """
+    x, y, width, height = blob.box
+    left, top = max(x - _REACH_PX, 0), max(y - _REACH_PX, 0)
+    right, bottom = min(x + width + _REACH_PX, size[0]), min(y + height + _REACH_PX, size[1])
+    stamps = history.stamps((left, top, right - left, bottom - top))
+    inside = np.s_[y - top : y - top + height, x - left : x - left + width]
+    body = np.zeros(stamps.shape, bool)
+    body[inside] = blob.mask
+    body &= stamps == NEWEST
+    angle, valid = motion_gradient(stamps, parameters.delta_min_frames, parameters.delta_max_frames)
+
+    def orientation(trail: np.ndarray) -> tuple[float, float]:
+        return region_orientation(angle, valid, stamps, _grow(trail), parameters.duration_frames)
+
+    old = np.where(stamps == NEWEST, np.uint8(0), stamps)
+    trails = flood_regions(old, _grow(body), parameters.segmentation_threshold_frames)
+    total = sum(int(trail.sum()) for trail in trails)
+    trails = [trail for trail in trails if trail.sum() >= _MIN_SHARE * total]
+    if not trails:
+        return [(blob, np.full(2, np.nan))]
+    headings, agreement = zip(*map(orientation, trails), strict=True)
+    pair = _furthest_apart([h if a >= _MIN_AGREEMENT else np.nan for h, a in zip(headings, agreement, strict=True)])
+    if pair is not None:
+        shares = _share_out(body, [trails[i] for i in pair], [headings[i] for i in pair])
+        if all(share.sum() >= _MIN_SHARE * body.sum() for share in shares):
+            velocities = [_velocity(stamps, s, trails[i], headings[i]) for s, i in zip(shares, pair, strict=True)]
+            if all(np.hypot(*velocity) >= _MIN_SPEED_PX for velocity in velocities):
+                return [(blob.cut(s[inside]), velocity) for s, velocity in zip(shares, velocities, strict=True)]
+    trail = np.logical_or.reduce(trails)
+    return [(blob, _velocity(stamps, body, trail, orientation(trail)[0]))]
+
+
+def _grow(region: np.ndarray) -> np.ndarray:
+    return cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+def _furthest_apart(headings: list[float]) -> tuple[int, int] | None:
+    """The two trails that point furthest apart, if far enough."""
+    best, pair = _APART_RAD, None
+    for i in range(len(headings)):
+        for j in range(i):
+            angle = abs(np.angle(np.exp(1j * (headings[i] - headings[j]))))
+            if angle > best:
+                best, pair = angle, (j, i)
+    return pair
+
+
+def _share_out(body: np.ndarray, trails: list[np.ndarray], headings: list[float]) -> list[np.ndarray]:
+    """Each pixel of the body goes to the trail that it lies ahead of; if that holds for both, to the nearer."""
+    row, column = np.nonzero(body)
+    costs = []
+    for trail, heading in zip(trails, headings, strict=True):
+        along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+        r, c = np.nonzero(trail)
+        side, ahead = np.c_[c, r] @ across, np.c_[column, row] @ along
+        lane = np.c_[column, row] @ across
+        beside = np.maximum(np.maximum(side.min() - lane, lane - side.max()), 0)
+        costs.append(1e3 * np.round(beside) + np.abs(ahead - (np.c_[c, r] @ along).max()))
+    nearest = np.argmin(costs, axis=0)
+    shares = np.zeros((len(trails), *body.shape), bool)
+    shares[nearest, row, column] = True
+    return list(shares)
+
+
+def _velocity(stamps: np.ndarray, body: np.ndarray, trail: np.ndarray, heading: float) -> np.ndarray:
+    """Velocity of a body that left a trail: the area swept a frame, over its breadth across the heading."""
+    if not np.isfinite(heading) or not body.any():
+        return np.full(2, np.nan)
+    age = NEWEST - stamps[trail].astype(int)
+    frames = int(age.max())
+    row, column = np.nonzero(body)
+    breadth = len(np.unique(np.round(column * np.sin(heading) - row * np.cos(heading))))
+    return len(age) / (frames * breadth) * np.array([np.cos(heading), np.sin(heading)])

@@ -1,4 +1,4 @@
-"""From one window's foreground to targets: blobs, their motion, their persistence, their outlines."""
+"""From the foreground of one window to targets: blobs, their motion, their persistence, their outlines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,26 +6,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, blob_motion, only_velocity
-from torchvision_dddas.detection.blobs import Blob, find_blobs, weak_blobs
+from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, blob_motion, split_by_flow
+from torchvision_dddas.detection.blobs import Blob, find_blobs, find_weak_blobs, group_fragments
 from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, Window
-from torchvision_dddas.detection.flow_split import parted_by_flow
-from torchvision_dddas.detection.fragments import groups
-from torchvision_dddas.detection.gates import Gates
-from torchvision_dddas.detection.motion_history import MotionHistory
-from torchvision_dddas.detection.motion_segmentation import moving_parts
-from torchvision_dddas.detection.outlines import refine
-from torchvision_dddas.detection.persistence import Sighting, persistent
-from torchvision_dddas.detection.shadows import without_shadow
-from torchvision_dddas.geometry import parts_of
+from torchvision_dddas.detection.motion_history import MotionHistory, split_by_trail
+from torchvision_dddas.detection.outlines import refine_outline, remove_shadow
+from torchvision_dddas.detection.persistence import Sighting, find_persistent
+from torchvision_dddas.geometry import connected_parts
 from torchvision_dddas.types import Detections
 
 
 @dataclass(frozen=True)
-class Found:
+class Target:
     """One target of a frame. box: x, y, width, height. mask: (height, width) bool inside the box.
 
-    core: the same of those pixels that differ by themselves, before gaps are closed and hulls are filled; None: all.
+    core: the pixels of the mask that differ by themselves, before gaps are closed and hulls are filled; None: all.
     """
 
     box: tuple[int, int, int, int]
@@ -34,16 +29,26 @@ class Found:
     score: float
     core: np.ndarray | None = None
 
+    def covers(self, u: float, v: float) -> bool:
+        """Whether a point lies in the box."""
+        x, y, width, height = self.box
+        return x <= u <= x + width and y <= v <= y + height
+
+    def window_in(self, left: int = 0, top: int = 0) -> tuple[slice, slice]:
+        """Rows and columns of the box in a picture whose first pixel is at (left, top)."""
+        x, y, width, height = self.box
+        return slice(y - top, y - top + height), slice(x - left, x - left + width)
+
 
 @dataclass
 class Observation:
-    """What one frame showed, before it is judged. Window and foreground are dropped once its targets are drawn."""
+    """What one frame shows, before its targets are chosen. Window and foreground are dropped once they are drawn."""
 
     window: Window | None
     foreground: Foreground | None
     blobs: list[Blob] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
-    targets: list[Found] | None = None
+    targets: list[Target] | None = None
 
 
 def observe(
@@ -51,43 +56,40 @@ def observe(
 ) -> Observation:
     """The blobs of a window's reference frame and how each of them moves.
 
-    history: moved on to this frame; it tells the motions where the settings ask for no dense flow.
+    history: moved on to this frame; it gives the motions where the settings want no dense flow.
     """
-    parameters, view = settings.difference, window.reference
-    scale = EVIDENCE_SCALE if parameters.kind == "normalized" else 1.0
+    parameters, view, scale = settings.difference, window.reference, _evidence_scale(settings)
+    threshold, peak = parameters.threshold * scale, parameters.peak * scale
+    min_area_px = settings.gates.min_area_px
     blobs = find_blobs(
         foreground.core,
         foreground.evidence,
-        parameters.threshold * scale,
-        settings.gates.min_area_px,
-        parameters.peak * scale,
+        threshold,
+        min_area_px,
+        peak,
         settings.morphology.hull,
         foreground.scale,
     )
-    if settings.persistence.on and _looks_both_ways(window):
-        knobs_of = settings.morphology, settings.gates.min_area_px, parameters.peak * scale
-        blobs += weak_blobs(foreground.wide, blobs, parameters.threshold * scale, *knobs_of)
+    # A wide pair that looks both ways shows what is in the reference frame alone.
+    wide = window.wide
+    if settings.persistence.on and wide is not None and window.offsets[wide[0]] * window.offsets[wide[1]] < 0:
+        blobs += find_weak_blobs(foreground.wide, blobs, threshold, settings.morphology, min_area_px, peak)
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)
         if settings.history.on:
-            blobs = [part for blob in blobs for part in parted_by_flow(blob, flows, foreground.offsets)]
+            blobs = [part for blob in blobs for part in split_by_flow(blob, flows, foreground.offsets)]
         motions = [blob_motion(blob, flows, foreground.offsets) for blob in blobs]
     elif history is not None:
         history.add(foreground.core)
-        parts = [part for blob in blobs for part in moving_parts(blob, history, view.size, settings.history)]
-        blobs, motions = [part.blob for part in parts], [only_velocity(part.velocity_px) for part in parts]
+        parts = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
+        blobs, motions = [blob for blob, _ in parts], [Motion(velocity_px) for _, velocity_px in parts]
     return Observation(window, foreground, blobs, motions)
-
-
-def _looks_both_ways(window: Window) -> bool:
-    """Whether the wide pair shows what is there in the reference frame alone."""
-    return window.wide is not None and window.offsets[window.wide[0]] * window.offsets[window.wide[1]] < 0
 
 
 def draw_targets(
     observations: Sequence[Observation], steps: Sequence[np.ndarray | None], index: int, settings: Settings
-) -> list[Found]:
+) -> list[Target]:
     """The targets of `observations[index]`: the blobs that persist, with refined outlines, fragments joined.
 
     steps: registration from each observation to the next, None at a cut.
@@ -98,105 +100,85 @@ def draw_targets(
     kept = [True] * len(here.blobs)
     if settings.persistence.on:
         sightings = [Sighting(o.blobs, o.motions, step) for o, step in zip(observations, [*steps, None], strict=False)]
-        kept = persistent(sightings, index, here.window.reference.size, settings.persistence)
-    found = []
-    for i, (blob, keep) in enumerate(zip(here.blobs, kept, strict=True)):
-        if not keep:
-            continue
-        motion = here.motions[i] if here.motions else None
+        kept = find_persistent(sightings, index, here.window.reference.size, settings.persistence)
+    targets = []
+    for i in np.flatnonzero(kept):
+        blob, motion = here.blobs[i], here.motions[i] if here.motions else None
         mask = blob.mask
         if settings.refine.on and motion is not None:
-            mask = _refined(blob, motion, here, settings)
-        velocity = motion.velocity_px if motion is not None else np.full(2, np.nan)
-        score = score_of(blob.peak, settings)
-        for box, part in parts_of(mask, blob.box, settings.gates.min_area_px // 2):
+            mask = _refine(blob, motion, here.window, here.foreground, settings)
+        velocity_px = motion.velocity_px if motion is not None else np.full(2, np.nan)
+        score = rate_peak(blob.peak, settings)
+        for box, part in connected_parts(mask, blob.box, settings.gates.min_area_px // 2):
             x, y = box[0] - blob.box[0], box[1] - blob.box[1]
             core = blob.core[y : y + box[3], x : x + box[2]] & part
-            found.append(Found(box, part, velocity, score, core))
-    return join(found)
+            targets.append(Target(box, part, velocity_px, score, core))
+    return join_fragments(targets)
 
 
-def _refined(blob: Blob, motion: Motion, here: Observation, settings: Settings) -> np.ndarray:
-    window, foreground = here.window, here.foreground
-    assert window is not None and foreground is not None
+def _refine(blob: Blob, motion: Motion, window: Window, foreground: Foreground, settings: Settings) -> np.ndarray:
     view = window.reference
-    mask = refine(
-        blob,
-        motion,
-        view.image,
-        view.grey,
-        foreground.evidence,
-        foreground.wide,
-        foreground.texture,
-        foreground.warped,
-        EVIDENCE_SCALE,
-        settings,
-    )
+    mask = refine_outline(blob, motion, view, foreground, settings)
     # From the air, where targets are small and shadows as large; beside a car they are thin and dark as its tyres.
     if window.wide is not None and blob.area_px <= settings.refine.shadow_share * view.grey.size:
         grounds = [window.neighbours[i].image for i in window.wide]
-        maps = [window.neighbour_from_reference[i] for i in window.wide]
-        mask = without_shadow(mask, blob.box, view.image, grounds, maps)
+        matrices = [window.neighbour_from_reference[i] for i in window.wide]
+        mask = remove_shadow(mask, blob.box, view.image, grounds, matrices)
     return mask
 
 
-def score_of(peak: float, settings: Settings) -> float:
+def _evidence_scale(settings: Settings) -> float:
+    return EVIDENCE_SCALE if settings.difference.kind == "normalized" else 1.0
+
+
+def rate_peak(peak: float, settings: Settings) -> float:
     """A confidence in [0, 1) that grows with the peak of evidence over the threshold."""
-    scale = EVIDENCE_SCALE if settings.difference.kind == "normalized" else 1.0
-    return float(1 - np.exp(-peak / (2 * settings.difference.threshold * scale)))
+    return float(1 - np.exp(-peak / (2 * settings.difference.threshold * _evidence_scale(settings))))
 
 
-def join(found: Sequence[Found]) -> list[Found]:
-    """Fragments of one mover as one target."""
-    if len(found) < 2:
-        return list(found)
+def join_fragments(targets: Sequence[Target]) -> list[Target]:
+    """Fragments of one moving thing become one target."""
+    if len(targets) < 2:
+        return list(targets)
     joined = []
-    boxes, velocities = np.array([f.box for f in found], float), np.array([f.velocity_px for f in found])
-    for members in groups(boxes, velocities):
-        if len(members) == 1:
-            joined.append(found[members[0]])
+    boxes = np.array([target.box for target in targets], float)
+    for members in group_fragments(boxes, np.array([target.velocity_px for target in targets])):
+        parts = [targets[i] for i in members]
+        if len(parts) == 1:
+            joined += parts
             continue
-        parts = [found[i] for i in members]
-        left, top = min(p.box[0] for p in parts), min(p.box[1] for p in parts)
-        right, bottom = max(p.box[0] + p.box[2] for p in parts), max(p.box[1] + p.box[3] for p in parts)
-        mask, core = np.zeros((2, bottom - top, right - left), bool)
-        for p in parts:
-            x, y, width, height = p.box
-            window = np.s_[y - top : y - top + height, x - left : x - left + width]
-            mask[window] |= p.mask
-            core[window] |= p.mask if p.core is None else p.core
-        largest = max(parts, key=lambda p: int(p.mask.sum()))
-        box = (left, top, right - left, bottom - top)
-        joined.append(Found(box, mask, largest.velocity_px, max(p.score for p in parts), core))
+        low, high = boxes[members, :2].min(axis=0), (boxes[members, :2] + boxes[members, 2:]).max(axis=0)
+        (left, top), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
+        mask, core = np.zeros((2, height, width), bool)
+        for part in parts:
+            window = part.window_in(left, top)
+            mask[window] |= part.mask
+            core[window] |= part.mask if part.core is None else part.core
+        largest = max(parts, key=lambda part: int(part.mask.sum()))
+        score = max(part.score for part in parts)
+        joined.append(Target((left, top, width, height), mask, largest.velocity_px, score, core))
     return joined
 
 
-def admitted(found: Sequence[Found], gates: Gates | None) -> list[Found]:
-    """The targets that the gates let through; all of them without gates."""
-    return [f for f in found if gates is None or gates.admit(f.box[2], f.box[3], f.velocity_px)]
-
-
-def table(found: Sequence[Found], size: tuple[int, int]) -> tuple[Detections, np.ndarray]:
+def build_detections(targets: Sequence[Target], size: tuple[int, int]) -> tuple[Detections, np.ndarray]:
     """The targets as a table and as a (H, W) uint16 mask whose value i + 1 is row i. size: (width, height)."""
     mask = np.zeros((size[1], size[0]), np.uint16)
-    for i, target in enumerate(found):
-        x, y, width, height = target.box
-        mask[y : y + height, x : x + width][target.mask] = i + 1
-    velocity = np.array([f.velocity_px for f in found]).reshape(-1, 2)
+    for i, target in enumerate(targets):
+        mask[target.window_in()][target.mask] = i + 1
+    velocity = np.array([target.velocity_px for target in targets]).reshape(-1, 2)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     return Detections(
-        box_px=np.array([f.box for f in found], float).reshape(-1, 4),
-        score=np.array([f.score for f in found], float),
-        area_px=np.array([f.mask.sum() for f in found], float),
+        box_px=np.array([target.box for target in targets], float).reshape(-1, 4),
+        score=np.array([target.score for target in targets], float),
+        area_px=np.array([target.mask.sum() for target in targets], float),
         heading_rad=np.where(speed > 0, np.arctan2(velocity[:, 1], velocity[:, 0]), np.nan),
         speed_px=speed,
     ), mask
 
 
-def cores(found: Sequence[Found], size: tuple[int, int]) -> np.ndarray:
+def build_core_mask(targets: Sequence[Target], size: tuple[int, int]) -> np.ndarray:
     """(H, W) bool, the pixels of the targets that differ by themselves. size: (width, height)."""
     core = np.zeros((size[1], size[0]), bool)
-    for target in found:
-        x, y, width, height = target.box
-        core[y : y + height, x : x + width] |= target.mask if target.core is None else target.core
+    for target in targets:
+        core[target.window_in()] |= target.mask if target.core is None else target.core
     return core

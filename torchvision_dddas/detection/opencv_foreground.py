@@ -1,11 +1,14 @@
-"""Pixel steps of the onboard back end, each in as few passes over 8-bit memory as it takes."""
+"""The foreground of a window on OpenCV, in as few passes over 8-bit memory as possible."""
 
 from itertools import pairwise
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.engine import WHITE
+from torchvision_dddas.config import DifferenceParameters, Settings
+from torchvision_dddas.detection.blobs import close_mask, ellipse
+from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Foreground, Window
+from torchvision_dddas.detection.registration import exposure_between
 from torchvision_dddas.geometry import transfer
 
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
@@ -19,6 +22,106 @@ _LEVELS = np.arange(256)
 _ROWS = 257 * _LEVELS
 
 
+def find_foreground(window: Window, settings: Settings) -> Foreground:
+    """What moves in the window's reference frame: differences to the warped neighbours, threshold, morphology."""
+    parameters, grey = settings.difference, window.reference.grey
+    if min(grey.shape) < 2:  # OpenCV takes a single column for a number
+        zero = np.zeros_like(grey)
+        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
+    normalized = parameters.kind == "normalized"
+    texture = measure_texture(grey) if normalized or settings.refine.on else no_texture(grey.shape)
+    scale = 1.0
+    if normalized:
+        scale = EVIDENCE_SCALE
+        noise = np.sqrt((np.arange(256) * parameters.gradient_share / 4) ** 2 + parameters.noise_levels**2)
+        weight = cv2.LUT(texture, (EVIDENCE_SCALE / noise).astype(np.float32))
+        textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
+    neighbours = _Neighbours(window, parameters)
+
+    def evidence(pair: tuple[int, int]) -> np.ndarray:
+        both = neighbours.both(pair)
+        z = neighbours.apart(pair) if parameters.kind == "between_later" else neighbours.least(pair)
+        if not normalized:
+            z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
+            return cv2.bitwise_and(z, both, dst=z)
+        z = cv2.multiply(cv2.bitwise_and(z, both), weight, dtype=cv2.CV_8U)
+        z = cv2.threshold(z, EVIDENCE_CAP, EVIDENCE_CAP, cv2.THRESH_TRUNC)[1]
+        z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
+        unit = median_above(z, cv2.bitwise_and(both, textured, dst=both), EVIDENCE_SCALE) / EVIDENCE_SCALE
+        return z if unit == 1.0 else cv2.convertScaleAbs(z, alpha=1 / unit)
+
+    near = evidence(window.near[0])
+    for pair in window.near[1:]:
+        near = cv2.max(near, evidence(pair), dst=near)
+    a, b = window.near[-1]
+    warped, offsets = (neighbours[a][0], neighbours[b][0]), (window.offsets[a], window.offsets[b])
+    neighbours.keep_for(window.wide, window.small)
+    wide = near if window.wide is None else evidence(window.wide)
+    neighbours.keep_for(window.small)
+    core = cv2.threshold(near, int(parameters.threshold * scale), 255, cv2.THRESH_BINARY)[1]
+    close_px = window.close_px or settings.morphology.close_px
+    core = close_mask(cv2.erode(core, ellipse(settings.morphology.erode_px)), close_px)
+    small = None
+    if window.small is not None:
+        small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
+        small = cv2.bitwise_and(small, neighbours.both(window.small), dst=small)
+        level = max(settings.small.threshold, settings.small.noise_ratio * cv2.mean(small)[0])
+        small = close_mask(cv2.threshold(small, int(level), 255, cv2.THRESH_BINARY)[1], settings.small.close_px)
+    return Foreground(core, near, wide, texture, small, warped, offsets)
+
+
+def no_texture(shape: tuple[int, ...]) -> np.ndarray:
+    """A texture map that is not needed: it takes no memory."""
+    return np.broadcast_to(np.uint8(0), shape)
+
+
+class _Neighbours:
+    """The neighbours as the reference sees them, each warped when it is first needed.
+
+    All neighbours of a window at once, with where each is seen, would take 15 MB at 1280x720.
+    """
+
+    def __init__(self, window: Window, parameters: DifferenceParameters) -> None:
+        self.window, self.parameters = window, parameters
+        self.made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.known: dict[tuple[int, int], np.ndarray] = {}
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """A neighbour warped, and 255 where it may be compared."""
+        if index not in self.made:
+            reference, neighbour_from_reference = self.window.reference, self.window.neighbour_from_reference[index]
+            neighbour = self.window.neighbours[index]
+            warped = warp(neighbour.grey, neighbour_from_reference)
+            seen = find_seen(neighbour_from_reference, reference.size, self.parameters.border_px)
+            if self.parameters.kind == "normalized":
+                warped = match_light(reference.grey, warped, seen)
+            elif self.parameters.kind == "to_reference":
+                warped = apply_light(reference.grey, warped, *exposure_between(reference, neighbour))
+            self.made[index] = warped, seen
+        return self.made[index]
+
+    def both(self, pair: tuple[int, int]) -> np.ndarray:
+        """255 where both of a pair are seen."""
+        return cv2.bitwise_and(self[pair[0]][1], self[pair[1]][1])
+
+    def apart(self, pair: tuple[int, int]) -> np.ndarray:
+        """The difference between the two of a pair."""
+        return cv2.absdiff(self[pair[0]][0], self[pair[1]][0])
+
+    def least(self, pair: tuple[int, int]) -> np.ndarray:
+        """The smaller difference of the reference to the two of a pair, computed once."""
+        if pair not in self.known:
+            a, b = (cv2.absdiff(self.window.reference.grey, self[i][0]) for i in pair)
+            self.known[pair] = cv2.min(a, b, dst=a)
+        return self.known[pair]
+
+    def keep_for(self, *pairs: tuple[int, int] | None) -> None:
+        """Drop what none of these pairs uses."""
+        wanted = {i for pair in pairs if pair for i in pair}
+        self.made = {i: kept for i, kept in self.made.items() if i in wanted}
+        self.known = {pair: kept for pair, kept in self.known.items() if pair in pairs}
+
+
 def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     """The picture as the reference sees it, bilinear, (H, W) uint8; border pixels are repeated outside.
 
@@ -27,7 +130,7 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     """
     height, width = picture.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    # The error falls with the square of the number of tiles across: that of a single one tells how many it takes.
+    # The error falls with the square of the number of tiles across: that of a single one gives the number needed.
     tiles = np.array([[0, 0, width - 1, height - 1]])
     maps, error = _affine_maps(picture_from_reference, tiles)
     count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
@@ -77,8 +180,8 @@ def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, fl
     return maps, float(error)
 
 
-def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
-    """255 where the reference's pixels see the picture, a strip inside its border left out; (H, W) uint8.
+def find_seen(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
+    """255 where the picture shows the reference's pixels, a strip inside its border left out; (H, W) uint8.
 
     size: (width, height) of both.
     """
@@ -100,7 +203,7 @@ def inside(picture_from_reference: np.ndarray, size: tuple[int, int], border: in
     return cv2.warpPerspective(mask, picture_from_reference, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
 
 
-def texture_of(grey: np.ndarray) -> np.ndarray:
+def measure_texture(grey: np.ndarray) -> np.ndarray:
     """Mean gradient magnitude over 5x5 px, 4 x grey levels a pixel, uint8."""
     steep = np.empty_like(grey)
     # In strips, with a row more on either side: float pictures of the whole would hold 11 MB at 1280x720.
@@ -114,13 +217,13 @@ def texture_of(grey: np.ndarray) -> np.ndarray:
     return cv2.blur(steep, (5, 5))
 
 
-def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def match_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """The warped picture in the reference's exposure: gain and offset by trimmed least squares on every 4th pixel.
 
     seen: 255 where the warped picture may be compared. All are (H, W) uint8.
     """
     samples = [warped[::4, ::4], reference[::4, ::4]]
-    # The fit needs no more than how often each pair of grey levels occurs.
+    # The fit needs only how often each pair of grey levels occurs.
     pairs = _GreyPairs(cv2.calcHist(samples, [0, 1], seen[::4, ::4], [256, 256], [0, 256, 0, 256]))
     if pairs.count < 100:
         return warped
@@ -137,24 +240,24 @@ def exposed(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.n
         offset = float(mean_y - gain * mean_x)
         if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
             break
-    return lit(reference, warped, gain, offset)
+    return apply_light(reference, warped, gain, offset)
 
 
-def lit(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
-    """The warped picture through gain and offset; what it has cut off at white agrees with anything brighter."""
+def apply_light(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
+    """The warped picture through gain and offset; where it is clipped at white it agrees with anything brighter."""
     table = np.clip(np.round(gain * _LEVELS + offset), 0, 255).astype(np.uint8)
     if (table == _LEVELS).all():
         return warped
     through = cv2.LUT(warped, table)
     if table[255] < WHITE:
-        # Cut off at white, a pixel only tells that the place was at least so bright.
+        # A clipped pixel only says that the place was at least so bright.
         cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
         cv2.copyTo(cv2.max(through, reference), cut, through)
     return through
 
 
 class _GreyPairs:
-    """How often grey level y meets grey level x in two pictures; summed along y: a band of y takes two looks."""
+    """How often grey levels x and y meet in two pictures, summed along y: a band of y takes two look-ups."""
 
     def __init__(self, times: np.ndarray) -> None:
         """times: (256, 256), x down, y across."""

@@ -1,7 +1,7 @@
-"""The step from a frame to the next on OpenCV: grid keypoints, Lucas-Kanade, RANSAC, refits on the inliers.
+"""The registration of one frame pair on OpenCV: grid keypoints, Lucas-Kanade, RANSAC, refits on the inliers.
 
 With `registration.redetect_frames` above 1 the inliers of one step are the start points of the next, and its homography
-predicts where they go: a short search then does what a deep one does from nothing.
+predicts where they go: a short search is then enough.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,13 @@ import numpy as np
 
 from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.detection.engine import View
-from torchvision_dddas.detection.exposure import in_one_light
-from torchvision_dddas.detection.keypoint_grid import cell_side
-from torchvision_dddas.detection.registration_check import judged
+from torchvision_dddas.detection.registration import cell_side, judge_registration, match_exposure
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
 # The short search around a prediction: pyramid levels above the full resolution, and steps a level.
 _SHORT_LEVELS, _SHORT_STEPS = 1, 5
-# The deep search of a cold start looks through a window at least this wide.
+# The window of the deep search from a cold start is at least this wide.
 _DEEP_WINDOW_PX = 21
 # Below this share of inliers a short step is done again, deep and from new keypoints.
 _LEAST_SHARE = 0.4
@@ -51,27 +49,27 @@ def register(earlier: View, later: View, parameters: RegistrationParameters) -> 
     """The background's motion from `earlier` to `later`; what the next step needs is left in `later.kept`."""
     carrying = parameters.redetect_frames > 1
     carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
-    if carried is not None and _worn(carried, earlier.size, parameters):
-        points = keypoints(earlier.grey, parameters, halved=not parameters.halved)
+    if carried is not None and _is_worn(carried, earlier.size, parameters):
+        points = detect_keypoints(earlier.grey, parameters, halved=not parameters.halved)
         carried = _Carried(points, carried.step, 0, len(points), _cover(points, earlier.size))
     if carried is not None:
-        found, inliers = _step(earlier, later, carried.points, parameters, carried.step)
+        found, inliers = _register_points(earlier, later, carried.points, parameters, carried.step)
         if found.inliers < _LEAST_SHARE * len(carried.points) or not found.reliable:
             carried = None
     if carried is None:
-        points = keypoints(earlier.grey, parameters, halved=carrying and not parameters.halved)
+        points = detect_keypoints(earlier.grey, parameters, halved=carrying and not parameters.halved)
         carried = _Carried(points, np.eye(3), 0, len(points), _cover(points, earlier.size))
-        found, inliers = _step(earlier, later, points, parameters, None)
+        found, inliers = _register_points(earlier, later, points, parameters, None)
     if carrying and found.reliable:
         step = found.later_from_earlier
         later.kept["carried"] = _Carried(inliers, step, carried.age + 1, carried.count, carried.cover)
     return found
 
 
-def keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
+def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
     """(N, 2) float32: the best pixel of every grid cell, by the smaller eigenvalue of the structure tensor.
 
-    halved: look at half the resolution, at a quarter of the cost; the points then lie on even pixels.
+    halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
     """
     height, width = grey.shape
     cell = cell_side(width, height, parameters)
@@ -110,7 +108,7 @@ def _corners(grey: np.ndarray, block: int) -> np.ndarray:
     return corner
 
 
-def _worn(carried: _Carried, size: tuple[int, int], parameters: RegistrationParameters) -> bool:
+def _is_worn(carried: _Carried, size: tuple[int, int], parameters: RegistrationParameters) -> bool:
     """Whether the points carried on are too old, too few or too much in one place."""
     return (
         carried.age >= parameters.redetect_frames
@@ -125,36 +123,25 @@ def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
     return len(np.unique(cells @ (1, _COARSE)))
 
 
-def _step(
+def _register_points(
     earlier: View, later: View, start: np.ndarray, parameters: RegistrationParameters, predicted: np.ndarray | None
 ) -> tuple[Registration, np.ndarray]:
     """The registration and its inliers' places in the later frame."""
     size, end, tracked = earlier.size, start, np.zeros(len(start), bool)
     if len(start) >= 4:
-        end, tracked = _track(*in_one_light(earlier, later), start, parameters, predicted)
+        end, found, missed_px = track_both_ways(*match_exposure(earlier, later), start, parameters, predicted)
+        tracked = found & (missed_px <= parameters.forward_backward_px)
     start, end = start[tracked], end[tracked]
     if len(start) < 4:
-        return judged(np.eye(3), len(start), 0, np.inf, size, parameters), end
-    later_from_earlier = fit(start, end, parameters)
+        return judge_registration(np.eye(3), len(start), 0, np.inf, size, parameters), end
+    later_from_earlier = fit_motion(start, end, parameters)
     miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
     inliers = miss < parameters.ransac_px
     error = float(np.median(miss[inliers])) if inliers.any() else np.inf
-    return judged(later_from_earlier, len(start), int(inliers.sum()), error, size, parameters), end[inliers]
+    return judge_registration(later_from_earlier, len(start), int(inliers.sum()), error, size, parameters), end[inliers]
 
 
-def _track(
-    earlier: np.ndarray,
-    later: np.ndarray,
-    start: np.ndarray,
-    parameters: RegistrationParameters,
-    predicted: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where the points went, (N, 2) float32, and which of them were followed, (N,) bool."""
-    end, found, missed_px = there_and_back(earlier, later, start, parameters, predicted)
-    return end, found & (missed_px <= parameters.forward_backward_px)
-
-
-def there_and_back(
+def track_both_ways(
     earlier: np.ndarray,
     later: np.ndarray,
     start: np.ndarray,
@@ -187,16 +174,14 @@ def there_and_back(
     return end, tracked & ((end >= 0) & (end <= (width - 1, height - 1))).all(axis=1), missed_px
 
 
-def fit(start: np.ndarray, end: np.ndarray, parameters: RegistrationParameters) -> np.ndarray:
+def fit_motion(start: np.ndarray, end: np.ndarray, parameters: RegistrationParameters) -> np.ndarray:
     """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy."""
     affine, model, refit = parameters.model == "affine", None, None
     if affine:
         found: np.ndarray | None = cv2.estimateAffine2D(start, end, None, cv2.RANSAC, parameters.ransac_px)[0]
         model = None if found is None else np.vstack([found, [0, 0, 1]])
     else:
-        model = cv2.findHomography(start, end, cv2.USAC_MAGSAC, parameters.ransac_px, maxIters=2000, confidence=0.999)[
-            0
-        ]
+        model, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, parameters.ransac_px, None, 2000, 0.999)
     if model is None:
         return np.eye(3)
     fitted = np.zeros(0, bool)

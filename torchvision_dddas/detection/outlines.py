@@ -1,78 +1,82 @@
-"""A target's outline from two explanations of every pixel: it stands still, or it moves with the target.
+"""A target's outline: from two explanations of every pixel, spread along colours, and without its cast shadow.
 
 Pixels that only the target's motion explains are foreground, those that the background explains are background; the
 rest (flat insides, places that only one picture shows) follow their colours.
 """
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.blob_motion import Motion
-from torchvision_dddas.detection.blobs import Blob
-from torchvision_dddas.detection.domain_transform import spread
+from torchvision_dddas.detection.blobs import Blob, Box, ellipse
+from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, View
 
-_CAP = 15.0
-# The smoothing window sees this much of the surroundings, px.
+_MAX_MISFIT = 15.0  # noise units
+# How much of the surroundings is smoothed with a blob, px.
 _PAD = 24
+_WARP_FLAGS = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+
+# A shadow leaves this share of the light on the ground ...
+_LIGHT_LEFT = (0.25, 0.85)
+# ... in every colour alike, to this share of it.
+_COLOURS_ALIKE = 0.1
+# Two pictures show the same bare ground if they agree to so many grey levels.
+_GROUNDS_ALIKE = 12
+# If less than this share of the mask is left, the target itself is dark.
+_LEAST_LEFT = 0.35
+# Parts smaller than this share of the largest one left go with the shadow.
+_CRUMB = 0.15
 
 
-def refine(
-    blob: Blob,
-    motion: Motion,
-    image: np.ndarray,
-    grey: np.ndarray,
-    evidence: np.ndarray,
-    wide: np.ndarray,
-    texture: np.ndarray,
-    warped: tuple[np.ndarray, np.ndarray],
-    scale: float,
-    settings: Settings,
-) -> np.ndarray:
+def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foreground, settings: Settings) -> np.ndarray:
     """The refined mask inside the blob's box, (height, width) bool; never outside the blob's own mask.
 
-    image: (H, W, 3) or (H, W) uint8. evidence, wide: (H, W) uint8, `scale` x noise units. texture: 4 x grey levels a
-    pixel. warped: the two neighbours whose motion `motion.affine` describes, registered and in equal exposure.
+    view: the reference frame. foreground: its maps; `motion.affine` describes the motion to its warped neighbours.
     """
     x, y, width, height = blob.box
     box = blob.window
     parameters = settings.difference
-    slope = texture[box].astype(np.float32) / 4
+    slope = foreground.texture[box].astype(np.float32) / 4
     noise = np.sqrt(parameters.noise_levels**2 + (parameters.gradient_share * slope) ** 2)
-    own = grey[box]
-    still = cv2.blur(np.minimum(*(_misfit(own, w[box], noise) for w in warped)), (3, 3))
-    moved = [_moved(w, fit, motion.frame, blob.box) for w, fit in zip(warped, motion.affine, strict=True)]
-    moving = cv2.blur(np.minimum(*(_misfit(own, w, noise) for w in moved)), (3, 3))
-    near, far = evidence[box] / np.float32(scale), wide[box] / np.float32(scale)
-    foreground = np.clip((near - 2) / 2, 0, 1) * np.clip(1.5 - moving / np.maximum(still, 1), 0, 1)
+    own = view.grey[box]
+    still = cv2.blur(np.minimum(*(_misfit(own, picture[box], noise) for picture in foreground.warped)), (3, 3))
+    moved = [
+        _move_into_box(picture, affine, motion.frame, blob.box)
+        for picture, affine in zip(foreground.warped, motion.affine, strict=True)
+    ]
+    moving = cv2.blur(np.minimum(*(_misfit(own, picture, noise) for picture in moved)), (3, 3))
+    scale = np.float32(EVIDENCE_SCALE)
+    near, far = foreground.evidence[box] / scale, foreground.wide[box] / scale
+    certain = np.clip((near - 2) / 2, 0, 1) * np.clip(1.5 - moving / np.maximum(still, 1), 0, 1)
     filled = np.clip((far - 2) / 2, 0, 1) * np.clip(1.5 - moving / 2, 0, 1)
-    foreground = np.where(foreground < 0.2, np.maximum(foreground, filled), foreground) * blob.mask
+    certain = np.where(certain < 0.2, np.maximum(certain, filled), certain) * blob.mask
     background = np.clip(slope / 8, 0, 1) * np.clip(1 - near / 2, 0, 1) * np.clip(0.5 + (moving - still) / 2, 0, 1)
     background *= np.clip(1 - far / 3, 0, 1)
     background[~blob.mask] = 1
 
     left, top = max(x - _PAD, 0), max(y - _PAD, 0)
-    right, bottom = min(x + width + _PAD, grey.shape[1]), min(y + height + _PAD, grey.shape[0])
+    right, bottom = min(x + width + _PAD, view.size[0]), min(y + height + _PAD, view.size[1])
+    inside = np.s_[y - top : y - top + height, x - left : x - left + width]
     seeds = np.zeros((bottom - top, right - left, 2), np.float32)
     seeds[..., 1] = 1
-    seeds[y - top : y - top + height, x - left : x - left + width] = np.dstack([foreground, background])
+    seeds[inside] = np.dstack([certain, background])
     half = max((right - left) // 2, 1), max((bottom - top) // 2, 1)
-    guide = cv2.resize(image[top:bottom, left:right], half, interpolation=cv2.INTER_AREA)
+    guide = cv2.resize(view.image[top:bottom, left:right], half, interpolation=cv2.INTER_AREA)
     seeds = cv2.resize(seeds, half, interpolation=cv2.INTER_AREA)
-    weight = spread(seeds, guide, settings.refine.spatial_px / 2, settings.refine.colour_levels)
+    weight = smooth_along_edges(seeds, guide, settings.refine.spatial_px / 2, settings.refine.colour_levels)
     share = weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6)
     share = cv2.resize(share, (right - left, bottom - top))
-    inside = share[y - top : y - top + height, x - left : x - left + width]
-    return (inside > settings.refine.share) & blob.mask
+    return (share[inside] > settings.refine.share) & blob.mask
 
 
 def _misfit(a: np.ndarray, b: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    return np.minimum(cv2.absdiff(a, b) / noise, _CAP).astype(np.float32)
+    return np.minimum(cv2.absdiff(a, b) / noise, _MAX_MISFIT).astype(np.float32)
 
 
-def _moved(
-    picture: np.ndarray, affine: np.ndarray, frame: tuple[float, float, float], box: tuple[int, int, int, int]
-) -> np.ndarray:
+def _move_into_box(picture: np.ndarray, affine: np.ndarray, frame: tuple[float, float, float], box: Box) -> np.ndarray:
     """The part of a picture that the target's motion brings into its box."""
     x, y, width, height = box
     centre_u, centre_v, scale = frame
@@ -80,5 +84,85 @@ def _moved(
     # u + shift + by_u (u - cu) / s + by_v (v - cv) / s, with (u, v) counted from the box's corner
     linear = np.eye(2) + np.c_[by_u, by_v] / scale
     origin = np.array([x, y]) + shift + np.c_[by_u, by_v] @ np.array([x - centre_u, y - centre_v]) / scale
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(picture, np.c_[linear, origin], (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    matrix = np.c_[linear, origin]
+    return cv2.warpAffine(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
+
+
+def smooth_along_edges(
+    values: np.ndarray, guide: np.ndarray, spatial_px: float, colour_levels: float, rounds: int = 2
+) -> np.ndarray:
+    """Smooth (H, W, K) values along the flat regions of a picture, without crossing its edges.
+
+    guide: (H, W, 3) or (H, W) uint8. spatial_px: reach where the colour does not change. colour_levels: change of
+    colour, summed over the channels, that counts as much as that reach.
+    Source: the recursive domain transform, Gastal and Oliveira 2011.
+    """
+    colours = np.atleast_3d(guide).astype(np.float32)
+    colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
+    across = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=1)).sum(axis=2)
+    down = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=0)).sum(axis=2)
+    # Rows are made contiguous for either direction: each step then works on whole rows.
+    rows = np.ascontiguousarray(values, np.float32)
+    for i in range(rounds):
+        sigma = spatial_px * np.sqrt(3) * 2 ** (rounds - i - 1) / np.sqrt(4**rounds - 1)
+        decay = np.log(np.float32(np.exp(-np.sqrt(2) / sigma)))
+        columns = np.ascontiguousarray(rows.transpose(1, 0, 2))
+        _filter_both_ways(columns, np.exp(decay * across).T)
+        rows = np.ascontiguousarray(columns.transpose(1, 0, 2))
+        _filter_both_ways(rows, np.exp(decay * down))
+    return rows
+
+
+def _filter_both_ways(lines: np.ndarray, keep: np.ndarray) -> None:
+    """Over the first axis and back: each line takes the share `keep` from the line before it."""
+    keep = np.ascontiguousarray(keep)[:, :, None]
+    for i in range(1, len(lines)):
+        lines[i] += keep[i - 1] * (lines[i - 1] - lines[i])
+    for i in range(len(lines) - 2, -1, -1):
+        lines[i] += keep[i] * (lines[i + 1] - lines[i])
+
+
+def remove_shadow(
+    mask: np.ndarray,
+    box: Box,
+    image: np.ndarray,
+    grounds: Sequence[np.ndarray],
+    ground_from_image: Sequence[np.ndarray],
+) -> np.ndarray:
+    """The target's mask without its cast shadow: darker ground of unchanged colour. Unchanged where none is found.
+
+    mask: (height, width) bool inside box = x, y, width, height of image, (H, W, 3) uint8. grounds: two other frames,
+    (H, W, 3), far enough in time that the target is elsewhere in them. ground_from_image: their (3, 3) registrations.
+    """
+    if len(grounds) != 2 or any(picture.ndim != 3 for picture in [image, *grounds]):
+        return mask
+    x, y, width, height = box
+    first, second = (_warp_box(ground, matrix, box) for ground, matrix in zip(grounds, ground_from_image, strict=True))
+    bare = np.abs(first - second).max(axis=2) < _GROUNDS_ALIKE
+    light = (_smooth(image[y : y + height, x : x + width]) + 2) / ((first + second) / 2 + 2)
+    mean = light.mean(axis=2)
+    alike = np.abs(light - mean[..., None]).max(axis=2) < _COLOURS_ALIKE * mean
+    low, high = _LIGHT_LEFT
+    shadow = (bare & alike & (mean > low) & (mean < high)).astype(np.uint8)
+    shadow = cv2.morphologyEx(shadow, cv2.MORPH_OPEN, ellipse(5))
+    body = (mask & (shadow == 0)).astype(np.uint8)
+    body = cv2.morphologyEx(body, cv2.MORPH_OPEN, ellipse(3))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(body)
+    if count < 2:
+        return mask
+    kept = stats[:, cv2.CC_STAT_AREA] >= _CRUMB * stats[1:, cv2.CC_STAT_AREA].max()
+    kept[0] = False
+    left = kept[labels]
+    return left if left.sum() >= _LEAST_LEFT * mask.sum() else mask
+
+
+def _smooth(picture: np.ndarray) -> np.ndarray:
+    return cv2.blur(picture, (3, 3)).astype(np.float32)
+
+
+def _warp_box(picture: np.ndarray, picture_from_image: np.ndarray, box: Box) -> np.ndarray:
+    """The part of another frame that lies under the box, as the image sees it."""
+    x, y, width, height = box
+    matrix = picture_from_image @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1]], float)
+    warped = cv2.warpPerspective(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
+    return _smooth(warped)

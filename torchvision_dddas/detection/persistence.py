@@ -1,4 +1,4 @@
-"""Blobs over time: what is linked from frame to frame and moves steadily is a target, what flickers is not."""
+"""Persistence: blobs that are linked from frame to frame and move steadily are targets, flicker is not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,16 +46,15 @@ class Sighting:
         return np.nan_to_num([motion.velocity_px for motion in self.motions])
 
 
-def persistent(
+def find_persistent(
     sightings: Sequence[Sighting], index: int, size: tuple[int, int], parameters: PersistenceParameters
 ) -> list[bool]:
     """Which blobs of `sightings[index]` are targets, judged by up to two frames before and after it.
 
     A blob that is linked over enough frames and moves steadily in enough of them is a target. Where blobs are few, or
-    a blob is large, one link will do: parallax comes in crowds of small blobs. Weak blobs get no such leave.
-
-    size: (width, height) of the picture. Source: appendix B, S5, asks for independently moving targets; the test
-    per blob, not per pixel, is what keeps targets whole.
+    a blob is large, one link is enough, because parallax makes many small blobs. Weak blobs need the full test.
+    size: (width, height) of the picture. Source: appendix B, S5, asks for independently moving targets; we test each
+    blob and not each pixel, which keeps targets whole.
     """
     crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > parameters.trusted_blobs
     possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)

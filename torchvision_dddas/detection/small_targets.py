@@ -1,4 +1,4 @@
-"""Small slow targets: weak candidates followed over many frames, believed once they have travelled steadily."""
+"""Small slow targets: weak candidates tracked over many frames, confirmed once they have travelled steadily."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _LENGTHS, _LENGTHS_EACH = 0.25, 0.005
 
 @dataclass
 class Track:
-    """One candidate followed. points_px: (N, 2) centres, all in the coordinates of the latest frame.
+    """One candidate over time. points_px: (N, 2) centres, all in the coordinates of the latest frame.
 
     frames: their numbers. boxes: their boxes in their own frames.
     """
@@ -34,8 +34,8 @@ class Track:
     confirmed: bool = False
 
 
-def candidates(small: np.ndarray, parameters: SmallParameters) -> list[tuple[int, int, int, int]]:
-    """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to be told apart."""
+def find_candidates(small: np.ndarray, parameters: SmallParameters) -> list[tuple[int, int, int, int]]:
+    """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to tell them apart."""
     boxes: list[tuple[int, int, int, int]] = []
     for left, top, wide, high in occupied(small, 2):
         part = small[top : top + high, left : left + wide]
@@ -49,7 +49,7 @@ def candidates(small: np.ndarray, parameters: SmallParameters) -> list[tuple[int
 
 
 class SmallTracks:
-    """Remembers the candidates of past frames. Feed it every frame in order."""
+    """The tracks of candidates. Feed it every frame in order."""
 
     def __init__(self, parameters: SmallParameters) -> None:
         self.parameters = parameters
@@ -57,7 +57,7 @@ class SmallTracks:
         self.counts: deque[int] = deque(maxlen=20)
 
     def step(self, frame: int, this_from_last: np.ndarray | None, boxes: Sequence[tuple[int, int, int, int]]) -> None:
-        """Take the candidates of one frame. this_from_last: (3, 3) registration, None at a cut."""
+        """Take the candidates of one frame. this_from_last: (3, 3) registration; None at a cut drops all tracks."""
         if this_from_last is None:
             self.tracks = []
         self.counts.append(len(boxes))
@@ -117,7 +117,3 @@ class SmallTracks:
         lengths = _LENGTHS + _LENGTHS_EACH * float(np.median(self.counts))
         far = travel >= max(self.parameters.min_travel_px, lengths * length)
         track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.parameters.sureness)
-
-    def confirmed(self) -> list[Track]:
-        """The tracks believed so far."""
-        return [t for t in self.tracks if t.confirmed]

@@ -1,21 +1,25 @@
-"""The step from a frame to the next in tensors: grid keypoints, where they went, what to trust; all pairs at once."""
+"""The registration of frame pairs in tensors, all at once: keypoints, point tracking, RANSAC, refits."""
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn import functional
 
 from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.detection.engine import View
-from torchvision_dddas.detection.exposure import in_one_light
-from torchvision_dddas.detection.keypoint_grid import cell_side
-from torchvision_dddas.detection.registration_check import judged
-from torchvision_dddas.detection.torch_foreground import LEVEL, joined, levels_of
-from torchvision_dddas.detection.torch_point_tracking import follow
-from torchvision_dddas.functional import flow, keypoints
+from torchvision_dddas.detection.registration import cell_side, judge_registration, match_exposure
+from torchvision_dddas.functional import affine, consensus, flow, homography, keypoints
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
+LEVEL = 255.0
 POINTS_AT_ONCE = {"cpu": 1000, "cuda": 100_000}
+# So many points search for the motion first; the others start where it takes them.
+SCOUTS = 32
 
 
 def register(
@@ -27,7 +31,7 @@ def register(
     """
     for earlier, _ in pairs:
         _detect(earlier, parameters, device)
-    followed = [_in_one_light(earlier, later) for earlier, later in pairs]
+    followed = [_match_exposures(earlier, later) for earlier, later in pairs]
     _build_pyramids([view for pair in followed for view in pair], parameters, device)
     count = max(pairs[0][0].kept["points"].shape[1], 1)
     step = max(1, POINTS_AT_ONCE.get(device.type, 1000) // count)
@@ -42,22 +46,23 @@ def _register_at_once(
     detected: list[View], followed: list[tuple[View, View]], parameters: RegistrationParameters
 ) -> list[Registration]:
     """detected: the frames that hold the keypoints. followed: the same frames and the later ones, in one light."""
-    points, valid = (joined([view.kept[name] for view in detected]) for name in ("points", "valid"))
+    points, valid = (join_batch([view.kept[name] for view in detected]) for name in ("points", "valid"))
     earlier, later = (
-        [joined(level) for level in zip(*(pair[i].kept["pyramid"] for pair in followed), strict=True)] for i in (0, 1)
+        [join_batch(level) for level in zip(*(pair[i].kept["pyramid"] for pair in followed), strict=True)]
+        for i in (0, 1)
     )
     if points.shape[1]:
-        end, found, matrices = follow(points, valid, earlier, later, parameters)
+        end, found, matrices = track_points(points, valid, earlier, later, parameters)
         tracked = valid & found
     else:
         end, tracked, matrices = points, valid, torch.eye(3).expand(len(detected), 3, 3)
     arrays = (array.cpu().numpy() for array in (points, end, valid, tracked, matrices))
-    return [_judged(one, detected[0].size, parameters) for one in zip(*arrays, strict=True)]
+    return [_judge(one, detected[0].size, parameters) for one in zip(*arrays, strict=True)]
 
 
-def _in_one_light(earlier: View, later: View) -> tuple[View, View]:
+def _match_exposures(earlier: View, later: View) -> tuple[View, View]:
     """The pair as it is followed: where exposures differ, one of the two is a view of its own."""
-    greys = in_one_light(earlier, later)
+    greys = match_exposure(earlier, later)
     first, second = (
         view if grey is view.grey else View(view.image, grey)
         for view, grey in zip((earlier, later), greys, strict=True)
@@ -74,7 +79,7 @@ def _build_pyramids(views: list[View], parameters: RegistrationParameters, devic
     # OpenCV's rule: a level that Lucas-Kanade's window does not fit into is left out.
     while levels <= parameters.levels and smaller_side / 2**levels > parameters.window_px:
         levels += 1
-    pictures = flow.pyramid(joined([levels_of(view, device) for view in missing]), levels)
+    pictures = flow.pyramid(join_batch([levels_of(view, device) for view in missing]), levels)
     for number, view in enumerate(missing):
         view.kept["pyramid"] = [level[number : number + 1] for level in pictures]
 
@@ -93,12 +98,146 @@ def _detect(view: View, parameters: RegistrationParameters, device: torch.device
     view.kept["points"], view.kept["valid"] = step * points, valid
 
 
-def _judged(found: tuple[np.ndarray, ...], size: tuple[int, int], parameters: RegistrationParameters) -> Registration:
+def _judge(found: tuple[np.ndarray, ...], size: tuple[int, int], parameters: RegistrationParameters) -> Registration:
     start, end, valid, tracked, later_from_earlier = found
     start, end = start[tracked], end[tracked]
     if valid.sum() < 4 or len(start) < 4:
-        return judged(np.eye(3), len(start) if valid.sum() >= 4 else 0, 0, np.inf, size, parameters)
+        return judge_registration(np.eye(3), len(start) if valid.sum() >= 4 else 0, 0, np.inf, size, parameters)
     miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
     inliers = miss < parameters.ransac_px
     error = float(np.median(miss[inliers])) if inliers.any() else np.inf
-    return judged(later_from_earlier.astype(np.float64), len(start), int(inliers.sum()), error, size, parameters)
+    return judge_registration(
+        later_from_earlier.astype(np.float64), len(start), int(inliers.sum()), error, size, parameters
+    )
+
+
+def levels_of(view: View, device: torch.device) -> Tensor:
+    """(1, 1, H, W) float32 grey levels, computed once."""
+    if "levels" not in view.kept:
+        view.kept["levels"] = torch.from_numpy(view.grey)[None, None].to(device).float()
+    levels: Tensor = view.kept["levels"]
+    return levels
+
+
+def join_batch(pictures: Sequence[Tensor]) -> Tensor:
+    """One batch; a single picture is not copied."""
+    return pictures[0] if len(pictures) == 1 else torch.cat(list(pictures))
+
+
+def track_points(
+    points: Tensor, valid: Tensor, earlier: list[Tensor], later: list[Tensor], parameters: RegistrationParameters
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the points are in the later frames, which were found, and the motion (B, 3, 3) that they agree on.
+
+    A few scouts search the whole pyramid; the others start where the scouts' motion takes them, which is quicker by
+    far. Where the scouts do not agree, all points search the whole pyramid.
+    """
+    if points.shape[1] < 2 * SCOUTS:
+        return _from_nothing(points, valid, earlier, later, parameters)
+    scouts = consensus.spread(valid, SCOUTS)
+    start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
+    # Scouts only lead: whoever is not there after a few steps does not count.
+    ahead, found = flow.track(start, earlier, later, rounds=2, **_tracking(parameters, most_steps=8))
+    found = found & valid.gather(1, scouts)
+    motion = _ransac(start.double(), ahead.double(), found, parameters, parameters.hypotheses // 2, (1.5, 1.0)).float()
+    near = found & (consensus.transfer_error(motion, start, ahead) < parameters.ransac_px)
+    agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
+    end, kept, motion = torch.zeros_like(points), torch.zeros_like(valid), motion.double()
+    for choice, search in ((agreed, _from_guess), (~agreed, _from_nothing)):
+        chosen = choice.nonzero()[:, 0]
+        if len(chosen) == len(points):
+            return search(points, valid, earlier, later, parameters, motion)
+        if len(chosen):
+            pyramids = [level[chosen] for level in earlier], [level[chosen] for level in later]
+            end[chosen], kept[chosen], motion[chosen] = search(
+                points[chosen], valid[chosen], *pyramids, parameters, motion[chosen]
+            )
+    return end, kept, motion
+
+
+def _from_nothing(
+    points: Tensor,
+    valid: Tensor,
+    earlier: list[Tensor],
+    later: list[Tensor],
+    parameters: RegistrationParameters,
+    _: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Lucas-Kanade through the whole pyramid, then RANSAC."""
+    settings = _tracking(parameters) | {"rounds": 3}
+    end, found = _there_and_back(points, earlier, later, None, parameters, settings)
+    motion = _ransac(
+        points.double(), end.double(), valid & found, parameters, parameters.hypotheses, (1.5, 1.0, 0.5, 0.5)
+    )
+    return end, found, motion
+
+
+def _from_guess(
+    points: Tensor,
+    valid: Tensor,
+    earlier: list[Tensor],
+    later: list[Tensor],
+    parameters: RegistrationParameters,
+    motion: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
+    guess = consensus.transfer(motion.float(), points)
+    settings = _tracking(parameters, most_steps=10) | {"reach_px": 3}
+    end, found = _there_and_back(points, earlier[:1], later[:1], guess, parameters, settings)
+    gates_px = tuple(share * parameters.ransac_px for share in (1.5, 1.0, 0.5, 0.5))
+    model = _model(parameters)
+    refits = consensus.refitted(
+        points.double(), end.double(), valid & found, motion, gates_px, model.SAMPLE_SIZE, model.fit
+    )
+    return end, found, refits
+
+
+def _there_and_back(
+    points: Tensor,
+    earlier: list[Tensor],
+    later: list[Tensor],
+    guess: Tensor | None,
+    parameters: RegistrationParameters,
+    settings: dict[str, Any],
+) -> tuple[Tensor, Tensor]:
+    if parameters.forward_backward_px > 0:
+        return flow.forward_backward(points, earlier, later, guess, limit_px=parameters.forward_backward_px, **settings)
+    return flow.track(points, earlier, later, guess, **settings)
+
+
+def _tracking(parameters: RegistrationParameters, most_steps: int = 1000) -> dict[str, Any]:
+    return {
+        "window_px": parameters.window_px,
+        "iterations": min(parameters.iterations, most_steps),
+        "epsilon_px": parameters.epsilon_px,
+        "min_eigen": 1e-4 * LEVEL**2,
+    }
+
+
+def _model(parameters: RegistrationParameters) -> ModuleType:
+    return affine if parameters.model == "affine" else homography
+
+
+def _ransac(
+    start: Tensor,
+    end: Tensor,
+    tracked: Tensor,
+    parameters: RegistrationParameters,
+    hypotheses: int,
+    shares: tuple[float, ...],
+) -> Tensor:
+    """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own.
+
+    The refits matter most for accuracy.
+    """
+    model = _model(parameters)
+    batch, count = tracked.shape
+    if count < model.SAMPLE_SIZE:
+        return torch.eye(3, dtype=start.dtype, device=start.device).expand(batch, 3, 3)
+    # The same numbers for every pair and call: what one pair gives does not depend on its company.
+    generator = torch.Generator().manual_seed(0)
+    samples = consensus.draw_samples(generator, 1, hypotheses, count, model.SAMPLE_SIZE)
+    samples = samples.to(start.device).expand(batch, -1, -1)
+    refits = tuple(share * parameters.ransac_px for share in shares)
+    matrix: Tensor = model.ransac(start, end, tracked, samples, parameters.ransac_px, refits)[0]
+    return matrix

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from torchvision_dddas.config import DifferenceParameters, MorphologyParameters, RegistrationParameters
-from torchvision_dddas.detection.keypoint_grid import cell_side
-from torchvision_dddas.detection.torch_foreground import LEVEL, apart, seen_by_both
+from torchvision_dddas.detection import cell_side
+from torchvision_dddas.detection.torch_engine import absolute_difference, find_seen_by_both
+from torchvision_dddas.detection.torch_registration import LEVEL
 from torchvision_dddas.functional import affine, blur, consensus, flow, homography, keypoints, morphology, warp
 
 LEAST_GRID = 8  # a grid of fewer keypoints than this squared is none
@@ -43,8 +44,8 @@ class WarpDifference(nn.Module):
         first, last = warp.seen_columns(
             neighbour_from_reference, (height, width), (height, width), self.difference.border_px
         )
-        seen = seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
-        least = torch.minimum(apart(grey, warped[:1]), apart(grey, warped[1:]))
+        seen = find_seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
+        least = torch.minimum(absolute_difference(grey, warped[:1]), absolute_difference(grey, warped[1:]))
         found = blur.gaussian_levels(least, self.difference.blur_px) * seen
         core = (found > threshold).to(torch.uint8) * 255
         core = morphology.erode(core, self.morphology.erode_px, "ellipse")

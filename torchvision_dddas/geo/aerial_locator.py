@@ -25,7 +25,6 @@ from torchvision_dddas.geo.plane_homography import LEAST, absolute_covariance, l
 from torchvision_dddas.geo.plane_solvers import PlaneSolver, load_solver
 from torchvision_dddas.geo.site import Site, build_site, resolve_camera
 from torchvision_dddas.geo.terrain import ground_height, surface_of
-from torchvision_dddas.io.telemetry import at
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -164,7 +163,7 @@ class AerialLocator:
 
     def telemetry_at(self, time_s: float) -> Flight | None:
         """What the telemetry says, its altitude counted from up = 0; NaN where that is below the ground."""
-        flight = at(self.site.telemetry, time_s) if self.site.telemetry is not None else None
+        flight = self.site.telemetry.at(time_s) if self.site.telemetry is not None else None
         if flight is None:
             return None
         below, base = 0.0, 0.0

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.engine import Engine, load_engine
+from torchvision_dddas.detection import Engine, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
     AerialLocator,

@@ -8,7 +8,6 @@ from math import isfinite
 from typing import Protocol
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import at
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.pipeline import Clip
@@ -110,7 +109,7 @@ class Feed:
         """Say when the telemetry falls silent, and when it speaks again."""
         if self._log is None:
             return
-        flight = at(self._log, frame.time_s)
+        flight = self._log.at(frame.time_s)
         silent = flight is None or not isfinite(flight.altitude_m)
         if silent != self._silent:
             self._silent = silent

@@ -10,7 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.engine import Engine, View
+from torchvision_dddas.detection import Engine, View
 
 # The shorter side of the picture that is registered, at least: corners then differ by 0.1 to 0.4 px (median) from a
 # registration at full size, for 30 to 45 % of its time.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.engine import Engine
+from torchvision_dddas.detection import Engine
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.tracker import Tracker

@@ -13,19 +13,24 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.blobs import filled_hull
-from torchvision_dddas.detection.detector import Loop
-from torchvision_dddas.detection.engine import (
+from torchvision_dddas.detection import (
     EVIDENCE_CAP,
     EVIDENCE_SCALE,
     Engine,
     Foreground,
+    MotionDetector,
     View,
     Window,
+    fill_hull,
     load_engine,
 )
-from torchvision_dddas.detection.torch_engine import TorchEngine
-from torchvision_dddas.detection.torch_foreground import TEXTURED, distances, least_of, seen_by_both
+from torchvision_dddas.detection.torch_engine import (
+    TEXTURED,
+    TorchEngine,
+    compare_to_reference,
+    find_seen_by_both,
+    smaller_difference,
+)
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
@@ -253,7 +258,7 @@ def _label_regions(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
         x, y, width, height = (int(v) for v in stats[label, :4])
         window = np.s_[y : y + height, x : x + width]
         region = parts[window] == label
-        filled[window][filled_hull(region) if hull else region] = label
+        filled[window][fill_hull(region) if hull else region] = label
     if reach <= 0:
         return count - 1
     weak, weak_parts = cv2.connectedComponents((margin > -reach).astype(np.uint8), ltype=cv2.CV_32S)
@@ -323,13 +328,13 @@ def recorded(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[Recor
     """The wanted frames of a clip, in order. Raises InputError as `dddas detect` does."""
     source = opened(clip)
     engine = _Recorder(load_engine("onboard", settings), wanted)
-    loop = Loop(engine, settings, source.rate_hz)
+    loop = MotionDetector(settings, engine, source.rate_hz)
 
     def scenes() -> Iterator[Scene]:
         for frame in source:
             engine.number = frame.number
-            yield from loop.feed(frame)
-        yield from loop.end(source.last)
+            yield from loop.update(frame)
+        yield from loop.flush(source.last)
 
     for scene in scenes():
         number = scene.frame.number
@@ -371,11 +376,11 @@ class _Recorder:
 @torch.inference_mode()
 def differences_of(window: Window, settings: Settings) -> Differences:
     """A window as far as no tunable parameter has a say, on the CPU; a batch of one."""
-    grey, warped, seen, texture = TorchEngine(settings, "cpu").registered([window])
+    grey, warped, seen, texture = TorchEngine(settings, "cpu").warp_neighbours([window])
     parameters = settings.difference
-    distance = distances(window, grey, warped, parameters)
-    least = [least_of(pair, distance, warped) for pair in window.near]
-    both = [seen_by_both(seen[a], seen[b], grey.shape[-1]) for a, b in window.near]
+    distance = compare_to_reference(window, grey, warped, parameters)
+    least = [smaller_difference(pair, distance, warped) for pair in window.near]
+    both = [find_seen_by_both(seen[a], seen[b], grey.shape[-1]) for a, b in window.near]
     return Differences(
         torch.cat(least, 1).clone(),
         torch.cat(both, 1),

@@ -12,9 +12,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.config import RegistrationParameters, Settings
-from torchvision_dddas.detection.engine import Engine, load_engine
-from torchvision_dddas.detection.exposure import in_one_light
-from torchvision_dddas.detection.opencv_registration import LAST_TOLERANCE, fit, keypoints, there_and_back
+from torchvision_dddas.detection import Engine, load_engine, match_exposure
+from torchvision_dddas.detection.opencv_registration import (
+    LAST_TOLERANCE,
+    detect_keypoints,
+    fit_motion,
+    track_both_ways,
+)
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
@@ -105,11 +109,11 @@ def followed(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels: np.
     # Whatever the way back misses by: how much it may is tuned.
     freely = parameters.model_copy(update={"forward_backward_px": np.inf})
     views = engine.prepare(earlier), engine.prepare(later)
-    start = keypoints(views[0].grey, parameters, halved=parameters.redetect_frames > 1)
+    start = detect_keypoints(views[0].grey, parameters, halved=parameters.redetect_frames > 1)
     if not len(start):
         end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
     else:
-        end, found, missed_px = there_and_back(*in_one_light(*views), start, freely)
+        end, found, missed_px = track_both_ways(*match_exposure(*views), start, freely)
     # A point whose search window meets what moves is drawn along by it.
     near = cv2.dilate((labels != 0).astype(np.uint8), np.ones((parameters.window_px, parameters.window_px), np.uint8))
     column, row = start[found].astype(int).T
@@ -143,7 +147,7 @@ def _lost(pair: Step, parameters: Mapping[str, Tensor], softness: float) -> Tens
     guess = np.eye(3)
     if kept.sum() >= 4:
         start, end = (side.numpy()[kept].astype(np.float32) for side in (points.earlier_px, points.later_px))
-        guess = fit(start, end, fixed.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
+        guess = fit_motion(start, end, fixed.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
     found = refitted(
         points,
         torch.from_numpy(guess),

@@ -239,7 +239,7 @@ def _shown(
     clip: Clip, table: TrackTable, settings: Settings, interval: int
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]]:
     """Number, identities, boxes, camera's motion and histograms of each look from the first to the last with boxes."""
-    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.detection import load_engine
     from torchvision_dddas.tracking.appearance import strips
     from torchvision_dddas.tracking.camera_motion import Camera
 

@@ -8,8 +8,7 @@ import pytest
 
 from tests.evaluation.studies import world
 from torchvision_dddas.config import Settings, load_config
-from torchvision_dddas.detection.detector import run
-from torchvision_dddas.detection.engine import load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.studies.record import Source
@@ -40,7 +39,7 @@ def test_a_clip_allows_what_its_pictures_and_truth_tell(clips) -> None:
 
 def test_motion_is_what_the_loop_finds(clips) -> None:
     clip, settings = clips["masks"], load_config()
-    scenes = list(run(opened(clip), load_engine("onboard", settings), settings))
+    scenes = list(detect_motion(opened(clip), settings, "onboard"))
     found = find(clip, "motion", settings)
     assert found.looked.tolist() == [scene.frame.number for scene in scenes]
     assert len(found.frame) > 0
@@ -64,7 +63,7 @@ def test_masks_are_kept_of_frames_that_the_truth_labels_alone(clips) -> None:
 def test_tracks_of_what_was_kept_are_those_of_a_run_of_the_clip(clips, interval) -> None:
     clip, settings = clips["tracks"], load_config()
     source = opened(clip)
-    scenes = run(source, load_engine("onboard", settings), settings)
+    scenes = detect_motion(source, settings, "onboard")
     wanted = list(follow_scenes(scenes, settings, interval, source.size))
     found = found_in(clip, "tracking", settings, interval)
     assert found.looked.tolist() == [followed.number for followed in wanted]
@@ -79,7 +78,7 @@ def test_a_picture_that_cannot_be_read_stays_out_of_the_tracks_too(clips, tmp_pa
     clip.pictures[3].write_bytes(b"no picture")
     settings = load_config()
     source = opened(clip)
-    scenes = list(run(source, load_engine("onboard", settings), settings))
+    scenes = list(detect_motion(source, settings, "onboard"))
     found = find(clip, "motion", settings)
     assert any("could not be decoded" in note for note in found.notes)
     for scene, again in zip(scenes, scenes_again(clip, found), strict=True):

@@ -48,7 +48,7 @@ def plan(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
 
     Raises InputError for wrong settings, an unknown kind or back end, and where no clip is left.
     """
-    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.detection import load_engine
     from torchvision_dddas.evaluation.datasets.kinds import read
 
     settings = load_config(spec.config, spec.overrides)

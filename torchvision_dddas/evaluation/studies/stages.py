@@ -122,11 +122,10 @@ def labelled(clip: Clip) -> set[int]:
 
 def motion(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
     """What moves: `dddas detect`."""
-    from torchvision_dddas.detection.detector import run
-    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.detection import detect_motion
 
     source, wanted = opened(clip), labelled(clip)
-    rows = scenes_kept(run(source, load_engine(backend, settings), settings), wanted, tick)
+    rows = scenes_kept(detect_motion(source, settings, backend), wanted, tick)
     rows.notes += [str(problem) for problem in source.problems]
     return rows
 
@@ -190,7 +189,7 @@ def true_boxes(clip: Clip, interval: int) -> "DetectionTable":
 
 def _followed(clip: Clip, table: "DetectionTable", settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
     """A table along the clip's pictures, or alone where it has none."""
-    from torchvision_dddas.detection.engine import load_engine
+    from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.detection_tables import check_table
     from torchvision_dddas.tracking.sequence import follow_clip, follow_table
 

@@ -3,7 +3,6 @@
 Own tables, DJI's subtitles, MAVLink and PX4 logs, MISB ST 0601 inside MPEG-TS, NMEA 0183.
 """
 
-from torchvision_dddas.io.telemetry.interpolation import at, check_overlap
 from torchvision_dddas.io.telemetry.reading import read_telemetry
 
-__all__ = ["at", "check_overlap", "read_telemetry"]
+__all__ = ["read_telemetry"]

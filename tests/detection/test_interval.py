@@ -1,0 +1,149 @@
+"""The interval rule, and the sizes that targets may have at an altitude, by hand."""
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
+from torchvision_dddas.detection.interval import (
+    AltitudeSettings,
+    Gates,
+    adjust_interval,
+    follow_altitude,
+    interval_from_flow,
+    interval_from_telemetry,
+    pixels_per_metre,
+    settings_at,
+)
+
+PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
+BASE = with_parameters(
+    Settings(),
+    {
+        "gates.min_area_px": 300,
+        "gates.focal_px": 1000.0,
+        "gates.expected_size_m": 2.0,
+        "gates.expected_share": 0.1,
+        "gates.min_size_m": 0.5,
+        "gates.max_size_m": 10.0,
+        "gates.max_speed_m_s": 30.0,
+        "small.min_area_px": 12,
+        "small.max_box_px": 1600,
+        "small.on": True,
+    },
+)
+
+
+@pytest.mark.parametrize(
+    ("altitude", "speed", "rate", "interval"),
+    [(20, 5, 10, 1), (40, 5, 10, 2), (20, 2.5, 10, 2), (20, 5, 30, 3), (60, 10, 20, 3)],
+)
+def test_the_interval_is_one_at_the_reference_and_proportional_to_altitude_rate_and_one_over_speed(
+    altitude, speed, rate, interval
+):
+    assert interval_from_telemetry(altitude, speed, rate, PARAMETERS) == pytest.approx(interval)
+
+
+def test_the_interval_from_flow_is_inverse_to_the_median_flow_and_independent_of_the_picture_size():
+    once = interval_from_flow([12.8], 640, PARAMETERS)
+    assert once == pytest.approx(PARAMETERS.reference_flow / 0.02)
+    assert interval_from_flow([6.4], 640, PARAMETERS) == pytest.approx(2 * once)
+    assert interval_from_flow([25.6], 1280, PARAMETERS) == pytest.approx(once)
+    assert interval_from_flow([5, 5, 5, 5, 300], 640, PARAMETERS) == interval_from_flow([5], 640, PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "interval"),
+    [
+        (0.0, 1),
+        (1.4, 1),
+        (3.6, 4),
+        (500, 12),
+        (1e30, 12),
+        (interval_from_telemetry(100, 0.0, 10, PARAMETERS), 12),  # hovering
+        (interval_from_flow([0.0], 640, PARAMETERS), 12),  # a still camera
+    ],
+)
+def test_the_interval_is_rounded_and_bounded(wanted, interval):
+    assert adjust_interval(1, 7, wanted, "", PARAMETERS)[0] == interval
+
+
+def test_a_change_is_recorded_with_its_cause_and_no_change_is_not():
+    new, (record,) = adjust_interval(7, 3, 6.1, "altitude 90 m", PARAMETERS)
+    found = (new, record.frame, record.parameter, record.old, record.new, record.cause)
+    assert found == (6, 7, "interval.frames", 3, 6, "altitude 90 m")
+    assert adjust_interval(7, 3, 3.2, "", PARAMETERS) == (3, ())
+
+
+def test_noise_around_the_middle_between_two_intervals_does_not_make_it_flutter():
+    current, changes = 3, 0
+    for k in range(40):
+        current, records = adjust_interval(k, current, 3.5 + 0.2 * (-1) ** k, "", PARAMETERS)
+        changes += len(records)
+    assert changes == 0
+
+
+def test_gates_are_metric_bounds_times_focal_over_altitude():
+    assert settings_at(50.0, 10.0, BASE).gates == Gates(min_size_px=10.0, max_size_px=200.0, max_speed_px=60.0)
+    assert settings_at(50.0, 30.0, BASE).gates.max_speed_px == pytest.approx(20.0)
+    assert settings_at(100.0, 10.0, BASE).gates == Gates(5.0, 100.0, 30.0)
+
+
+@pytest.mark.parametrize("altitude", [0.0, -3.0, 0.5])
+def test_on_the_ground_the_scale_stays_finite(altitude):
+    assert pixels_per_metre(altitude, 800.0) == 800.0
+
+
+@pytest.mark.parametrize(
+    ("box", "velocity", "passes"),
+    [
+        ((20, 40), (3, 4), True),
+        ((9, 9), (0, 0), False),
+        ((9, 10), (0, 0), True),
+        ((10, 201), (0, 0), False),
+        ((20, 40), (0, 60.5), False),
+        ((20, 40), (np.nan, np.nan), True),
+    ],
+)
+def test_the_longer_side_and_the_speed_decide(box, velocity, passes):
+    assert Gates(10.0, 200.0, 60.0).admit(box[0], box[1], np.array(velocity)) is passes
+
+
+@pytest.mark.parametrize(("altitude", "area"), [(50.0, 160), (10.0, 300), (500.0, 12)])
+def test_the_expected_size_sets_the_smallest_area_between_its_bounds(altitude, area):
+    """2 m at 1000 px focal length are 2000 / altitude px; a tenth of its square at 50 m is 160 px."""
+    assert settings_at(altitude, 10, BASE).settings.gates.min_area_px == area
+
+
+def test_the_small_path_is_on_while_targets_are_expected_to_fit_its_boxes():
+    assert settings_at(50.5, 10, BASE).settings.small.on
+    assert not settings_at(49.5, 10, BASE).settings.small.on
+    assert not settings_at(200.0, 10, with_parameters(BASE, {"small.on": False})).settings.small.on
+
+
+def test_gaps_are_closed_in_metres_where_that_is_wanted_and_never_wider_than_in_pixels():
+    base = with_parameters(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
+    closes = [settings_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
+    assert closes == [base.morphology.close_px, 17, 4]
+    assert settings_at(200.0, 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
+
+
+def test_nothing_else_of_the_settings_changes_with_the_altitude():
+    there = settings_at(90.0, 10, BASE).settings
+    back = {"gates.min_area_px": BASE.gates.min_area_px, "small.on": BASE.small.on}
+    assert with_parameters(there, back) == BASE
+
+
+def test_settings_move_only_when_the_altitude_has_changed_by_a_fifth_or_is_lost():
+    current, first = follow_altitude(1, AltitudeSettings(BASE), 100.0, 10, BASE)
+    assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
+    assert all("altitude 100.0 m" in record.cause for record in first)
+    assert follow_altitude(2, current, 119.0, 10, BASE) == (current, ())
+    higher, records = follow_altitude(3, current, 121.0, 10, BASE)
+    assert higher.altitude_m == 121.0
+    bound = next(record for record in records if record.parameter == "gates.max_size_px")
+    assert bound.new == pytest.approx(bound.old * 100 / 121)
+    assert "was 100.0 m" in bound.cause
+    after, records = follow_altitude(9, current, None, 10, BASE)
+    assert after == AltitudeSettings(BASE)
+    assert {record.cause for record in records} == {"no telemetry for this frame"}
+    assert follow_altitude(10, after, None, 10, BASE) == (after, ())

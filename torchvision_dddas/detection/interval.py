@@ -1,0 +1,137 @@
+"""What flight and scene decide about detection: the interval between frames, and the sizes that targets may have."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
+from torchvision_dddas.types import Adjustment
+
+# A smaller relative change of altitude does not move the gates.
+_ALTITUDE_STEP = 0.2
+
+
+def interval_from_telemetry(
+    altitude_m: float, speed_m_s: float, rate_hz: float, parameters: IntervalParameters
+) -> float:
+    """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
+
+    Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz. The lowest speed, which keeps the
+    interval of a hovering vehicle finite, is ours.
+    """
+    speed = max(speed_m_s, parameters.lowest_speed_m_s)
+    by_height = altitude_m / parameters.reference_altitude_m * parameters.reference_speed_m_s / speed
+    return by_height * rate_hz / parameters.reference_rate_hz * parameters.cost
+
+
+def interval_from_flow(flows_px: Sequence[float], width: int, parameters: IntervalParameters) -> float:
+    """The same without telemetry: the background flow is proportional to S / (A R), so its inverse replaces A R / S.
+
+    flows_px: median background flow of the latest steps, pixels a frame. width: of the picture, pixels.
+    """
+    flow = float(np.median(flows_px)) / width
+    return parameters.reference_flow / max(flow, 1e-4) * parameters.cost
+
+
+def adjust_interval(
+    frame: int, current: int, wanted: float, cause: str, parameters: IntervalParameters
+) -> tuple[int, tuple[Adjustment, ...]]:
+    """The interval from this frame on, rounded and within its bounds, and the record of its change, if any.
+
+    A change by one frame happens only when the rule is a quarter of a frame past the middle, so that noise does not
+    make the interval flutter.
+    """
+    new = int(np.clip(round(min(wanted, 1e6)), parameters.minimum_frames, parameters.maximum_frames))
+    if new == current or (
+        abs(new - current) == 1 and abs(wanted - current) < 0.75 and parameters.minimum_frames <= current
+    ):
+        return current, ()
+    return new, (Adjustment(frame, "interval.frames", current, new, cause),)
+
+
+@dataclass(frozen=True)
+class Gates:
+    """Bounds of a target: the longer side of its box in pixels, its speed over the background in pixels a frame."""
+
+    min_size_px: float = 0.0
+    max_size_px: float = float("inf")
+    max_speed_px: float = float("inf")
+
+    def admit(self, width_px: float, height_px: float, velocity_px: np.ndarray) -> bool:
+        """Whether a target of this box and velocity passes. An unknown (NaN) velocity passes."""
+        size, speed = max(width_px, height_px), float(np.hypot(*velocity_px))
+        return self.min_size_px <= size <= self.max_size_px and not speed > self.max_speed_px
+
+
+@dataclass(frozen=True)
+class AltitudeSettings:
+    """What the altitude decides. altitude_m, gates: None without telemetry.
+
+    settings: those of the user with `gates.min_area_px`, `small.on` and `morphology.close_px` chosen for the altitude.
+    """
+
+    settings: Settings
+    altitude_m: float | None = None
+    gates: Gates | None = None
+
+    def values(self) -> dict[str, float]:
+        """The numbers in force, by name."""
+        gates = self.gates or Gates()
+        return {
+            "gates.min_area_px": self.settings.gates.min_area_px,
+            "small.on": float(self.settings.small.on),
+            "morphology.close_px": self.settings.morphology.close_px,
+            "gates.min_size_px": gates.min_size_px,
+            "gates.max_size_px": gates.max_size_px,
+            "gates.max_speed_px": gates.max_speed_px,
+        }
+
+
+def pixels_per_metre(altitude_m: float, focal_px: float) -> float:
+    """Scale of the ground straight below. An altitude below 1 m counts as 1 m, so that it stays finite on landing."""
+    return focal_px / max(altitude_m, 1.0)
+
+
+def settings_at(altitude_m: float, rate_hz: float, base: Settings) -> AltitudeSettings:
+    """The settings and gates for an altitude above ground (appendix A, and the baseline of appendix B).
+
+    A target measures e = expected_size_m x focal / altitude pixels when the camera looks straight down. Obliquely the
+    far side of the picture is smaller, so the bounds are meant to be wide. The smallest area is expected_share x e^2,
+    between that of the small path and the user's. The small path is on while e^2 is at most its largest box. Gaps of
+    close_m, if it is set, are closed up to close_px, which would join ever more from a greater height.
+    """
+    gates, small, close_px = base.gates, base.small, base.morphology.close_px
+    scale = pixels_per_metre(altitude_m, gates.focal_px)
+    square = (gates.expected_size_m * scale) ** 2
+    if base.morphology.close_m:
+        close_px = int(np.clip(round(base.morphology.close_m * scale), 1, close_px))
+    chosen = {
+        "gates.min_area_px": int(min(gates.min_area_px, max(small.min_area_px, round(gates.expected_share * square)))),
+        "small.on": small.on and square <= small.max_box_px,
+        "morphology.close_px": close_px,
+    }
+    bounds = Gates(gates.min_size_m * scale, gates.max_size_m * scale, gates.max_speed_m_s * scale / rate_hz)
+    return AltitudeSettings(with_parameters(base, chosen), altitude_m, bounds)
+
+
+def follow_altitude(
+    frame: int, current: AltitudeSettings, altitude_m: float | None, rate_hz: float, base: Settings
+) -> tuple[AltitudeSettings, tuple[Adjustment, ...]]:
+    """The settings from this frame on, and the record of what changed.
+
+    They change when the altitude has changed by a fifth since their last change, or became known or unknown.
+    """
+    before_m = current.altitude_m
+    if altitude_m is None:
+        if before_m is None:
+            return current, ()
+        new, cause = AltitudeSettings(base), "no telemetry for this frame"
+    else:
+        if before_m is not None and abs(altitude_m - before_m) <= _ALTITUDE_STEP * max(before_m, 1.0):
+            return current, ()
+        new, cause = settings_at(altitude_m, rate_hz, base), f"altitude {altitude_m:.1f} m"
+        cause += "" if before_m is None else f", was {before_m:.1f} m"
+    old = current.values()
+    changed = {name: value for name, value in new.values().items() if value != old[name]}
+    return new, tuple(Adjustment(frame, name, old[name], value, cause) for name, value in changed.items())
