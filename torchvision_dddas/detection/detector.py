@@ -208,8 +208,10 @@ class MotionDetector:
         self.settings = self.engine.parameters = settings
         self._memory = max(self._memory, _memory_frames(settings))
         altitude_m = self._altitude.altitude_m
-        known = altitude_m is not None
-        self._altitude = settings_at(altitude_m, self.rate_hz, settings) if known else AltitudeSettings(settings)
+        if altitude_m is None:
+            self._altitude = AltitudeSettings(settings)
+        else:
+            self._altitude = settings_at(altitude_m, self.rate_hz, settings)
 
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """As `update`, one scene at a time."""

@@ -60,7 +60,7 @@ def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foregroun
     left, top = max(x - _PAD, 0), max(y - _PAD, 0)
     right, bottom = min(x + width + _PAD, view.size[0]), min(y + height + _PAD, view.size[1])
     inside = np.s_[y - top : y - top + height, x - left : x - left + width]
-    seeds = np.zeros((bottom - top, right - left, 2), np.float32)
+    seeds: np.ndarray = np.zeros((bottom - top, right - left, 2), np.float32)
     seeds[..., 1] = 1
     seeds[inside] = np.dstack([certain, background])
     half = max((right - left) // 2, 1), max((bottom - top) // 2, 1)
