@@ -12,7 +12,7 @@ from torchvision_dddas.geo.colours import ColourFinder
 from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
 from torchvision_dddas.geo.plane_homography import LEAST
 from torchvision_dddas.geo.projection import distort_pixels, project
-from torchvision_dddas.geometry import parts_of, transfer
+from torchvision_dddas.geometry import connected_parts, transfer
 from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, LandmarkObservations, Landmarks, Scene
 
 # A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.
@@ -229,7 +229,7 @@ def cut_out_landmarks(
             continue
         # What a vehicle's own blob leaves outside is as a rule its shadow.
         least = max(least_px * (_VEHICLE_REST if vehicles[row] else 1), 1)
-        parts = parts_of(left, (max(x, 0), max(y, 0), width, height), least) if touched else []
+        parts = connected_parts(left, (max(x, 0), max(y, 0), width, height), least) if touched else []
         if not touched:
             parts = [((x, y, width, height), whole)]
         for box, part in parts:
