@@ -21,10 +21,11 @@ import report
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics import detection, segmentation
+from torchvision_dddas.evaluation.metrics import boxes as detection
+from torchvision_dddas.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.pixels import Pixels
 from torchvision_dddas.io.sources import open_source
 
 Found = tuple[np.ndarray, np.ndarray]

@@ -22,9 +22,10 @@ from footage import film_of, sequences, truth_of
 
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.evaluation.metrics import clear, identity, windows
+from torchvision_dddas.evaluation.metrics import accuracy_ratio as windows
+from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
-from torchvision_dddas.evaluation.metrics.windows import Windows
+from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.sequence import Follower
@@ -78,8 +79,8 @@ def measured(place: Path, clip: Path | None, interval: int, settings: Settings) 
     for phase, found in enumerate(tracks):
         both = pair(truth.at((truth.frame - 1) % interval == phase), found)
         links = [known.plus(windows.count(both, interval, size)) for known, size in zip(links, (2, 3), strict=True)]
-        switches.append(clear.count(both, SAME).switches)
-        idf1.append(100 * identity.measures(identity.count(both, SAME))["idf1"])
+        switches.append(tracking.count_clear(both, SAME).switches)
+        idf1.append(100 * tracking.identity_measures(tracking.count_identity(both, SAME))["idf1"])
     ratios = " | ".join(f"{100 * known.mean:.2f}" for known in links)
     spread = f"{np.mean(switches):.1f} ({max(switches)}) | {np.mean(idf1):.1f} ({min(idf1):.1f})"
     return f"{links[1].windows} | {ratios} | {spread} | {100 * looked:.0f}"

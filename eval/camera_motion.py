@@ -26,7 +26,7 @@ from synthetic import LEAST_PX, SIZE, render
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import detect_motion, load_engine
-from torchvision_dddas.evaluation.metrics import clear, identity
+from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import ONE_TARGET_LEAST
@@ -106,8 +106,8 @@ def _detections(truth: TrackTable) -> DetectionTable:
 
 def _switches_and_idf1(truth: TrackTable, found: TrackTable) -> str:
     both = pair(truth, found)
-    idf1 = identity.measures(identity.count(both))["idf1"]
-    return f"{clear.count(both, LEAST).switches} / {100 * idf1:.1f}"
+    idf1 = tracking.identity_measures(tracking.count_identity(both))["idf1"]
+    return f"{tracking.count_clear(both, LEAST).switches} / {100 * idf1:.1f}"
 
 
 # -- own detections --------------------------------------------------------------------------------------------------
@@ -134,8 +134,8 @@ def _own(found: list[Scene], truth: TrackTable, told: Told, interval: int, size:
     tracks = _table(follow_scenes((_less(scene, told, size) for scene in found), load_config(), interval, size))
     # Elsewhere nothing is labelled, so that nothing there is wrong.
     both = pair(truth, tracks.at(np.isin(tracks.frame, truth.frame)))
-    switches = clear.count(both, ONE_TARGET_LEAST).switches
-    right = identity.count(both, ONE_TARGET_LEAST).idtp / max(len(truth.frame), 1)
+    switches = tracking.count_clear(both, ONE_TARGET_LEAST).switches
+    right = tracking.count_identity(both, ONE_TARGET_LEAST).idtp / max(len(truth.frame), 1)
     return f"{switches}, {100 * right:.0f} %, {len(np.unique(tracks.identity))}"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from torchvision_dddas import config as parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels, count, measures
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, count, measures
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from footage import frames_of, has_pictures, truth_of
 
-from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.boxes import iou
 
 CLIPS = ("PETS09-S2L1", "TUD-Stadtmitte")
 SAME = 0.5

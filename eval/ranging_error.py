@@ -24,7 +24,7 @@ from footage import truth_of
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from torchvision_dddas.config import GroundParameters
-from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.types import Camera, Poses, Sightings

@@ -18,7 +18,7 @@ from sim_runs import Case, Over, finish, options, pyplot, run_all, table
 from sim_scenes import Kept, usual, walking
 
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics import segmentation
+from torchvision_dddas.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import FrameResult, TrackedFrame, Tracks

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import report
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.metrics.segmentation import ratio
+from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.geo.colour_calibration import build_ranges, find_samples, hue_difference, pool_samples, to_hsv
 from torchvision_dddas.geo.colours import OpenCVColourFinder
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Fault, Scenario, Shot, Simulator

@@ -29,8 +29,7 @@ import report
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.evaluation.datasets import inria, motchallenge
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.detection import iou
-from torchvision_dddas.evaluation.metrics.ranking import judged
+from torchvision_dddas.evaluation.metrics.boxes import iou, judged
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of

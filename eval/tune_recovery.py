@@ -26,8 +26,8 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics import segmentation
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.evaluation.metrics.pixels import Pixels
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.tuning.descent import Plan, descend

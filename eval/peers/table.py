@@ -28,7 +28,7 @@ import report
 from footage import sequences
 
 from torchvision_dddas.evaluation.datasets import motchallenge
-from torchvision_dddas.evaluation.metrics import clear, hota, identity, mot_text, tracking
+from torchvision_dddas.evaluation.metrics import tracking, truth
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
@@ -136,7 +136,7 @@ def read(data: Path) -> list[Sequence]:
     """The sequences, as long as seqinfo.ini says, or as their truth where there is none."""
     found = []
     for clip in map(motchallenge.sequence, sequences(data)):
-        scores = mot_text.read_rows(clip.given, "detections").mark if clip.given else np.full(1, np.nan)
+        scores = truth.read_rows(clip.given, "detections").mark if clip.given else np.full(1, np.nan)
         probable = bool(((scores >= 0) & (scores <= 1)).all())
         film = clip.pictures[0] if len(clip.pictures) == 1 else None
         assert clip.truth is not None
@@ -159,8 +159,7 @@ def run_peer(
     ]
     seconds_of(peer, jobs, folder)
     return [
-        [mot_text.read_rows(folder / f"{k}-{i}.txt", "tracks").table for i in range(len(files))]
-        for k in range(len(tried))
+        [truth.read_rows(folder / f"{k}-{i}.txt", "tracks").table for i in range(len(files))] for k in range(len(tried))
     ]
 
 
@@ -176,7 +175,7 @@ def run_ours(boxes: Path, interval: int, folder: Path, clip: Path | None = None)
     words = ["-c", "from torchvision_dddas.cli import main; main()", "track", *([str(clip)] if clip else [])]
     words += ["--detections", str(boxes), "--interval", str(interval), "--out", str(folder / "ours"), "--quiet"]
     subprocess.run([sys.executable, *words, *(["--save", "none"] if clip else [])], check=True)
-    return mot_text.read_rows(folder / "ours/tracks.txt", "tracks").table
+    return truth.read_rows(folder / "ours/tracks.txt", "tracks").table
 
 
 def grid(choices: dict[str, list]) -> Iterable[Settings]:
@@ -233,8 +232,8 @@ def by_clip(sequences: list[Sequence], tracks: list[TrackTable], interval: int) 
     for sequence, found in zip(sequences, tracks, strict=True):
         assert sequence.truth.tracks is not None
         clip = pair(sequence.truth.tracks.every(interval), found)
-        idf1 = identity.measures(identity.count(clip, SAME))["idf1"]
-        scores[sequence.name] = [clear.count(clip, SAME).switches, 100 * idf1]
+        idf1 = tracking.identity_measures(tracking.count_identity(clip, SAME))["idf1"]
+        scores[sequence.name] = [tracking.count_clear(clip, SAME).switches, 100 * idf1]
     return scores
 
 
@@ -276,7 +275,7 @@ def pooled(sequences: list[Sequence], tracks: list[TrackTable]) -> dict:
     for sequence, found in zip(sequences, tracks, strict=True):
         assert sequence.truth.tracks is not None
         clip = pair(sequence.truth.tracks, found)
-        counts = TrackCounts(clear.count(clip), identity.count(clip), hota.count(clip))
+        counts = TrackCounts(tracking.count_clear(clip), tracking.count_identity(clip), tracking.count_hota(clip))
         clips[sequence.name] = figures_of(counts)
         total = total.plus(counts)
     return {**figures_of(total), "clips": clips}

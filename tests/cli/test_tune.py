@@ -15,7 +15,7 @@ from tests.evaluation.studies.world import filmed, study
 from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.metrics import paired
+from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.tuning import costing, family
 
 THRESHOLD = "difference.threshold"
@@ -35,7 +35,7 @@ def asked(clips: Path, *words: str, bowl: Bowl | None = None):
     """Run the command with a bowl as the family of motion."""
     with pytest.MonkeyPatch.context() as here:
         # Fewer samples than in earnest: what is tested here is no interval.
-        here.setattr(paired, "effects", partial(paired.effects, resamples=40, most=40))
+        here.setattr(bootstrap, "effects", partial(bootstrap.effects, resamples=40, most=40))
         here.setattr(family, "family_of", lambda name: bowl or Bowl(place=math.log(6)))
         return CliRunner().invoke(app, ["tune", str(clips), "--cache", str(clips.parent / "cache"), *words])
 

@@ -97,11 +97,11 @@ def _detections(path: Path) -> None:
 
 
 def _truth(path: Path) -> None:
-    from torchvision_dddas.evaluation.metrics import results, truth
+    from torchvision_dddas.evaluation.metrics import clip, truth
 
     found = truth.load(path)
     _ = found.frames
-    results.load(path)
+    clip.load(path)
 
 
 def _evaluated(path: Path) -> None:
@@ -125,11 +125,11 @@ def _clip(without: str) -> Mapping[str, bytes]:
 
 
 def _record(path: Path) -> None:
-    from torchvision_dddas.evaluation.metrics import results
+    from torchvision_dddas.evaluation.metrics import clip
     from torchvision_dddas.io.output import run_record as journal
 
     journal.read(path.parent)
-    results.load(path.parent)
+    clip.load(path.parent)
 
 
 def _positions(path: Path) -> None:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels, measures
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, measures
 from torchvision_dddas.tuning.motion import LOSSES as BY_NAME
 from torchvision_dddas.tuning.motion import dice_loss, f_loss, focal_loss
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torchvision_dddas.config import PeopleParameters
-from torchvision_dddas.evaluation.metrics.detection import areas, iou
+from torchvision_dddas.evaluation.metrics.boxes import areas, iou
 from torchvision_dddas.people.boxes import body, probability
 from torchvision_dddas.tuning.people import bodies, doubt, soft_f
 

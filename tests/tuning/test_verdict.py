@@ -7,7 +7,7 @@ import pytest
 
 from tests.evaluation.studies.world import filmed, study
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.evaluation.metrics import paired
+from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.studies.goals import goal_of, value_of
 from torchvision_dddas.evaluation.studies.running import run_study
 from torchvision_dddas.evaluation.studies.spec import read_spec
@@ -30,7 +30,7 @@ def clips(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def found(clips) -> Verdict:
     with pytest.MonkeyPatch.context() as here:
-        here.setattr(paired, "effects", partial(paired.effects, resamples=40, most=200))
+        here.setattr(bootstrap, "effects", partial(bootstrap.effects, resamples=40, most=200))
         spec = read_spec(clips)
         return judge(spec, clips.parent, GOAL, KNOBS, ("one", "two"), ("held",), 0, clips.parent / "cache")
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics import results
+from torchvision_dddas.evaluation.metrics import clip
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.clip import How, score_clip
 from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
@@ -30,7 +30,7 @@ def evaluate(
     notes: list[str] = []
     clips = {}
     for name, (true_place, found_place) in _pairs(truth, result, notes).items():
-        clips[name] = score_clip(truths.load(true_place, first_frame), results.load(found_place), how, notes)
+        clips[name] = score_clip(truths.load(true_place, first_frame), clip.load(found_place), how, notes)
     scored = {name: {"frames": clip.frames, **figures(clip.counts)} for name, clip in clips.items()}
     report = {"clips": scored, "notes": notes}
     if len(clips) > 1:
@@ -44,16 +44,16 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
     for place, what in ((truth, "truth"), (result, "result")):
         if not place.exists():
             raise InputError(f"no {what} at {place}")
-    if truths.find(truth) is not None or results.is_result(result):
+    if truths.find(truth) is not None or clip.is_result(result):
         name = result.resolve()
         return {name.stem if result.is_file() else name.name: (truth, result)}
     names = sorted(p.name for p in truth.iterdir() if p.is_dir()) if truth.is_dir() else []
-    places = {n: p for n in names for p in (result / f"{n}.txt", result / n) if results.is_result(p)}
+    places = {n: p for n in names for p in (result / f"{n}.txt", result / n) if clip.is_result(p)}
     pairs = {n: (truth / n, p) for n, p in places.items() if truths.find(truth / n) is not None}
     if not pairs:
         raise InputError(
             f"no clip to score: no folder in {truth} that holds masks, boxes or tracks has its like in {result} "
-            f"with a {results.DETECTIONS} or {results.TRACKS}"
+            f"with a {clip.DETECTIONS} or {clip.TRACKS}"
         )
     notes += [f"{n}: no result, not scored" for n in names if n not in places]
     notes += [f"{n}: no truth, not scored" for n in places if n not in pairs]

@@ -13,9 +13,8 @@ from torch.nn import functional
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics import uncounted
-from torchvision_dddas.evaluation.metrics.detection import areas, iou
-from torchvision_dddas.evaluation.metrics.ranking import SAME, judged
+from torchvision_dddas.evaluation.metrics.boxes import SAME, areas, iou, judged
+from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.functional.threshold import step
@@ -139,7 +138,7 @@ def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer
 
 
 def _counted(truth: Truth, number: int, box_px: np.ndarray) -> np.ndarray:
-    return uncounted.counted(truth, np.full(len(box_px), number), box_px)
+    return counted(truth, np.full(len(box_px), number), box_px)
 
 
 def _whose(box_px: np.ndarray, right: np.ndarray, truth_px: np.ndarray) -> np.ndarray:

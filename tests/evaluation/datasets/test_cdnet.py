@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.evaluation.datasets.layouts import clip, complaint, mask, pictures, read, text
-from torchvision_dddas.evaluation.metrics import segmentation
+from torchvision_dddas.evaluation.metrics import pixels
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 
 REGIONS = {(0, 0, 4, 24): 85, (10, 10, 6, 6): 170, (11, 11, 4, 4): 255, (20, 10, 3, 3): 50}
@@ -38,7 +38,7 @@ def test_shadow_is_background_and_unknown_and_outside_do_not_count(tmp_path: Pat
     labels = labels_of(truth, 4)
     assert [labels[y, x] for y, x in ((0, 0), (10, 10), (11, 20), (20, 30), (12, 12))] == [-1, -1, 0, 0, 255]
     everything = np.ones(labels.shape, np.uint8)
-    counts = segmentation.count(everything, labels)
+    counts = pixels.count(everything, labels)
     assert counts == (16, 32 * 24 - 4 * 24 - 36, 0, 0)
     assert not truth.labels.separate
 

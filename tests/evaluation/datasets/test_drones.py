@@ -8,7 +8,7 @@ import pytest
 from tests.evaluation.datasets.layouts import complaint, read, text, video
 from tests.evaluation.datasets.numbered import line_of, numbered
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.uncounted import counted
+from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 
 # -- VisDrone ----------------------------------------------------------------------------------------------------------
 

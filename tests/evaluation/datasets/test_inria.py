@@ -8,7 +8,7 @@ import pytest
 from tests.evaluation.datasets.layouts import complaint, pictures, read, text
 from tests.evaluation.datasets.numbered import line_of
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.pascal import read_annotation
+from torchvision_dddas.evaluation.datasets.inria import read_annotation
 
 HEAD = (
     '# PASCAL Annotation Version 1.00\n\nImage filename : "Test/pos/{name}.png"\n'

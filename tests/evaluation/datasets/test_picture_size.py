@@ -8,7 +8,7 @@ import pytest
 
 from tests.evaluation.datasets.layouts import pictures
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.picture_size import size_of
+from torchvision_dddas.evaluation.datasets.files import size_of
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".ppm", ".pgm", ".webp", ".tif"])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.evaluation.metrics import bootstrap, paired
+from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Stratum
 
 
@@ -91,7 +91,7 @@ def test_the_same_content_gives_the_same_interval_and_another_seed_another():
 
 def changed(first, second, strata, seed=0, resamples=2, most=200):
     values = np.concatenate([first, second])
-    return paired.effects(mean_of(values), strata, seed, resamples, most)["mean"]
+    return bootstrap.effects(mean_of(values), strata, seed, resamples, most)["mean"]
 
 
 def test_no_change_is_called_a_change_as_seldom_as_it_should_be():
@@ -128,6 +128,6 @@ def test_p_values_of_few_clips_are_exact():
 
 
 def test_holm_by_hand():
-    adjusted = paired.holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
+    adjusted = bootstrap.holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": float("nan")})
     assert [adjusted[k] for k in "abc"] == pytest.approx([0.03, 0.06, 0.06])
     assert np.isnan(adjusted["d"])

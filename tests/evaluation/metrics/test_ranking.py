@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.evaluation.metrics import ranking
-from torchvision_dddas.evaluation.metrics.ranking import RATES, judged
+from torchvision_dddas.evaluation.metrics import boxes
+from torchvision_dddas.evaluation.metrics.boxes import RATES, judged
 
 
 def ranked(score, right, true, images=1.0):
     unit = np.zeros(len(score), np.int64)
     args = np.array(score, float), np.array(right, float), unit, np.array([float(true)]), np.array([float(images)])
-    return ranking.ranking(*args)
+    return boxes.ranking(*args)
 
 
 def test_average_precision_by_hand():
@@ -72,9 +72,9 @@ def test_a_weight_of_two_is_the_unit_twice(seed):
     rng = np.random.default_rng(seed)
     score, right, unit = rng.random(30), rng.integers(0, 2, 30).astype(float), rng.integers(0, 3, 30)
     true = np.array([9.0, 30.0, 4.0])
-    once = ranking.ranking(score, right, unit, true).measures(np.array([2.0, 0.0, 1.0]))
+    once = boxes.ranking(score, right, unit, true).measures(np.array([2.0, 0.0, 1.0]))
     rows = np.concatenate([np.flatnonzero(unit == k) for k in (0, 0, 2)])
-    twice = ranking.ranking(score[rows], right[rows], np.zeros(len(rows), np.int64), np.array([22.0]), np.array([3.0]))
+    twice = boxes.ranking(score[rows], right[rows], np.zeros(len(rows), np.int64), np.array([22.0]), np.array([3.0]))
     assert once == pytest.approx(twice.measures())
 
 

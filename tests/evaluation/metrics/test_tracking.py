@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import evaluate
-from torchvision_dddas.evaluation.metrics import clear, hota, tracking
+from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
 
@@ -98,7 +98,7 @@ def test_boxes_below_the_least_overlap_are_false_and_missed():
     assert tracking.measures(counts)["mota"] == -1
     # Found at alpha .05 to .45, nine of nineteen.
     assert tracking.measures(counts)["hota"] == pytest.approx(9 / 19)
-    assert hota.curves(counts.hota)["loca"][:10] == pytest.approx([13 / 27] * 9 + [1])
+    assert tracking.curves(counts.hota)["loca"][:10] == pytest.approx([13 / 27] * 9 + [1])
 
 
 def test_rows_marked_zero_are_dropped_or_take_what_matches_them_along():
@@ -121,7 +121,7 @@ def test_nothing_found_scores_zero_and_nothing_true_is_undefined():
     assert (m["mostly_lost"], m["loca"]) == (1, 1)
     m = scores(NOTHING, THREE)
     assert all(math.isnan(m[k]) for k in ("hota", "assa", "loca", "mota", "idf1", "recall"))
-    assert tracking.count(NOTHING, NOTHING).clear == clear.Clear()
+    assert tracking.count(NOTHING, NOTHING).clear == tracking.Clear()
 
 
 def test_pooled_counts_are_those_of_one_long_clip():

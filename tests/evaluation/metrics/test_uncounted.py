@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.metrics.uncounted import counted
 
 
 def table(*boxes: tuple[float, float, float, float]) -> TrackTable:

@@ -7,7 +7,7 @@ import pytest
 from tests.evaluation.studies.scored_clips import found_of, masked, tracked, walk
 from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics import paired
+from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.studies import comparing
 from torchvision_dddas.evaluation.studies.comparing import compare
 from torchvision_dddas.evaluation.studies.scored import SCORES, ScoredCase, ScoredStudy, read_scores, write_scores
@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.studies.scoring import score
 @pytest.fixture(autouse=True)
 def _few(monkeypatch):
     """Few samples: none of these properties needs many."""
-    monkeypatch.setattr(paired.effects, "__defaults__", (100, 300))
+    monkeypatch.setattr(bootstrap.effects, "__defaults__", (100, 300))
 
 
 def of_tracks(folder, name, miss, clips=range(8)) -> ScoredStudy:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
+from torchvision_dddas.evaluation.metrics.pixels import Pixels
 from torchvision_dddas.evaluation.studies.record import Found
 from torchvision_dddas.evaluation.studies.scored import Scored
 from torchvision_dddas.evaluation.studies.stored import DamagedError, packed, unpacked

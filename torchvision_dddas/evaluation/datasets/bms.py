@@ -18,13 +18,10 @@ from typing import Any
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import bms_definition
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.files import fitted, images_in
+from torchvision_dddas.evaluation.datasets.folder import clip_at, looks_like
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.own import clip_at, looks_like
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.truth import Labels, Truth
 
 TERMS = "for research purposes only; any commercial use is prohibited; to be cited"

@@ -17,13 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.files import fitted, frames_by_number, images_in, labelled, number_of
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import frames_by_number, labelled, number_of
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.truth import Labels, Truth
 
 TERMS = "whoever publishes results acknowledges changedetection.net and cites its papers"

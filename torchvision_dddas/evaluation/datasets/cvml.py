@@ -20,17 +20,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import LAST
-from torchvision_dddas.evaluation.datasets.boxes import table_of, truth_of
-from torchvision_dddas.evaluation.datasets.footage import agreed, whole
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import LAST, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import agreed, images_in, number_of, videos_in, whole
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import number_of
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in, videos_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
-from torchvision_dddas.evaluation.metrics.mot_text import FARTHEST
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
+from torchvision_dddas.evaluation.metrics.truth import FARTHEST, Truth
 
 TERMS = "research only; cite PETS 2009 or CAVIAR"
 _DEEP = 2

@@ -15,13 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.files import fitted, frames_by_number, images_in, labelled
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import frames_by_number, labelled
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.truth import Truth
 
 TERMS = "2016: BSD licence; 2017: Creative Commons Attribution 4.0; some clips under terms of their own; to be cited"

@@ -1,31 +1,24 @@
-"""One's own data: a folder of clips, each a folder.
-
-    CLIP/frames/            its pictures in natural order, named by number or not; or img1/, or one video in CLIP
-    CLIP/masks/             PNG, of any of its frames: 0 background, each other value or colour one mover; named by the
-                            number of the picture, or of a video's or unnumbered clip's frame, from 0 or from 1
-    CLIP/boxes_xywh.txt     or this: x,y,width,height of one target a frame, NaN where it is not seen; others may move
-    CLIP/gt.txt, gt/gt.txt  or this: MOTChallenge text, frames from 1
-    CLIP/det/det.txt        detections to follow, as MOTChallenge text
-    CLIP/positions.csv      where the targets truly are: frame,target,east_m,north_m
-    CLIP/seqinfo.ini        MOTChallenge's: seqLength, frameRate
-    CLIP/telemetry.*, landmarks.csv, colours.toml, camera.toml, dem.*: as `dddas run` takes them
-
-A clip without pictures can be followed all the same if its truth has identities.
-Options: still (names or patterns of clips in which nothing moves: whatever is found there is false), people (the same
-of clips whose truth labels people who may stand), rate_hz. Terms of use: your own.
-"""
+"""One's own data: a folder of clips in the plain convention."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.files import (
+    fitted,
+    frames_by_number,
+    frames_of,
+    images_in,
+    labelled,
+    videos_in,
+)
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.own import clip_at, looks_like
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, SeqInfo, Truth, read_seqinfo
 
 OPTIONS: Mapping[str, Any] = {"still": [], "people": [], "rate_hz": None}
 
@@ -42,3 +35,87 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         return fitted(clip_at(places[name], name, said["rate_hz"], still, ("people",) if people else ("movers",)))
 
     return gather("folder", folder, "", filter(wanted, places), clip_of)
+
+
+FRAMES = ("frames", "img1")
+"""Folders that may hold a clip's pictures."""
+
+
+def looks_like(folder: Path) -> bool:
+    """Whether a folder is a clip, and not one of clips."""
+    return any((folder / name).is_dir() for name in FRAMES) or truths.find(folder) is not None
+
+
+def clip_at(
+    place: Path,
+    name: str,
+    rate_hz: float | None = None,
+    still: bool = False,
+    shows: tuple[str, ...] = ("movers",),
+    labels: Labels | None = None,
+) -> Clip:
+    """A clip's folder. rate_hz: where seqinfo.ini is not to say. labels: what the values of its masks mean.
+
+    Raises InputError: neither pictures nor truth, several videos, files that cannot be read.
+    """
+    pictures = pictures_at(place)
+    truth = truth_at(place, pictures, labels or Labels())
+    if not pictures and truth is None:
+        raise InputError(f"{place} holds neither pictures nor truth; wanted frames/ or a video, and masks/ or boxes")
+    positions = next((p for p in (place / "positions.csv", place / "truth" / "positions.csv") if p.is_file()), None)
+    if truth is not None and positions is not None:
+        truth = replace(truth, positions=positions_at(positions))
+    counted = frames_of(pictures)
+    said = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
+    return Clip(
+        name,
+        place,
+        pictures,
+        rate_hz or said.rate_hz,
+        counted or said.length,
+        truth,
+        still,
+        shows,
+        _first(place, "det/det.txt", "det.txt"),
+        _first(place, "telemetry.*"),
+        _first(place, "landmarks.csv"),
+        _first(place, "colours.toml"),
+        _first(place, "camera.toml"),
+        _first(place, "dem.*"),
+    )
+
+
+def pictures_at(place: Path) -> tuple[Path, ...]:
+    """The pictures of a clip's folder, or its video. Raises InputError where there are several videos."""
+    for name in FRAMES:
+        if found := images_in(place / name):
+            return found
+    videos = [v for v in videos_in(place) if v.stem != "telemetry"]  # MPEG-TS that carries metadata alone
+    if len(videos) > 1:
+        raise InputError(f"{place} holds {len(videos)} videos, {videos[0].name} and {videos[1].name}; wanted one")
+    return tuple(videos)
+
+
+def truth_at(place: Path, pictures: tuple[Path, ...], labels: Labels) -> Truth | None:
+    """The truth of a clip's folder, None where it has none. Raises InputError where it cannot be read."""
+    found = truths.find(place)
+    if found is None:
+        return None
+    numbers = frames_by_number(pictures) if len(pictures) > 1 else {}
+    if found.is_dir() and numbers:
+        masks = [path for path in images_in(found, frozenset({".png"})) if path.stem.isdecimal()]
+        return Truth("masks", found, labelled(masks, numbers, pictures[0].parent), {}, labels=labels)
+    truth = truths.load(found)
+    return replace(truth, labels=labels) if truth.kind == "masks" else truth
+
+
+def positions_at(path: Path) -> Positions:
+    """True places on the ground. Raises InputError where they cannot be read."""
+    from torchvision_dddas.io.position_tables import read_positions
+
+    said = read_positions(path)
+    return Positions(said.frame, said.target, said.east_north_m, said.lonlat_deg)
+
+
+def _first(place: Path, *patterns: str) -> Path | None:
+    return next((path for pattern in patterns for path in sorted(place.glob(pattern)) if path.is_file()), None)

@@ -1,39 +1,20 @@
-"""KITTI tracking: what a car sees of the others, in pixels and in metres.
-
-    training/image_02/0000/000000.png   the left colour camera, frames from 0, 10 a second
-    training/label_02/0000.txt          frame id type truncated occluded alpha left top right bottom
-                                        height width length x y z rotation
-    training/calib/0000.txt             R_rect, Tr_velo_cam, Tr_imu_velo
-    training/oxts/0000.txt              lat lon alt roll pitch yaw ..., a line a frame
-
-DontCare rows are regions that nobody labelled. What does not count and does not harm, as for TrackEval: what is cut
-off by the border (truncated above 0) or whose occlusion is unknown (above 2), and here all classes that are not asked
-for (TrackEval: vans beside cars, people who sit beside pedestrians). TrackEval also takes out what was found without a
-match and is at most 25 px high; that is not done here. Positions need calib and oxts: metres east and north of where
-the car's receiver was in the first frame.
-
-Terms, as its makers state them: CC BY-NC-SA 3.0.
-"""
+"""KITTI tracking: boxes of road users from a car, in pixels and in metres."""
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import pi
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import read_rows
-from torchvision_dddas.evaluation.datasets.boxes import asked, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.footage import agreed, whole
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import asked, read_rows, table_of, text_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import agreed, images_in, whole
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.kitti_pose import positions_of
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
 
 TERMS = "CC BY-NC-SA 3.0"
 RATE_HZ = 10.0
@@ -100,3 +81,78 @@ def read_truth(
     counts = asked(words[rest], classes or CLASSES, CLASSES, "KITTI") & whole_ones
     where = positions_of(table.at(counts), v[rest][counts, 13:16], *pose) if pose else None
     return truth_of(path, table, counts, length, regions if region.any() else None, where)
+
+
+EARTH_RADIUS_M = 6378137.0
+MOST_LATITUDE_DEG = 85.0
+"""Beyond it the map projection goes to infinity."""
+
+_RECORD = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
+_SIZES = {"R_rect": 9, "Tr_velo_cam": 12, "Tr_imu_velo": 12}
+
+
+def positions_of(table: TrackTable, camera_m: np.ndarray, calibration: Path, records: Path) -> Positions:
+    """Where rows are on the ground. camera_m: (N, 3), right, down and ahead of the rectified camera.
+
+    Metres east and north of the unit's place in the first frame, by the Mercator projection at its latitude, as
+    KITTI's own tools have it. Raises InputError: broken files, a row in a frame without record.
+    """
+    imu_from_camera = np.linalg.inv(camera_from_imu(calibration))
+    world_from_imu = poses(records)
+    if len(table.frame) and table.frame.max() > len(world_from_imu):
+        raise InputError(f"{records} has {len(world_from_imu)} lines, but frame {table.frame.max()} is labelled")
+    homogeneous = np.column_stack([camera_m, np.ones(len(camera_m))]) @ imu_from_camera.T
+    place = np.einsum("nij,nj->ni", world_from_imu[table.frame - 1], homogeneous)
+    return Positions(table.frame, table.identity, place[:, :2])
+
+
+def camera_from_imu(path: Path) -> np.ndarray:
+    """(4, 4) rectified camera from the inertial unit. Raises InputError where one of the matrices lacks."""
+    lines = {cells[0].rstrip(":"): cells[1:] for line in text_of(path).splitlines() if (cells := line.split())}
+    matrices = []
+    for name, size in _SIZES.items():
+        try:
+            values = np.array([float(cell) for cell in lines.get(name, ())])
+        except ValueError:
+            values = np.zeros(0)
+        if len(values) != size or not np.isfinite(values).all() or np.abs(values).max() > 1e6:
+            raise InputError(f"{path} does not hold {name} with {size} numbers")
+        matrix = np.eye(4)
+        matrix[:3, : size // 3] = values.reshape(3, -1)
+        if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.01:
+            raise InputError(f"{path}: {name} is no rotation")
+        matrices.append(matrix)
+    rectified, camera_from_velodyne, velodyne_from_imu = matrices
+    chain: np.ndarray = rectified @ camera_from_velodyne @ velodyne_from_imu
+    return chain
+
+
+def poses(path: Path) -> np.ndarray:
+    """(F, 4, 4) east, north, up from the unit's forward, left, up, of each line. Raises InputError with the line."""
+    rows = read_rows(path, _RECORD)
+    latitude, longitude, altitude, roll, pitch, yaw = rows.values.T
+    if not len(rows.values):
+        raise InputError(f"{path} is empty; wanted {','.join(_RECORD)} a line")
+    outside = (np.abs(latitude) > MOST_LATITUDE_DEG) | (np.abs(longitude) > 360)
+    if outside.any():
+        i = int(outside.argmax())
+        raise InputError(
+            f"{path}, line {rows.line[i]}: {latitude[i]:g}, {longitude[i]:g} is no place; wanted degrees, "
+            f"latitudes to {MOST_LATITUDE_DEG:g}"
+        )
+    scale = EARTH_RADIUS_M * np.cos(np.radians(latitude[0]))
+    east = scale * np.radians(longitude)
+    north = scale * np.log(np.tan(pi / 4 + np.radians(latitude) / 2))
+    found = np.tile(np.eye(4), (len(latitude), 1, 1))
+    found[:, :3, :3] = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+    found[:, :3, 3] = np.stack([east - east[0], north - north[0], altitude - altitude[0]], axis=1)
+    return found
+
+
+def _about(axis: int, angle_rad: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) rotations about x, y or z."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    found = np.tile(np.eye(3), (len(c), 1, 1))
+    found[:, a, a], found[:, b, b], found[:, a, b], found[:, b, a] = c, c, -s, s
+    return found

@@ -23,18 +23,12 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import read_rows, text_of
-from torchvision_dddas.evaluation.datasets.boxes import by_frame, table_of
-from torchvision_dddas.evaluation.datasets.footage import agreed, whole
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import by_frame, read_rows, table_of, text_of
+from torchvision_dddas.evaluation.datasets.files import agreed, images_in, number_of, videos_in, whole
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import number_of
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in, videos_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.seqinfo import SeqInfo, read_seqinfo
-from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.metrics.truth import Positions, SeqInfo, Truth, read_seqinfo
 
 TERMS = "CC BY-NC-SA 3.0"
 BENCHMARKS = ("", "MOT15", "MOT16", "MOT17", "MOT20")

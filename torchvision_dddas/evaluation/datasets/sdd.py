@@ -20,14 +20,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import read_rows
-from torchvision_dddas.evaluation.datasets.boxes import asked, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.footage import agreed
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import asked, read_rows, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import agreed, videos_in
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import videos_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.truth import Truth
 
 TERMS = "CC BY-NC-SA 3.0"

@@ -22,12 +22,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.files import fitted
+from torchvision_dddas.evaluation.datasets.folder import clip_at, pictures_at
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.own import clip_at, pictures_at
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
 from torchvision_dddas.io.detection_tables import read_rows

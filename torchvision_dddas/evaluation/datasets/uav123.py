@@ -19,13 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import gather
+from torchvision_dddas.evaluation.datasets.files import fitted, images_in, number_of
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import number_of
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, gather
 from torchvision_dddas.evaluation.metrics import truth as truths
 
 TERMS = "for research; whoever uses it cites Mueller, Smith and Ghanem (2016)"

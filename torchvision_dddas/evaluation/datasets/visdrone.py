@@ -18,14 +18,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import read_rows
-from torchvision_dddas.evaluation.datasets.boxes import asked, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.footage import whole
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import asked, read_rows, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import images_in, whole
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 

@@ -1,33 +1,18 @@
-"""DARPA VIVID, egtest01 to egtest05 and their like, as of the tracking evaluation of PETS 2005 (Collins et al.).
-
-    egtest01/frame00000.jpg   the frames, numbered from 0; also egtest01/egtest01/frame00000.jpg
-
-The truth, the first of these that is there, in the clip's folder, beside it, or in Groundtruth/:
-
-    egtest01_truth.csv        all vehicles: a line of names, then name,frame,identity,x,y,width,height; frames from 0
-    egtest01*.txt             one target: frame,x,y,width,height of every tenth frame; or x,y,width,height a frame, NaN
-                              where it is not seen
-    egtest01*mask*/           one target: masks of every tenth frame, named by its number, nonzero where the target is
-
-The site of the evaluation is gone, and copies differ: these are the layouts in which it is passed on. Of masks the box
-about the target is taken, for the vehicles beside it move too and are not labelled. Options: rate_hz (30 by default).
-Terms of use: its makers offer it for the evaluation of trackers, to be cited as Collins, Zhou and Teh (PETS 2005).
-"""
+"""DARPA VIVID, egtest01 to egtest05, as in the tracking evaluation of PETS 2005 (Collins et al.)."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets import vivid_truth
-from torchvision_dddas.evaluation.datasets.fitting import fitted
-from torchvision_dddas.evaluation.datasets.gathering import folders_in, gather
+from torchvision_dddas.evaluation.datasets.files import fitted, frames_by_number, images_in, labelled, size_of
 from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.numbering import frames_by_number
-from torchvision_dddas.evaluation.datasets.options import checked
-from torchvision_dddas.evaluation.datasets.pictures import images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
+from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import FARTHEST, Truth, read_mask
+from torchvision_dddas.io.tables import read_csv
 
 TERMS = "for the evaluation of trackers; to be cited as Collins, Zhou and Teh (PETS 2005)"
 
@@ -56,13 +41,121 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
 def _truth(folder: Path, name: str, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
     """The truth of a clip, wherever it lies. Raises InputError where there is none."""
     homes = (folder / name, folder, folder / "Groundtruth", folder / "groundtruth")
-    for pattern, reader in (("*_truth.csv", vivid_truth.vehicles), ("*.txt", vivid_truth.boxes)):
+    for pattern, reader in (("*_truth.csv", vehicles), ("*.txt", boxes)):
         for home in homes:
             if found := [p for p in sorted(home.glob(f"{name}{pattern}")) if p.is_file()]:
                 return reader(found[0], frames)
     for home in homes:
         inside = folders_in(home) if home.is_dir() else []
-        masks = [home / d for d in inside if "mask" in d.lower() and (home == folder / name or d.startswith(name))]
-        if masks:
-            return vivid_truth.masks(masks[0], frames, pictures)
+        folders = [home / d for d in inside if "mask" in d.lower() and (home == folder / name or d.startswith(name))]
+        if folders:
+            return masks(folders[0], frames, pictures)
     raise InputError(f"{folder} has no truth of it; wanted {name}_truth.csv, {name}*.txt or a folder {name}_mask")
+
+
+def vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
+    """All vehicles: name,frame,identity,x,y,width,height under a line of names. frames: number of a picture -> frame.
+
+    Frames without a row are taken as empty up to the last that has one. Raises InputError with file and line.
+    """
+    rows = []
+    _, lines, cells_of = read_csv(path, "truth")
+    for number, cells in zip(lines, cells_of, strict=True):
+        where = f"truth {path}, line {number}"
+        if len(cells) != 7:
+            raise InputError(f"{where}: {len(cells)} columns; wanted name,frame,identity,x,y,width,height")
+        row = _numbers(cells[1:], where)
+        rows.append([_frame(row[0], frames, where), *row[1:]])
+    if not rows:
+        raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height a line")
+    values = np.array(rows)
+    if len(strange := values[values[:, 1] % 1 != 0]):
+        raise InputError(f"{path}: {strange[0, 1]:g} is no identity; wanted whole numbers")
+    table = TrackTable(values[:, 0].astype(np.int64), values[:, 1].astype(np.int64), values[:, 2:])
+    if (table.box_px[:, 2:] <= 0).any():
+        raise InputError(f"{path}: a box has no width or height; wanted more than 0")
+    if len(np.unique(values[:, :2], axis=0)) < len(values):
+        raise InputError(f"{path}: an identity stands twice in a frame; wanted one box a frame")
+    last = int(table.frame.max())
+    boxes = {frame: table.box_px[table.frame == frame] for frame in range(1, last + 1)}
+    return Truth("boxes", path, {}, boxes, table, length=len(frames))
+
+
+def boxes(path: Path, frames: Mapping[int, int]) -> Truth:
+    """One target: frame,x,y,width,height of some frames, or x,y,width,height of each. Raises InputError."""
+    try:
+        lines = [x.replace(",", " ").split() for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no table of boxes: {error}") from None
+    if not lines or len(lines[0]) not in (4, 5):
+        held = f"has {len(lines[0])} columns" if lines else "is empty"
+        raise InputError(f"{path} {held}; wanted frame,x,y,width,height, or x,y,width,height, a line")
+    found: dict[int, np.ndarray] = {}
+    for number, cells in enumerate(lines, 1):
+        where = f"{path}, line {number}"
+        if len(cells) != len(lines[0]):
+            raise InputError(f"{where}: {len(cells)} columns; the first line has {len(lines[0])}")
+        row = _numbers(cells, where, unseen=True)
+        frame = number if len(row) == 4 else _frame(row[0], frames, where)
+        if frame in found:
+            raise InputError(f"{where}: frame {row[0]:g} stands there twice; wanted one box a frame")
+        found[frame] = np.array(row[-4:])
+    if len(lines[0]) == 4 and len(lines) != len(frames):
+        raise InputError(f"{path} has {len(lines)} lines, but the clip {len(frames)} frames; wanted a line a frame")
+    return _one(path, found, len(frames))
+
+
+def masks(place: Path, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
+    """One target, by the box about what is not 0 in its masks. Raises InputError."""
+    files = labelled(images_in(place), frames, place.parent)
+    if not files:
+        raise InputError(f"{place} holds no masks; there belongs the truth of every tenth frame")
+    size = size_of(pictures[0])
+    found = {}
+    for frame, path in files.items():
+        mask = read_mask(path)
+        if mask.shape != size[::-1]:
+            raise InputError(
+                f"{path} is {mask.shape[1]}×{mask.shape[0]} pixels, but {pictures[0].name} {size[0]}×{size[1]}; "
+                "wanted masks of the size of the pictures"
+            )
+        found[frame] = _about(mask)
+    return _one(place, found, len(frames))
+
+
+def _one(place: Path, found: Mapping[int, np.ndarray], length: int) -> Truth:
+    """The truth of one target. found: its box by frame, NaN where it is not seen."""
+    frames = sorted(found)
+    rows = np.array([found[frame] for frame in frames])
+    seen = ~np.isnan(rows).any(axis=1)
+    tracks = TrackTable(np.array(frames)[seen], np.ones(int(seen.sum()), np.int64), rows[seen])
+    return Truth("one target", place, {}, {frame: found[frame][None] for frame in frames}, tracks, length=length)
+
+
+def _about(mask: np.ndarray) -> np.ndarray:
+    v, u = np.nonzero(mask)
+    if not len(u):
+        return np.full(4, np.nan)
+    return np.array([u.min(), v.min(), np.ptp(u) + 1, np.ptp(v) + 1], float)
+
+
+def _numbers(cells: list[str], where: str, unseen: bool = False) -> list[float]:
+    """Cells as numbers. unseen: they may be NaN. Raises InputError."""
+    values = []
+    for cell in cells:
+        try:
+            value = float(cell)
+        except ValueError:
+            value = np.inf
+        if not (abs(value) <= FARTHEST or (unseen and np.isnan(value))):
+            raise InputError(f"{where}: '{cell[:40]}' will not do; wanted a number, {-FARTHEST:g} to {FARTHEST:g}")
+        values.append(value)
+    return values
+
+
+def _frame(number: float, frames: Mapping[int, int], where: str) -> int:
+    """The frame of the picture with a number. Raises InputError where there is none."""
+    found = frames.get(int(number)) if number == number and number == int(number) else None
+    if found is None:
+        raise InputError(f"{where}: there is no picture {number:g}; the clip has {min(frames)} to {max(frames)}")
+    return found

@@ -1,21 +1,23 @@
 """Scoring one clip: which measures its truth and its result allow, over which frames."""
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics import detection, segmentation, tracking
+from torchvision_dddas.evaluation.metrics import boxes, pixels, tracking, truth
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.results import Result
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
-from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.io.image_bytes import decoded
 
 Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | GroundLocations]
 
@@ -37,6 +39,42 @@ class ClipScore:
     each: dict[str, Each]
 
 
+@dataclass(frozen=True)
+class Result:
+    """A result. frames: the last one of the run, 0 where nothing says. state: of the run.
+
+    place: the folder or file. detected: (N, 4) boxes of each frame with targets, None where only tracks were written.
+    tracks: the boxes with identities, None where there are none.
+    """
+
+    place: Path
+    frames: int
+    detected: dict[int, np.ndarray] | None
+    has_masks: bool
+    state: str
+    tracks: TrackTable | None = None
+
+    @property
+    def name(self) -> str:
+        """What to call it: the folder's name, or the file's without its ending."""
+        place = self.place.resolve()
+        return place.stem if place.is_file() else place.name
+
+    def boxes_at(self, frame: int) -> np.ndarray:
+        """(N, 4) boxes of a frame: the detections, or the tracks' where there are none."""
+        if self.detected is not None:
+            return self.detected.get(frame, np.zeros((0, 4)))
+        return np.zeros((0, 4)) if self.tracks is None else self.tracks.box_px[self.tracks.frame == frame]
+
+    def mask_at(self, frame: int) -> np.ndarray:
+        """(H, W) mask of a frame. Raises InputError if it is not there."""
+        path = self.place / "masks" / f"{frame:06d}.png"
+        mask = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        if mask is None:
+            raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
+        return mask if mask.ndim == 2 else mask.max(axis=2)
+
+
 def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> ClipScore:
     """Count what a clip's truth and result allow; what is left out is added to the notes.
 
@@ -55,7 +93,7 @@ def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> Clip
         counts, each = _summed(frames, (_by_masks if truth.kind == "masks" else _by_one)(truth, result, frames))
     elif truth.kind == "boxes" and (result.detected is not None or not followed):
         frames = _labelled(truth, result, how, notes)
-        boxes: dict[str, list[Any]] = {"boxes": [detection.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
+        boxes: dict[str, list[Any]] = {"boxes": [boxes.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
         counts, each = _summed(frames, boxes)
     if truth.tracks is not None and result.tracks is not None:
         scored, name, found, of_each = _by_tracks(truth, truth.tracks, result, result.tracks, how, notes)
@@ -100,12 +138,12 @@ def _labelled(truth: Truth, result: Result, how: How, notes: list[str]) -> list[
 
 
 def _by_one(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
-    one = detection.one_target
+    one = boxes.one_target
     return {"target": [one(result.mask_at(f), result.boxes_at(f), truth.boxes[f][0]) for f in frames]}
 
 
 def _by_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
-    pixels, boxes = [], []
+    pixel_counts, box_counts = [], []
     if not result.has_masks:
         raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
     for f in frames:
@@ -115,10 +153,11 @@ def _by_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, list
                 f"frame {f}: the truth is {labels.shape[1]}×{labels.shape[0]} pixels ({truth.masks[f]}), "
                 f"the result {mask.shape[1]}×{mask.shape[0]} ({result.place})"
             )
-        pixels.append(segmentation.count(mask, labels))
+        pixel_counts.append(pixels.count(mask, labels))
         if truth.labels.separate:
-            boxes.append(detection.match(result.boxes_at(f), detection.boxes_of(labels)))
-    return {"pixels": pixels, "boxes": boxes} if truth.labels.separate else {"pixels": pixels}
+            box_counts.append(boxes.match(result.boxes_at(f), boxes.boxes_of(labels)))
+    found: dict[str, list[Any]] = {"pixels": pixel_counts}
+    return found | {"boxes": box_counts} if truth.labels.separate else found
 
 
 def _by_tracks(
@@ -155,3 +194,44 @@ def _by_tracks(
 
 def _of(how: How) -> str:
     return f" of every {how.interval}th" if how.interval > 1 else ""
+
+
+DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
+
+
+def is_result(place: Path) -> bool:
+    """Whether a place looks like a result: a file, or a folder that dddas detect or dddas track wrote."""
+    return place.is_file() or any((place / name).is_file() for name in (DETECTIONS, TRACKS))
+
+
+def load(place: Path) -> Result:
+    """Read a result folder, or a file of MOTChallenge text. Raises InputError if it is none."""
+    if place.is_file():
+        rows = truth.read_rows(place, "result")
+        if rows.named:
+            return Result(place, 0, None, False, "complete", truth.with_identities(rows, place))
+        return Result(place, 0, _by_frame(rows.table), False, "complete")
+    if not is_result(place):
+        raise InputError(
+            f"{place} is no result of dddas detect: it holds no {DETECTIONS}; nor of dddas track: no {TRACKS}"
+        )
+    detected = tracks = None
+    if (place / DETECTIONS).is_file():
+        detected = _by_frame(truth.read_rows(place / DETECTIONS, "detections").table)
+    if (place / TRACKS).is_file():
+        tracks = truth.with_identities(truth.read_rows(place / TRACKS, "tracks"), place / TRACKS)
+    try:
+        record = json.loads((place / "run.json").read_text(encoding="utf-8"))
+        looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), list(record["outputs"])
+        # dddas track writes every interval-th frame, from wherever its table begins; dddas detect each.
+        counted = max(looks - 1, 0) * int(record.get("interval_frames", 1)) + min(looks, 1)
+        frames = int(record.get("last_frame", counted)) if looks else 0
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
+        numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
+        frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []
+    return Result(place, frames, detected, "masks" in outputs, state, tracks)
+
+
+def _by_frame(table: TrackTable) -> dict[int, np.ndarray]:
+    return {int(f): table.box_px[table.frame == f] for f in np.unique(table.frame)}

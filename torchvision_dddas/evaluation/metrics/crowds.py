@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.evaluation.metrics import identity
+from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.crowd_frames import (
     LEAST_VISIBLE,
     Crowd,
@@ -27,7 +27,7 @@ from torchvision_dddas.evaluation.metrics.crowd_frames import (
     touched,
 )
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
-from torchvision_dddas.evaluation.metrics.segmentation import ratio
+from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.types import FrameResult, Truth
 
 INSIDE = 5.991
@@ -190,7 +190,11 @@ class CrowdScorer:
         n, frames = self._counts, self._counts["frames"]
         moving = n["crowd_frames"] - n["still"], n["found"] - n["still_found"]
         truth, found = (_table(rows) for rows in (self._true_rows, self._found_rows))
-        idf1 = identity.measures(identity.count(pair(truth, found), IOU_LEAST))["idf1"] if frames else math.nan
+        idf1 = (
+            tracking.identity_measures(tracking.count_identity(pair(truth, found), IOU_LEAST))["idf1"]
+            if frames
+            else math.nan
+        )
         right = sum((self._holds[which] > 0) == (kind == "human") for which, kind in self._kind.items())
         return CrowdScore(
             frames=frames,

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics import detection, metres, segmentation, still, tracking
+from torchvision_dddas.evaluation.metrics import boxes, metres, pixels, tracking
+from torchvision_dddas.evaluation.metrics.boxes import Boxes
 from torchvision_dddas.evaluation.metrics.clip import Counts
-from torchvision_dddas.evaluation.metrics.detection import Boxes
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
-from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
 
 GROUPS = ("pixels", "boxes", "target", "tracks", "target_track")
@@ -29,18 +28,18 @@ def figures(counts: Counts) -> dict[str, dict[str, float]]:
 def of_group(value: Any) -> dict[str, float]:
     """The measures that come of one group's counts."""
     if isinstance(value, Pixels):
-        return segmentation.measures(value)
+        return pixels.measures(value)
     if isinstance(value, Boxes):
-        return detection.measures(value)
+        return boxes.measures(value)
     if isinstance(value, TrackCounts):
         return tracking.measures(value)
     if isinstance(value, TargetTrack):
         return tracking.one_target_measures(value)
     if isinstance(value, Still):
-        return still.measures(value)
+        return pixels.still_measures(value)
     if isinstance(value, GroundLocations):
         return metres.located_measures(value)
-    return detection.one_target_measures(value)
+    return boxes.one_target_measures(value)
 
 
 def pooled(clips: Sequence[Counts]) -> Counts:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.boxes import iou
 
 LEAST = 0.5
 """IoU from which a box counts as found."""

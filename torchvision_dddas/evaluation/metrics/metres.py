@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, TrackTable
-from torchvision_dddas.evaluation.metrics.segmentation import ratio
+from torchvision_dddas.evaluation.metrics.pixels import ratio
 
 INSIDE = 5.991
 """Of chi-square with two degrees of freedom, in 95 %."""

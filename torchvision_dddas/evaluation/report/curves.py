@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.ranking import precision_recall, ranking
+from torchvision_dddas.evaluation.metrics.boxes import precision_recall, ranking
 from torchvision_dddas.evaluation.report.tallies import main_group, tally
 from torchvision_dddas.evaluation.studies.record import Case
 from torchvision_dddas.evaluation.studies.scored import Scored

@@ -8,9 +8,9 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.detection import iou
+from torchvision_dddas.evaluation.metrics.boxes import iou
+from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.uncounted import counted
 from torchvision_dddas.evaluation.report.pictures import Boxes, Pair, box_pair, mask_pair, matched
 from torchvision_dddas.evaluation.report.tallies import Tally, main_group, tally
 from torchvision_dddas.evaluation.studies.record import Case, Found

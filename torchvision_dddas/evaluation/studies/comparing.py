@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics import paired
-from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Stratum
-from torchvision_dddas.evaluation.metrics.paired import Effect
+from torchvision_dddas.evaluation.metrics import bootstrap
+from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
 from torchvision_dddas.evaluation.studies import estimates
 from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
 from torchvision_dddas.evaluation.studies.scored import Scored, ScoredStudy
@@ -133,7 +132,7 @@ def _over_clips(first: Sequence[Scored], second: Sequence[Scored]) -> dict[str, 
     for group, estimate in estimates.over_clips([*first, *second]).items():
         clips = estimate.strata[0].units // 2
         if clips >= FEWEST:
-            found[group] = paired.effects(estimate.statistic, (Stratum(clips),), estimate.seed(group))
+            found[group] = bootstrap.effects(estimate.statistic, (Stratum(clips),), estimate.seed(group))
     return found
 
 
@@ -141,7 +140,7 @@ def _over_frames(first: Sequence[Scored], second: Sequence[Scored]) -> dict[str,
     found = {}
     for group, estimate in estimates.over_frames([*first, *second]).items():
         if strata := _paired_strata(estimate):
-            found[group] = paired.effects(estimate.statistic, strata, estimate.seed(group))
+            found[group] = bootstrap.effects(estimate.statistic, strata, estimate.seed(group))
     return found
 
 
@@ -155,7 +154,7 @@ def _paired_strata(estimate: Estimate) -> tuple[Stratum, ...]:
 def _correct(entries: Sequence[dict[str, Any]], way: str) -> None:
     """Add p_holm to all that are asked together, and whether it could be below LEVEL at all."""
     told = [entry[way] for entry in entries if entry.get(way) is not None]
-    adjusted = paired.holm({str(i): one["p"] for i, one in enumerate(told)})
+    adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(told)})
     for i, one in enumerate(told):
         one["p_holm"] = adjusted[str(i)]
         one["enough"] = one.pop("least") * len(told) < LEVEL

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.segmentation import ratio
+from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results
 
 

@@ -5,15 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics import bootstrap, clear, metres
+from torchvision_dddas.evaluation.metrics import bootstrap, metres, tracking
 from torchvision_dddas.evaluation.metrics.bootstrap import Statistic, Stratum
-from torchvision_dddas.evaluation.metrics.clear import Clear
-from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget, Ranking, ranking
 from torchvision_dddas.evaluation.metrics.figures import of_group
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.ranking import Ranking, ranking
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels, ratio
-from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still, ratio
+from torchvision_dddas.evaluation.metrics.tracking import Clear
 from torchvision_dddas.evaluation.studies.scored import Scored
 
 Measure = Callable[[np.ndarray], dict[str, float]]
@@ -148,7 +146,7 @@ def _of_samples(samples: dict[str, np.ndarray], unit: np.ndarray) -> Statistic:
 def _columns(group: str) -> tuple[tuple[str, ...], Measure]:
     """The counts of frames that a group's measures come of, and how."""
     if group == "tracks":
-        return (*clear.PER_FRAME, "windows_2", "ar_2", "windows_3", "ar_3"), _of_tracks
+        return (*tracking.PER_FRAME, "windows_2", "ar_2", "windows_3", "ar_3"), _of_tracks
     if group == "target_track":
         return ("frames", "found"), lambda sums: {"found": ratio(sums[1], sums[0])}
     kind = _KINDS[group]
@@ -157,7 +155,7 @@ def _columns(group: str) -> tuple[tuple[str, ...], Measure]:
 
 def _of_tracks(sums: np.ndarray) -> dict[str, float]:
     tp, fn, fp, switches, overlap, windows_2, ar_2, windows_3, ar_3 = sums.tolist()
-    found = clear.measures(Clear(tp=tp, fn=fn, fp=fp, switches=switches, overlap=overlap))
+    found = tracking.clear_measures(Clear(tp=tp, fn=fn, fp=fp, switches=switches, overlap=overlap))
     shares = {name: found[name] for name in ("mota", "motp", "recall", "precision")}
     return {**shares, "ar_2": ratio(ar_2, windows_2), "ar_3": ratio(ar_3, windows_3)}
 

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics import detection, ranking, uncounted
+from torchvision_dddas.evaluation.metrics import boxes
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.clip import Counts, How, score_clip
+from torchvision_dddas.evaluation.metrics.clip import Counts, How, Result, score_clip
+from torchvision_dddas.evaluation.metrics.ignored_regions import WITHIN, counted
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.results import Result
-from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.pixels import Still
 from torchvision_dddas.evaluation.metrics.tracking import Each
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.scored import Scored
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scored:
     """Score one case. interval: of tracking and association, as `dddas evaluate --interval`.
 
-    Found boxes that neither count as right nor as false (see `uncounted.counted`) are left out of all counts. Raises
+    Found boxes that neither count as right nor as false (see `boxes.counted`) are left out of all counts. Raises
     InputError where the truth is missing, or does not fit what was found.
     """
     if task == "location":
@@ -46,7 +46,7 @@ def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scor
         truth = replace(truth, kind="boxes")
         judged = replace(truth, ignored=vehicles, regions=vehicles, ignoring="removed")
     box_px = as_written(found.box_px)
-    counts = uncounted.counted(judged, found.frame, box_px) & ~_unlabelled(clip.truth, found.frame, box_px)
+    counts = counted(judged, found.frame, box_px) & ~_unlabelled(clip.truth, found.frame, box_px)
     rows = counts & (found.identity != -1) if followed else counts
     table = TrackTable(found.frame[rows], found.identity[rows], box_px[rows])
     last = int(found.looked.max(initial=0))
@@ -130,7 +130,7 @@ def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarr
         for row in np.flatnonzero(frame == number):
             x, y, w, h = (round(float(v)) for v in box_px[row])
             inside = unknown[max(y, 0) : max(y + h, 0), max(x, 0) : max(x + w, 0)]
-            out[row] = bool(inside.size) and inside.mean() > uncounted.WITHIN
+            out[row] = bool(inside.size) and inside.mean() > WITHIN
     return out
 
 
@@ -139,8 +139,8 @@ def _ranked(truth: Truth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarr
     right = np.full(len(frame), np.nan)
     for number in np.unique(frame):
         rows = np.flatnonzero((frame == number) & counts)
-        true = truth.boxes[number] if truth.kind == "boxes" else detection.boxes_of(truths.labels_of(truth, number))
-        right[rows] = ranking.judged(box_px[rows], score[rows], true)
+        true = truth.boxes[number] if truth.kind == "boxes" else boxes.boxes_of(truths.labels_of(truth, number))
+        right[rows] = boxes.judged(box_px[rows], score[rows], true)
     return np.stack([score, right, frame], axis=1)
 
 

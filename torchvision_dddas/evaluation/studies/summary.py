@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.evaluation.metrics import bootstrap, metres
-from torchvision_dddas.evaluation.metrics.detection import Boxes, OneTarget
+from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget, ranking
 from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.ranking import ranking
-from torchvision_dddas.evaluation.metrics.segmentation import Pixels
-from torchvision_dddas.evaluation.metrics.still import Still
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
 from torchvision_dddas.evaluation.studies import estimates
 from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate

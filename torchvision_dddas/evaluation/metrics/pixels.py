@@ -1,4 +1,4 @@
-"""The source's six pixel measures, from counts that may be pooled over frames and clips."""
+"""The source's six pixel measures, from counts that may be pooled (appendix B, eq. 10 and 11)."""
 
 import math
 from typing import NamedTuple
@@ -49,3 +49,23 @@ def measures(pixels: Pixels) -> dict[str, float]:
 def ratio(part: float, whole: float) -> float:
     """Part / whole, NaN for 0/0."""
     return part / whole if whole else math.nan
+
+
+class Still(NamedTuple):
+    """Frames that were looked at, those with any blob, and the blobs."""
+
+    frames: int = 0
+    alarmed: int = 0
+    blobs: int = 0
+
+    def plus(self, other: "Still") -> "Still":
+        """The counts of both."""
+        return Still(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+def still_measures(counts: Still) -> dict[str, float]:
+    """False blobs a frame, and the share of frames with any."""
+    return {
+        "false_blobs_per_frame": ratio(counts.blobs, counts.frames),
+        "alarmed": ratio(counts.alarmed, counts.frames),
+    }

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.evaluation.metrics.detection import areas, iou
+from torchvision_dddas.evaluation.metrics.boxes import areas, iou
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 
