@@ -93,8 +93,8 @@ def score_clip(truth: Truth, result: Result, how: How, notes: list[str]) -> Clip
         counts, each = _summed(frames, (_by_masks if truth.kind == "masks" else _by_one)(truth, result, frames))
     elif truth.kind == "boxes" and (result.detected is not None or not followed):
         frames = _labelled(truth, result, how, notes)
-        boxes: dict[str, list[Any]] = {"boxes": [boxes.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
-        counts, each = _summed(frames, boxes)
+        matched = [boxes.match(result.boxes_at(f), truth.boxes[f]) for f in frames]
+        counts, each = _summed(frames, {"boxes": matched})
     if truth.tracks is not None and result.tracks is not None:
         scored, name, found, of_each = _by_tracks(truth, truth.tracks, result, result.tracks, how, notes)
         return ClipScore(max(len(frames), scored), {**counts, name: found}, {**each, name: of_each})
