@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def score(clip: "Clip", task: "Task", found: "Found", interval: int = 1) -> Scored:
     """Score one case. interval: of tracking and association, as `dddas evaluate --interval`.
 
-    Found boxes that neither count as right nor as false (see `ignored_regions.counted`) are left out of all counts. Raises
+    Boxes that count neither as right nor as false (see `ignored_regions.counted`) are left out. Raises
     InputError where the truth is missing, or does not fit what was found.
     """
     if task == "location":
