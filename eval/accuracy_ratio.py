@@ -24,8 +24,8 @@ from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics import accuracy_ratio as windows
 from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
+from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking.camera_motion import Camera
 from torchvision_dddas.tracking.sequence import Follower
