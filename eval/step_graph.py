@@ -81,7 +81,7 @@ def parity(frames: list[np.ndarray], graph: StepGraph, size: Size) -> dict[str, 
 
     from torchvision_dddas.export import traced_graphs as traced
 
-    module = traced.module("step", load_config("fast"), size)
+    module = traced.build_module("step", load_config("fast"), size)
     given = [torch.from_numpy(value) for value in graph.given.values()]
     greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
     corners, overlaps, ours, plain = [], [], [], []

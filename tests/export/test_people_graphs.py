@@ -1,4 +1,4 @@
-"""The graphs of people's scores: the shipped ones are what is made, and compute what `ops.hog` does."""
+"""The graphs of people's scores: the shipped ones are what is made, and compute what `functional.hog` does."""
 
 import math
 from pathlib import Path
@@ -17,9 +17,8 @@ import torch
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.export import manifest
 from torchvision_dddas.export import people_graphs as people
-from torchvision_dddas.export.checked import refuse_wrong
+from torchvision_dddas.export.graph_files import refuse_failed, write_graphs
 from torchvision_dddas.functional import hog
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.onnx_scorer import OnnxScorer
@@ -39,18 +38,18 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_graphs_of_any_layout_score_as_torch_does(layout):
-    assert people.largest_difference(people.graphs(layout), layout) < 3e-5
+    assert people.largest_difference(people.build_graphs(layout), layout) < 3e-5
 
 
 def test_the_same_layout_gives_the_same_bytes():
-    first, again = (people.graphs(hog.Layout()) for _ in range(2))
+    first, again = (people.build_graphs(hog.Layout()) for _ in range(2))
     assert first == again and tuple(first) == NAMES
-    assert all(first[name] != content for name, content in people.graphs(hog.Layout(bins=8)).items())
+    assert all(first[name] != content for name, content in people.build_graphs(hog.Layout(bins=8)).items())
 
 
 def test_the_shipped_graphs_are_those_that_are_made_now():
     """Node by node: the bytes may differ with the versions of onnx."""
-    for name, content in people.graphs(hog.Layout()).items():
+    for name, content in people.build_graphs(hog.Layout()).items():
         shipped, made = onnx.load(SHIPPED / name), onnx.load_from_string(content)
         assert list(shipped.graph.node) == list(made.graph.node)
         for one, other in zip(shipped.graph.initializer, made.graph.initializer, strict=True):
@@ -89,17 +88,6 @@ def whole_scores(image: np.ndarray, weights: np.ndarray, bias: float) -> np.ndar
     return found
 
 
-def test_a_clip_of_one_lets_all_numbers_pass():
-    given = people.example(hog.Layout(), (8, 8), 3, 0)
-    session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
-    clipped, free = (session.run(None, {**given, "clip": np.array(clip, np.float32)})[0] for clip in (0.05, 1.0))
-    bordered = torch.from_numpy(given["image"]).permute(2, 0, 1)[None].float()
-    svm = torch.from_numpy(given["weights"]), torch.from_numpy(given["bias"])
-    wanted = hog.scores(hog.blocks(bordered, hog.Layout(clip=1.0)), *svm)[0].numpy()
-    np.testing.assert_allclose(free, wanted, atol=2e-5)
-    assert np.abs(clipped - free).max() > 0.01
-
-
 def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
     changed: dict[str, Any] = {
         "cell_px": 4,
@@ -108,7 +96,7 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
         "window_width_px": 32,
         "window_height_px": 64,
     }
-    manifest.write(tmp_path / "own", people.made(PeopleParameters(**changed)))
+    write_graphs(tmp_path / "own", people.export_people(PeopleParameters(**changed)))
     parameters = PeopleParameters(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
     image = np.random.default_rng(1).integers(0, 256, (80, 70, 3), np.uint8)
     weights = np.random.default_rng(2).normal(0, 0.05, math.prod((7, 15, 4, 9))).astype(np.float32)
@@ -122,8 +110,8 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
 
 def test_graphs_that_are_off_are_refused(monkeypatch):
     monkeypatch.setattr(hog, "SOFT_FIRST", 0.2)
-    made = people.graphs(hog.Layout())
+    made = people.build_graphs(hog.Layout())
     monkeypatch.undo()
-    monkeypatch.setattr(people, "graphs", lambda _: made)
-    with pytest.raises(InputError, match=r"people.onnx does not agree with ops.hog: .* score where 5e-05"):
-        refuse_wrong(people.made(PeopleParameters()))
+    monkeypatch.setattr(people, "build_graphs", lambda _: made)
+    with pytest.raises(InputError, match=r"people.onnx does not agree with functional.hog: .* score, 5e-05"):
+        refuse_failed(people.export_people(PeopleParameters()))

@@ -1,4 +1,4 @@
-"""Graphs traced from `ops`: what torch computes, of standard operations, the same bytes each time.
+"""Graphs traced from `functional`: what torch computes, of standard operations, the same bytes each time.
 
 A graph takes time for every node, so the step is traced once, at a small size and with as little flow and morphology
 as there can be; eval/step_graph.py compares the whole of it, on real clips too.
@@ -14,14 +14,15 @@ pytest.importorskip("onnxscript")
 pytest.importorskip("torch")
 
 import onnx
-import onnxruntime
 import torch
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import traced_graphs as traced
-from torchvision_dddas.export.checked import Made
-from torchvision_dddas.export.graph_builder import OPSET
+from torchvision_dddas.export.graph_files import ExportedGraph, refuse_failed
+from torchvision_dddas.export.tracing import OPSET, open_session
+from torchvision_dddas.functional import homography
+from torchvision_dddas.runtime import SHIPPED
 
 SIZE, STEP_SIZE = (96, 80), (128, 96)
 LEAST = {
@@ -41,17 +42,17 @@ def fast() -> Settings:
 
 
 @pytest.fixture(scope="module")
-def made(fast: Settings) -> Made:
-    (found,) = traced.made("warp_difference", fast, SIZE).values()
+def made(fast: Settings) -> ExportedGraph:
+    (found,) = traced.export_segmentation("warp_difference", fast, SIZE).values()
     return found
 
 
 def test_the_graph_computes_what_torch_does_on_pictures_it_was_not_traced_with(made, fast):
     """Whole grey levels: what differs at all is a pixel in thousands, by rounding."""
-    graph = traced.module("warp_difference", fast, SIZE)
-    session = onnxruntime.InferenceSession(made.content, providers=["CPUExecutionProvider"])
+    graph = traced.build_module("warp_difference", fast, SIZE)
+    session = open_session(made.content)
     for seed in (5, 6):
-        given = traced.example("warp_difference", fast, SIZE, seed)
+        given = traced.example_pictures("warp_difference", fast, SIZE, seed)
         difference, mask = session.run(None, {name: value.numpy() for name, value in given.items()})
         wanted, wanted_mask = (value.numpy() for value in graph(*given.values()))
         assert wanted_mask.any() and not wanted_mask.all()
@@ -59,14 +60,15 @@ def test_the_graph_computes_what_torch_does_on_pictures_it_was_not_traced_with(m
         assert traced.overlap(mask, wanted_mask) > 0.999
 
 
+@pytest.mark.slow
 def test_the_whole_step_computes_what_torch_does_on_pictures_it_was_not_traced_with(fast):
     settings = with_parameters(fast, LEAST)
-    (made,) = traced.made("step", settings, STEP_SIZE).values()
-    assert all(check.passed for check in made.checks)
-    graph = traced.module("step", settings, STEP_SIZE)
-    session = onnxruntime.InferenceSession(made.content, providers=["CPUExecutionProvider"])
+    (made,) = traced.export_segmentation("step", settings, STEP_SIZE).values()
+    assert all(check.is_passed for check in made.checks)
+    graph = traced.build_module("step", settings, STEP_SIZE)
+    session = open_session(made.content)
     for seed in (1, 2):
-        given = traced.example("step", settings, STEP_SIZE, seed)
+        given = traced.example_pictures("step", settings, STEP_SIZE, seed)
         for tolerance_px in (2.0, 0.5):
             given["tolerance_px"] = torch.tensor(tolerance_px, dtype=torch.float64)
             matrix, inliers, tracked, _, mask = session.run(None, {name: v.numpy() for name, v in given.items()})
@@ -78,14 +80,9 @@ def test_the_whole_step_computes_what_torch_does_on_pictures_it_was_not_traced_w
             assert traced.overlap(mask, wanted[4]) > 0.98 and mask.any() and not mask.all()
 
 
-def test_the_same_graph_is_the_same_bytes(made, fast):
-    (again,) = traced.made("warp_difference", fast, SIZE).values()
-    assert again.content == made.content
-
-
 def test_the_threshold_is_an_input(made, fast):
-    session = onnxruntime.InferenceSession(made.content, providers=["CPUExecutionProvider"])
-    given = {n: v.numpy() for n, v in traced.example("warp_difference", fast, SIZE, 0).items()}
+    session = open_session(made.content)
+    given = {n: v.numpy() for n, v in traced.example_pictures("warp_difference", fast, SIZE, 0).items()}
     areas = [
         np.count_nonzero(session.run(["mask"], {**given, "threshold": np.array(level, np.uint8)})[0])
         for level in (10, 40, 254)
@@ -97,42 +94,45 @@ def test_only_standard_operations_are_used_and_inputs_have_names_of_our_own(made
     model = onnx.load_from_string(made.content)
     assert [(held.domain, held.version) for held in model.opset_import] == [("", OPSET)]
     assert {node.domain for node in model.graph.node} == {""} and not model.functions
-    assert tuple(value.name for value in model.graph.input) == traced.INPUTS["warp_difference"]
+    given = traced.example_pictures("warp_difference", load_config("fast"), SIZE, 0)
+    assert [value.name for value in model.graph.input] == list(given)
     assert tuple(value.name for value in model.graph.output) == traced.OUTPUTS["warp_difference"]
 
 
-def test_nothing_of_the_machine_is_in_the_file(made):
+def test_the_file_is_the_same_each_time_and_holds_nothing_of_the_machine(made, fast):
+    (again,) = traced.export_segmentation("warp_difference", fast, SIZE).values()
+    assert again.content == made.content
     for trace in (b".py", b"File ", str(Path.cwd()).encode(), torch.__version__.encode()):
         assert trace not in made.content
 
 
 def test_a_graph_that_computes_something_else_does_not_pass(made, fast):
-    assert all(check.passed for check in made.checks)
-    other = traced.module("warp_difference", with_parameters(fast, {"morphology.erode_px": 1}), SIZE)
-    examples = [traced.example("warp_difference", fast, SIZE, 0)]
-    assert not all(check.passed for check in traced.compared(made.content, other, "warp_difference", examples))
+    assert all(check.is_passed for check in made.checks)
+    other = traced.build_module("warp_difference", with_parameters(fast, {"morphology.erode_px": 1}), SIZE)
+    examples = [traced.example_pictures("warp_difference", fast, SIZE, 0)]
+    assert not all(check.is_passed for check in traced.compare(made.content, other, "warp_difference", examples))
 
 
 def test_settings_that_a_graph_cannot_hold_are_refused():
     with pytest.raises(
         InputError, match=r"difference.kind = to_reference .* got normalized with 2. Give --config fast"
     ):
-        traced.module("step", Settings(), SIZE)
+        traced.build_module("step", Settings(), SIZE)
 
 
 def test_a_picture_too_small_for_keypoints_is_refused(fast):
     with pytest.raises(InputError, match=r"room for 30 keypoints at 96x80; wanted 48"):
-        traced.module("step", fast, SIZE)
+        traced.build_module("step", fast, SIZE)
 
 
 @pytest.mark.parametrize("model", ["homography", "affine"])
 def test_the_step_finds_the_motion_of_the_background_and_what_moves_on_it(fast, model):
     """As torch runs it, before it is traced."""
     settings, size = with_parameters(fast, {"registration.model": model}), (320, 240)
-    given = traced.example("step", settings, size, 0)
-    known = traced.example("warp_difference", settings, size, 0)["neighbour_from_reference"].numpy()
+    given = traced.example_pictures("step", settings, size, 0)
+    known = traced.example_pictures("warp_difference", settings, size, 0)["neighbour_from_reference"].numpy()
     with torch.inference_mode():
-        matrix, inliers, tracked, difference, mask = traced.module("step", settings, size)(*given.values())
+        matrix, inliers, tracked, difference, mask = traced.build_module("step", settings, size)(*given.values())
     assert traced.corner_error(matrix.numpy(), known, (240, 320)) < (0.25 if model == "homography" else 1.0)
     assert (inliers > 0.8 * tracked).all() and difference.shape == mask.shape == (240, 320)
     assert mask[114:126, 128 + 4 : 148 - 4].any() or mask[72:92, 96:116].any()
@@ -141,13 +141,13 @@ def test_the_step_finds_the_motion_of_the_background_and_what_moves_on_it(fast, 
 
 def test_where_nothing_agrees_the_motion_is_the_identity_with_no_inliers(fast):
     size = (160, 120)
-    given = traced.example("step", fast, size, 0)
+    given = traced.example_pictures("step", fast, size, 0)
     given["neighbours"] = torch.randint(
         0, 256, (2, 120, 160), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
     )
     given["reference"] = torch.full((120, 160), 90, dtype=torch.uint8)
     with torch.inference_mode():
-        matrix, inliers, *_ = traced.module("step", fast, size)(*given.values())
+        matrix, inliers, *_ = traced.build_module("step", fast, size)(*given.values())
     np.testing.assert_array_equal(matrix.numpy(), np.tile(np.eye(3), (2, 1, 1)))
     assert not inliers.any()
 
@@ -160,3 +160,40 @@ def test_masks_and_matrices_are_compared_as_said():
     moved = np.eye(3)[None].copy()
     moved[0, :2, 2] = 3, 4
     assert traced.corner_error(moved, np.eye(3)[None], (10, 20)) == pytest.approx(5)
+
+
+@pytest.fixture(scope="module")
+def planes() -> dict[str, ExportedGraph]:
+    return traced.export_homographies()
+
+
+def test_homographies_place_4_to_16_landmarks_where_torch_does(planes):
+    refuse_failed(planes)
+    assert traced.homography_difference_px({name: made.content for name, made in planes.items()}) < 1e-6
+    assert traced.homography_difference_px({name: (SHIPPED / name).read_bytes() for name in planes}) < 1e-6
+
+
+def test_homographies_have_free_batches_and_landmarks_and_standard_operations(planes):
+    for made in planes.values():
+        model = onnx.load_from_string(made.content)
+        assert {node.domain for node in model.graph.node} == {""}
+        for value in model.graph.input:
+            assert [d.dim_param for d in value.type.tensor_type.shape.dim][:2] == ["B", "n"]
+
+
+def test_a_batch_of_homographies_is_the_same_as_one_after_the_other(planes):
+    given, session = traced.example_landmarks(6, 3, 1), open_session(planes["homography.onnx"].content)
+    together, _ = session.run(None, given)
+    for k in range(3):
+        alone, _ = session.run(None, {name: array[k : k + 1] for name, array in given.items()})
+        np.testing.assert_allclose(together[k : k + 1], alone, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("tilt", "is_seen"), [(-0.999, True), (-1.001, False)])
+def test_the_horizon_of_the_homography_graph_is_that_of_torch(planes, tilt: float, is_seen: bool):
+    corners = np.array([[[0.0, 0], [1, 0], [1, 1], [0, 1]]])
+    image = corners / (1 + corners @ (tilt, 0))[..., None]
+    given = {"ground": corners, "image": image, "weight": np.ones((1, 4))}
+    _, valid = open_session(planes["homography.onnx"].content).run(None, given)
+    torch_valid = homography.fit(*(torch.from_numpy(array) for array in given.values()))[1]
+    assert valid.item() == torch_valid.item() == is_seen

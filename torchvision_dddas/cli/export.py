@@ -35,11 +35,11 @@ def export(
     Writes the graphs and manifest.json (inputs, outputs, parameters, SHA-256, versions) under --out, once all agree
     with torch. `step` takes half a minute, the others seconds.
     """
-    from torchvision_dddas import export as exporting
     from torchvision_dddas.config import load_config
+    from torchvision_dddas.export import GRAPHS, export_graphs
 
     if list_:
-        for name, about in exporting.GRAPHS.items():
+        for name, about in GRAPHS.items():
             typer.echo(f"{name:16s} {about}")
         return
     sizes = [size_of(text) for text in size or ["640x480"]]
@@ -48,17 +48,17 @@ def export(
         raise InputError(f"--out {out} is a file; wanted a folder for the graphs")
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise InputError(f"dddas export needs {', '.join(missing)}; pip install 'torchvision-dddas[torch,export]'")
-    files: dict[str, exporting.Made] = {}
-    for name, found in exporting.made(graph or list(exporting.GRAPHS), settings, sizes):
+    from torchvision_dddas.export.graph_files import ExportedGraph, write_graphs
+
+    files: dict[str, ExportedGraph] = {}
+    for name, found in export_graphs(graph or list(GRAPHS), settings, sizes):
         files |= found
         if not quiet:
             checks = "; ".join(
                 f"{c.off:.1e} {c.unit} off, {c.limit:g} allowed" for c in next(iter(found.values())).checks
             )
             typer.echo(f"{name}: {', '.join(found)}: compared with torch: {checks}", err=True)
-    from torchvision_dddas.export.manifest import write
-
-    write(out, files)
+    write_graphs(out, files)
     if not quiet:
         for name, made in files.items():
             typer.echo(f"{out / name}: {len(made.content)} bytes")

@@ -1,20 +1,22 @@
 """ONNX graphs of our functions, each compared with torch before it is written: `dddas export`. Needs torch and onnx.
 
-The graphs of people and of homographies are built node by node (people.py, plane.py), as ONNX Runtime runs them on a
-small CPU; the package ships them. The others are traced from `ops` by torch's exporter (traced.py) for one size of
-picture, for accelerators. The same versions write the same bytes.
+The graphs of people are built node by node (people_graphs.py), as ONNX Runtime runs them on a small CPU. The others are
+traced from `functional` by torch's exporter (traced_graphs.py). The package ships those of people and of homographies.
+The same versions write the same bytes.
 """
 
 import os
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.export.checked import Made
 
-__all__ = ["GRAPHS", "Made", "made"]
+if TYPE_CHECKING:
+    from torchvision_dddas.export.graph_files import ExportedGraph
 
-# What can be asked for, and what it is.
+__all__ = ["GRAPHS", "export_graphs"]
+
 GRAPHS = {
     "people": "HOG and a linear SVM for people, of the layout of people.*; shipped for the default one",
     "homography": "plane homographies from landmarks; shipped",
@@ -23,27 +25,24 @@ GRAPHS = {
 }
 
 
-def made(
-    names: Sequence[str], settings: Settings, sizes: Sequence[tuple[int, int]]
-) -> Iterator[tuple[str, dict[str, Made]]]:
-    """The files of each graph in turn, compared with torch; nothing is written. sizes: (width, height) in px.
+def export_graphs(
+    names: Sequence[str], settings: Settings, sizes_px: Sequence[tuple[int, int]]
+) -> "Iterator[tuple[str, dict[str, ExportedGraph]]]":
+    """Make the files of each graph in turn and compare them with torch; nothing is written. sizes_px: (width, height).
 
-    Raises InputError for an unknown graph, and settings that a graph cannot hold.
+    Raises InputError for an unknown graph, and for settings that a graph cannot hold.
     """
     if unknown := [name for name in names if name not in GRAPHS]:
         raise InputError(f"no graph is named '{unknown[0]}'; there are {', '.join(GRAPHS)}")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads that spin take the cores from the others
+    from torchvision_dddas.export.people_graphs import export_people
+    from torchvision_dddas.export.traced_graphs import export_homographies, export_segmentation
+
     for name in dict.fromkeys(names):
         if name == "people":
-            from torchvision_dddas.export import people_graphs as people
-
-            yield name, people.made(settings.people)
+            yield name, export_people(settings.people)
         elif name == "homography":
-            from torchvision_dddas.export import plane_graphs as plane
-
-            yield name, plane.made()
+            yield name, export_homographies()
         else:
-            from torchvision_dddas.export import traced_graphs as traced
-
-            for size in dict.fromkeys(sizes):
-                yield name, traced.made(name, settings, size)
+            for size_px in dict.fromkeys(sizes_px):
+                yield name, export_segmentation(name, settings, size_px)

@@ -1,4 +1,4 @@
-"""The graphs that score windows for people, from the constants of `ops.hog`.
+"""The graphs that score windows for people, built node by node from the constants of `functional.hog`.
 
     people.onnx             uint8 picture (H + 2, W + 2, 3 or 1) with a border of one pixel -> `scores` (ny, nx)
     people_histograms.onnx  `polar` (1, 2, H, W), magnitude and magnitude x direction in radians, -> `histograms`
@@ -7,27 +7,29 @@
 
 The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
 tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
-of the same cells, blocks and bins runs on them, with windows of any size: `weights` are what `ops.hog.arranged` gives.
+of the same cells, blocks and bins runs on them, with windows of any size: `functional.hog.arranged` gives `weights`.
 
-The graphs are built node by node: what torch's exporter makes of `ops.hog` is right too, but takes 160 ns a pixel on
-one core at 640x480 where people.onnx takes 110 and people_histograms.onnx 14 (cv2.HOGDescriptor all in all 54), as ONNX
-Runtime has quick convolutions and slow copies.
+Traced graphs of `functional.hog` are right too, but take 160 ns a pixel on one core at 640x480 where people.onnx takes
+110 and people_histograms.onnx 14 (cv2.HOGDescriptor in all 54): ONNX Runtime has quick convolutions and slow copies.
 """
 
 import math
+from typing import Any
 
 import numpy as np
-import onnxruntime
+import onnx
 import torch
-from onnx import TensorProto
+from onnx import TensorProto, helper, numpy_helper
 
 from torchvision_dddas.config import PeopleParameters
-from torchvision_dddas.export.checked import Check, Made
-from torchvision_dddas.export.graph_builder import FAR, Graph
+from torchvision_dddas.export.graph_files import Check, ExportedGraph
+from torchvision_dddas.export.tracing import OPSET, open_session
 from torchvision_dddas.functional import hog
 from torchvision_dddas.people.onnx_scorer import BAKED
 from torchvision_dddas.people.torch_scorer import layout
 
+IR_VERSION = 10
+FAR = 2**31 - 1  # an end of a slice: the last
 TOLERANCE = 5e-5
 CHANNELS = 16  # ONNX Runtime's quick convolutions take channels by 16, on smaller vectors by 8 or 4
 ABOUT = {
@@ -37,20 +39,61 @@ ABOUT = {
 }
 
 
-def made(parameters: PeopleParameters) -> dict[str, Made]:
+def export_people(parameters: PeopleParameters) -> dict[str, ExportedGraph]:
     """The files by their names, compared with torch."""
     wanted = layout(parameters)
-    files = graphs(wanted)
+    files = build_graphs(wanted)
     check = Check("score", largest_difference(files, wanted), TOLERANCE)
-    return {name: Made(content, ABOUT[name], "ops.hog", baked(wanted), (check,)) for name, content in files.items()}
+    held, source = baked(wanted), "functional.hog"
+    return {name: ExportedGraph(files[name], about, source, held, (check,)) for name, about in ABOUT.items()}
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# The steps of `ops.hog`.
+class GraphBuilder:
+    """Builds a graph: a call adds a node and returns its output's name."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[bytes, onnx.TensorProto] = {}
+
+    def __call__(self, operation: str, *inputs: str, out: str = "", **attributes: Any) -> str:
+        """A node of one output; out: its name, if it matters."""
+        out = out or f"{operation.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operation, list(inputs), [out], name=out, **attributes))
+        return out
+
+    def number(self, *values: float) -> str:
+        """A float32 constant: a number, or a vector."""
+        return self.constant(np.array(values if len(values) > 1 else values[0], np.float32))
+
+    def whole(self, *values: int) -> str:
+        """A vector of int64."""
+        return self.constant(np.array(values, np.int64))
+
+    def constant(self, array: np.ndarray) -> str:
+        """An array, once however often it is asked for."""
+        key = str(array.dtype).encode() + str(array.shape).encode() + array.tobytes()
+        name = f"constant_{len(self.constants)}"
+        return self.constants.setdefault(key, numpy_helper.from_array(array, name)).name
+
+    def cut(self, name: str, axis: int, begin: int, end: int) -> str:
+        """A stretch of one axis."""
+        return self("Slice", name, self.whole(begin), self.whole(end), self.whole(axis))
+
+    def model(self, inputs: dict, outputs: dict, properties: dict[str, str], name: str = "people") -> bytes:
+        """The file's content. inputs, outputs: {name: (type, shape)}."""
+        given, found = (
+            [helper.make_tensor_value_info(value, kind, shape) for value, (kind, shape) in held.items()]
+            for held in (inputs, outputs)
+        )
+        graph = helper.make_graph(self.nodes, name, given, found, initializer=list(self.constants.values()))
+        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        helper.set_model_props(made, properties)
+        onnx.checker.check_model(made, full_check=True)
+        return made.SerializeToString(deterministic=True)
 
 
-def polar(graph: Graph, image: str, layout: hog.Layout) -> str:
-    """`ops.hog.gradient` and `angle`: (1, 2, H, W)."""
+def polar(graph: GraphBuilder, image: str, layout: hog.Layout) -> str:
+    """`functional.hog.gradient` and `angle`: (1, 2, H, W)."""
     levels = graph("Transpose", graph("Expand", image, graph.whole(1, 1, 3)), perm=[2, 0, 1])
     levels = graph("Cast", levels, to=TensorProto.FLOAT)
     if layout.gamma:
@@ -88,8 +131,8 @@ def polar(graph: Graph, image: str, layout: hog.Layout) -> str:
     return graph("Unsqueeze", both, graph.whole(0))
 
 
-def histograms(graph: Graph, polar: str, layout: hog.Layout, out: str = "") -> str:
-    """From `ops.hog.ramps` to the middle of `blocks`: (F, ny, nx), not yet normalised.
+def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "") -> str:
+    """From `functional.hog.ramps` to the middle of `blocks`: (F, ny, nx), not yet normalised.
 
     Ramps are a convolution of one pixel with the rectifier that follows it; pooling is one of each channel by itself,
     over rows, then over columns; the hats and the order of a block's numbers are one of one pixel again.
@@ -116,14 +159,14 @@ def histograms(graph: Graph, polar: str, layout: hog.Layout, out: str = "") -> s
     return graph("Squeeze", found, graph.whole(0), out=out)
 
 
-def pool(graph: Graph, maps: str, weights: np.ndarray, channels: int, stride: tuple[int, int]) -> str:
+def pool(graph: GraphBuilder, maps: str, weights: np.ndarray, channels: int, stride: tuple[int, int]) -> str:
     """Weighted sums of each channel by itself."""
     kernel = graph.constant(np.ascontiguousarray(np.broadcast_to(weights, (channels, 1, *weights.shape))))
     return graph("Conv", maps, kernel, kernel_shape=list(weights.shape), strides=list(stride), group=channels)
 
 
-def scores(graph: Graph, histograms: str, layout: hog.Layout, out: str) -> str:
-    """The end of `ops.hog.blocks`, and `scores`: (ny - down + 1, nx - across + 1)."""
+def scores(graph: GraphBuilder, histograms: str, layout: hog.Layout, out: str) -> str:
+    """The end of `functional.hog.blocks`, and `scores`: (ny - down + 1, nx - across + 1)."""
     size = layout.bins * layout.cells**2
     flat = graph("Reshape", histograms, graph.whole(size, -1))
     # Sums over a block's numbers as products with ones: ONNX Runtime is slow at sums over the first axis.
@@ -147,7 +190,7 @@ def scores(graph: Graph, histograms: str, layout: hog.Layout, out: str) -> str:
     places = graph("Mul", ny, nx)
     weights = graph("Reshape", "weights", graph.whole(-1, size))
     part = graph("MatMul", weights, blocks)
-    # Sums over a window's blocks: see `ops.hog.scores`.
+    # Sums over a window's blocks: see `functional.hog.scores`.
     part = graph("Pad", graph("Reshape", part, joined(down, rest)), joined(graph.whole(0, 0, 0), across))
     part = graph("ReduceSum", graph("Reshape", part, joined(down, across, rest)), one, keepdims=0)
     more = graph("Mul", down, nx)
@@ -158,7 +201,7 @@ def scores(graph: Graph, histograms: str, layout: hog.Layout, out: str) -> str:
     return graph("Add", graph("Slice", part, graph.whole(0, 0), ends, graph.whole(0, 1)), "bias", out=out)
 
 
-def graphs(layout: hog.Layout) -> dict[str, bytes]:
+def build_graphs(layout: hog.Layout) -> dict[str, bytes]:
     """Files by their names."""
     size = layout.bins * layout.cells**2
     number: tuple[int, list] = (TensorProto.FLOAT, [])
@@ -168,7 +211,7 @@ def graphs(layout: hog.Layout) -> dict[str, bytes]:
     held = {"histograms": (TensorProto.FLOAT, [size, "ny", "nx"])}
     found = {"scores": (TensorProto.FLOAT, ["windows down", "windows across"])}
     properties = {name: str(value) for name, value in baked(layout).items()}
-    whole, first, second = Graph(), Graph(), Graph()
+    whole, first, second = GraphBuilder(), GraphBuilder(), GraphBuilder()
     scores(whole, histograms(whole, polar(whole, "image", layout), layout), layout, "scores")
     histograms(first, "polar", layout, "histograms")
     scores(second, "histograms", layout, "scores")
@@ -183,10 +226,6 @@ def baked(layout: hog.Layout) -> dict[str, int]:
     """The parameters that a graph is made for."""
     values = layout.cell, layout.block, layout.stride, layout.bins, int(layout.signed), int(layout.gamma)
     return dict(zip(BAKED, values, strict=True))
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Checking them.
 
 
 def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
@@ -207,10 +246,7 @@ def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int
 
 def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
     """Between the graphs' scores and torch's, over pictures and windows of several sizes."""
-    sessions = {
-        name: onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        for name, content in files.items()
-    }
+    sessions = {name: open_session(content) for name, content in files.items()}
 
     def run(name: str, given: dict[str, np.ndarray]) -> np.ndarray:
         wanted = [entry.name for entry in sessions[name].get_inputs()]

@@ -1,8 +1,8 @@
-"""From a module of torch to a file that any runtime reads: standard operations only, nothing of the machine.
+"""From a torch module to an ONNX file of standard operations that holds nothing of the machine that made it.
 
-By torch's older exporter, which traces: on the whole step the newer one takes minutes where this one takes 20 seconds.
-Two things to know of it: it has no `.mT`, which is added here, and counts a negative dimension of `unfold` wrongly
-without a word, so that a graph is only worth what its comparison with torch says.
+Uses torch's older exporter, which traces: on the whole step the newer one takes minutes and this one 20 seconds. It has
+no `.mT`, which is added here, and it counts a negative dimension of `unfold` wrongly without an error, so every graph
+must be compared with torch.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,34 +21,46 @@ from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.export.graph_builder import OPSET
 
-TRANSPOSED = "aten::mT"
+OPSET = 20
 
 
-def traced(
-    graph: nn.Module, name: str, given: Sequence[Tensor], inputs: Sequence[str], outputs: Sequence[str]
+def trace_graph(
+    module: nn.Module,
+    name: str,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    free_axes: Mapping[str, Mapping[int, str]] | None = None,
 ) -> bytes:
-    """The file of a module, traced on the tensors given; the same versions give the same bytes.
+    """The ONNX file of a module, traced on the tensors given; the same versions give the same bytes.
 
-    inputs, outputs: names of our own. Raises InputError where torch makes it of operations that are not standard.
+    free_axes: names of axes of any length, by input or output. Raises InputError if the result is not of standard
+    operations.
     """
     file = io.BytesIO()
     with _quiet(), _transpose_known(), torch.no_grad():
         torch.onnx.export(
-            graph,
-            tuple(given),
+            module,
+            tuple(inputs.values()),
             file,  # type: ignore[arg-type]  # the older exporter takes it
             dynamo=False,
             opset_version=OPSET,
-            input_names=inputs,
-            output_names=outputs,
+            input_names=list(inputs),
+            output_names=list(outputs),
+            dynamic_axes=free_axes,
         )
-    return bare(folded(file.getvalue()), name)
+    return _strip(_fold_constants(file.getvalue()), name)
 
 
-def folded(content: bytes) -> onnx.ModelProto:
-    """A graph without what does not depend on its inputs, which is nearly two nodes of three: it opens sooner."""
+def open_session(content: bytes) -> onnxruntime.InferenceSession:
+    """A session of a graph on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def _fold_constants(content: bytes) -> onnx.ModelProto:
+    """The graph without nodes that do not depend on its inputs, nearly two of three: it opens sooner."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC  # standard operations
@@ -60,18 +72,18 @@ def folded(content: bytes) -> onnx.ModelProto:
         return onnx.load(path)
 
 
-def bare(model: onnx.ModelProto, name: str) -> bytes:
-    """A model without what tells where and how it was made."""
-    model.graph.name, model.doc_string, model.graph.doc_string = name, "", ""
-    model.producer_name, model.producer_version = "", ""
-    del model.metadata_props[:], model.graph.value_info[:], model.functions[:]
+def _strip(model: onnx.ModelProto, name: str) -> bytes:
+    """The model without what tells where and how it was made."""
     graph = model.graph
+    graph.name, model.doc_string, model.producer_name, model.producer_version = name, "", "", ""
+    del model.metadata_props[:], graph.value_info[:], model.functions[:]
     for held in (graph, *graph.node, *graph.initializer, *graph.input, *graph.output):
         held.doc_string = ""
         del held.metadata_props[:]
     if strange := {node.domain for node in graph.node} - {""}:
         raise InputError(
-            f"torch's exporter made {name} of operations of {', '.join(strange)}; another torch may do better"
+            f"torch's exporter made {name} of operations of {', '.join(strange)}, wanted standard ones; "
+            "try another version of torch"
         )
     opsets = [held for held in model.opset_import if held.domain == ""]
     del model.opset_import[:]
@@ -95,7 +107,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _transpose_known() -> Iterator[None]:
-    """The exporter can do `.mT` meanwhile."""
+    """Teach the exporter `.mT` meanwhile."""
 
     def last_two_swapped(context: Any, matrix: Any) -> Any:
         rank = symbolic_helper._get_tensor_rank(matrix)
@@ -103,8 +115,8 @@ def _transpose_known() -> Iterator[None]:
         order = [*range(rank - 2), rank - 1, rank - 2]
         return context.op("Transpose", matrix, perm_i=order)
 
-    torch.onnx.register_custom_op_symbolic(TRANSPOSED, last_two_swapped, 9)  # type: ignore[attr-defined]
+    torch.onnx.register_custom_op_symbolic("aten::mT", last_two_swapped, 9)  # type: ignore[attr-defined]
     try:
         yield
     finally:
-        torch.onnx.unregister_custom_op_symbolic(TRANSPOSED, 9)  # type: ignore[attr-defined]
+        torch.onnx.unregister_custom_op_symbolic("aten::mT", 9)  # type: ignore[attr-defined]
