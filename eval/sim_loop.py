@@ -28,7 +28,7 @@ from sim_scenes import CONFIG
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.control.mission_api import Begun, mission_of
+from torchvision_dddas.control import StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.pipeline import survey
@@ -93,8 +93,8 @@ def work(case: Case) -> Case:
     parameters = {name: value for name, value in case["set"].items() if name != "every"}
     settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
     timed = Timed(source, case["set"].get("every", 1))
-    begun = Begun(timed)
-    mission = mission_of(begun, settings, "onboard")
+    begun = StartedSource(timed)
+    mission = build_mission(begun, settings, "onboard")
     engine = load_engine("onboard", mission.settings)
     scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
     stages: Counter[str] = Counter()

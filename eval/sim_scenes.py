@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.control.mission_api import Begun, fitted
+from torchvision_dddas.control import StartedSource, fit_settings
 from torchvision_dddas.control.rules import every_least
 from torchvision_dddas.detection import detect_motion, pixels_per_metre
 from torchvision_dddas.evaluation.metrics.crowd_frames import shown
@@ -56,7 +56,9 @@ class Way:
 
 def usual(source: SimulatorSource, more: dict[str, object] | None = None) -> Settings:
     """What `dddas run sim:` takes, and more."""
-    return with_parameters(fitted(load_config(CONFIG, (), scenario_settings(source.scenario)), source), more or {})
+    return with_parameters(
+        fit_settings(load_config(CONFIG, (), scenario_settings(source.scenario)), source), more or {}
+    )
 
 
 class OnceAFrame:
@@ -202,7 +204,7 @@ def located(scenario: Scenario, ways: Sequence[Way], parts_s: Sequence[float] = 
     truths: dict[int, Truth] = {}
     settings = usual(source)
     # As many frames are left out as the closed loop does before anything is found.
-    begun: Any = Begun(source)
+    begun: Any = StartedSource(source)
     scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
     least = every_least(scale, source.rate_hz, settings.steering)
     source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))

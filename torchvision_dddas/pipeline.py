@@ -16,7 +16,7 @@ from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
 from torchvision_dddas.types import Fix, FrameResult, Scene, Telemetry, TrackedFrame
 
 if TYPE_CHECKING:
-    from torchvision_dddas.control.mission_api import Mission
+    from torchvision_dddas.control import Mission
 
 
 class Clip(detection.Clip, Protocol):
@@ -57,7 +57,7 @@ def survey(
                 yield scene
                 continue
             if mission is not None:
-                mission.refresh(scene)
+                mission.take_reports(scene)
             watched = group_crowds(watch.update(scene), watch.locator, source.rate_hz)
             waiting[scene.frame.number] = watched if pictures else _unpictured(watched)
             if seen is not None:
@@ -72,7 +72,7 @@ def survey(
         if crowds is not None:
             followed = _with_crowd_identities(followed, past[-1].fixed.fix, watch.locator, crowds)
         surveyed = _located(followed, past, watch.locator)
-        yield surveyed if mission is None else mission.after(surveyed, past[-1].scene.step)
+        yield surveyed if mission is None else mission.steer(surveyed, past[-1].scene.step)
 
 
 def _with_crowd_identities(

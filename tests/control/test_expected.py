@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import GroundParameters
-from torchvision_dddas.control.expected_regions import expected_regions
+from torchvision_dddas.control.ground_confirmation import expected_regions
 from torchvision_dddas.types import Camera
 
 CAMERA = Camera("", (640, 480), (600.0, 600.0), (319.5, 239.5), height_m=1.3, position_sigma_m=0.1)

@@ -8,7 +8,7 @@ import pytest
 from tests.simulation.small import small
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
-from torchvision_dddas.control.mission_api import Begun, Mission, mission_of
+from torchvision_dddas.control import Mission, StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.pipeline import survey
 from torchvision_dddas.simulation import SimulatorSource
@@ -53,8 +53,8 @@ def fly(overrides=(), seconds=6.0, **tables) -> Flight:
 
     simulated.steer = told  # type: ignore[method-assign]
     settings = load_config("patrol", [*overrides])
-    source = Begun(simulated)
-    mission = mission_of(source, settings, "onboard", scenario.clip.located_by == "landmarks")
+    source = StartedSource(simulated)
+    mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
     flown = Flight(simulated, mission, steered=steered)
     engine = load_engine("onboard", mission.settings)
     for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):

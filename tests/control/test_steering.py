@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import Settings, SteeringParameters
-from torchvision_dddas.control.steering_api import Steering
+from torchvision_dddas.control import Steering
 from torchvision_dddas.geo.landmark_trajectories import best_spread, spread_m2
 from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.types import (
@@ -89,7 +89,7 @@ SQUARE = np.array([[14, 14], [-14, 14], [-14, -14], [14, -14]], float)
 def test_nothing_known_changes_nothing():
     steering = Steering(Settings(), CAMERA, RATE_HZ, names(4))
     for frame in range(1, 30):
-        command, made = steering.step(located(frame, []), None, frame / RATE_HZ, team_at(SQUARE), None)
+        command, made = steering.update(located(frame, []), None, frame / RATE_HZ, team_at(SQUARE), None)
         assert (command.every, command.look_at, command.fly_to, command.altitude_m, command.orders) == (
             1,
             *3 * [None],
@@ -151,7 +151,7 @@ class World:
             marks = replace(marks, landmark=marks.landmark[reported], east_north_m=places[reported])
             flight = None if self.silent else flown(pose)
             confirmed = judged(settled.frame, *kinds) if kinds else None
-            command, made = self.steering.step(settled, confirmed, self.now_s, marks, flight)
+            command, made = self.steering.update(settled, confirmed, self.now_s, marks, flight)
             self.commands.append(command)
             self.made.extend(made)
             self._obey(command)
@@ -302,7 +302,7 @@ def test_silent_telemetry_is_survived_by_what_the_pictures_tell():
     deaf = Steering(Settings(), CAMERA, RATE_HZ, names(4))
     for frame in range(1, 30):
         blind = replace(located(frame, [[1, 2]]), fix=Fix(frame, "", cause="nothing"))
-        command, _ = deaf.step(blind, None, frame / RATE_HZ + 1, team_at(SQUARE), None)
+        command, _ = deaf.update(blind, None, frame / RATE_HZ + 1, team_at(SQUARE), None)
     assert command.look_at is None and len(command.orders) == 4
 
 
@@ -431,7 +431,7 @@ def sampled_by(targets, velocity, speed_m_s=0.5, misses=None, step=None, size_m=
         here = targets + velocity * frame / SAMPLED_HZ
         gone = misses is not None and frame in misses
         seen = located(frame, [] if gone else here, [] if gone else velocity, size_m=size_m, rate_hz=SAMPLED_HZ)
-        command, new = steering.step(
+        command, new = steering.update(
             seen, None, frame / SAMPLED_HZ + 1, team_at(SQUARE), flown(pose_at((0, 0)), speed_m_s), step
         )
         every.append(command.every)

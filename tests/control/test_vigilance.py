@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.control.mission_api import Vigilance
+from torchvision_dddas.control import SensorMonitor
 from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 
 RATE_HZ = 10.0
@@ -38,12 +38,12 @@ def standing(until, which=(0, 1)):
 
 def watched(until, rows, times=None):
     """All that is noticed from frame to frame, as (frame, text)."""
-    watch = Vigilance(("ugv1", "ugv2"), RATE_HZ)
+    watch = SensorMonitor(("ugv1", "ugv2"), RATE_HZ)
     times = np.arange(until) / RATE_HZ if times is None else np.asarray(times)
     said = []
     for now in range(1, until + 1):
         there = reports([row for row in rows if row[0] <= now or len(row) == 5])
-        watch.reports(now, there, telemetry(times[times <= (now - 1) / RATE_HZ + 1e-9]))
+        watch.check_reports(now, there, telemetry(times[times <= (now - 1) / RATE_HZ + 1e-9]))
         said += [(notice.frame, notice.text) for notice in watch.notices()]
     return said
 
@@ -89,14 +89,14 @@ def test_a_leap_is_told_with_its_length_there_and_back():
 
 def film(moves_px, frozen=()):
     """What is noticed of pictures of which the ground moves by so many pixels each; 0.1 m a pixel."""
-    watch, rng = Vigilance((), RATE_HZ), np.random.default_rng(0)
+    watch, rng = SensorMonitor((), RATE_HZ), np.random.default_rng(0)
     image, said = rng.integers(1, 255, (48, 64, 3), np.uint8), []
     for k, moved in enumerate(moves_px):
         if k not in frozen:
             image = rng.integers(1, 255, (48, 64, 3), np.uint8)
         step = np.eye(3)
         step[0, 2] = moved
-        watch.picture(Frame(k + 1, k / RATE_HZ, image), Registration(step, 100, 100, 0.1, abs(moved)), 0.1)
+        watch.check_picture(Frame(k + 1, k / RATE_HZ, image), Registration(step, 100, 100, 0.1, abs(moved)), 0.1)
         said += [(notice.frame, notice.text) for notice in watch.notices()]
     return said
 

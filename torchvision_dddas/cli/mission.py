@@ -13,7 +13,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.control.mission_api import Mission
+    from torchvision_dddas.control import Mission
     from torchvision_dddas.evaluation.metrics.crowds import CrowdScore
     from torchvision_dddas.io.output.run_record import Record
     from torchvision_dddas.simulation import SimulatorSource
@@ -74,7 +74,7 @@ def fly_into(
     with SimulatedRunOutput(folder, save) as output:
         from torchvision_dddas import geometry
         from torchvision_dddas.config import load_config
-        from torchvision_dddas.control.mission_api import Begun, mission_of
+        from torchvision_dddas.control import StartedSource, build_mission
         from torchvision_dddas.detection import load_engine
         from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
         from torchvision_dddas.pipeline import survey
@@ -92,8 +92,8 @@ def fly_into(
         settings = load_config(config or CONFIG, overrides, own)
         with name_scenario_in_errors(scenario):
             simulated = SimulatorSource(chosen, Path(scenario).stem)
-        source: Any = Begun(simulated)
-        mission = mission_of(source, settings, backend, chosen.clip.located_by == "landmarks")
+        source: Any = StartedSource(simulated)
+        mission = build_mission(source, settings, backend, chosen.clip.located_by == "landmarks")
         engine = load_engine(backend, mission.settings)
         journal = _begin(output, mission, simulated, engine.name)
         output.knows(partial(geometry.lonlat, origin_deg=simulated.origin_deg))

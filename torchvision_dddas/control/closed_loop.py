@@ -1,51 +1,142 @@
-"""The loop about the whole path: reports come in, what is found goes out as commands."""
+"""The closed loop: reports come in, results go out as commands to the aerial vehicle and the ground vehicles."""
 
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.control.ground_confirmation import CloserLook
-from torchvision_dddas.control.sensor_monitor import Notice, Vigilance
-from torchvision_dddas.control.steering_api import Steering
-from torchvision_dddas.control.vehicles import Instrument
+from torchvision_dddas.control.footprint import CameraMount, ground_in_middle, inside, update_mount
+from torchvision_dddas.control.ground_confirmation import GroundConfirmation
+from torchvision_dddas.control.prediction import Prediction, TargetPredictor
+from torchvision_dddas.control.rules import (
+    AdjustmentLog,
+    every_least,
+    every_wanted,
+    sampled,
+)
+from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
+from torchvision_dddas.control.uav_commands import UavSteering
+from torchvision_dddas.control.ugv_commands import UgvTeam
+from torchvision_dddas.detection import interval_from_flow, interval_from_telemetry, pixels_per_metre
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geo.terrain import shift_origin
 from torchvision_dddas.people.detector import recognizer_of
-from torchvision_dddas.types import Command, Elevation, FrameResult, Landmarks, Order, Registration, Scene, Telemetry
+from torchvision_dddas.types import (
+    Adjustment,
+    AerialLocations,
+    Camera,
+    Colours,
+    Command,
+    Confirmation,
+    Elevation,
+    Flight,
+    Frame,
+    FrameResult,
+    GroundPicture,
+    LandmarkObservations,
+    Landmarks,
+    Order,
+    Registration,
+    Scene,
+    Telemetry,
+)
 
-MEMORY_S = 15.0
-"""Reports this old no longer tell where anything is: the rest of a long run would only cost time."""
+# Reports this old are dropped: in a long run they would only cost time.
+_MEMORY_S = 15.0
+# Vehicles get new goals this often at most: results are a second old, and vehicles do not turn faster.
+_PERIOD_S = 0.2
+# After a target was lost every frame is processed for this time.
+_ALERT_S = 4.0
+# Fewer frames are processed only this time after the last change.
+_CALM_S = 3.0
+# A target is lost once this many frames in a row do not show it.
+_MISSED = 2
+# A registration is weak if a smaller share of its points agrees.
+_WEAK = 0.5
 
 
-def mission_of(source: Instrument, settings: Settings, backend: str, by_landmarks: bool = True) -> "Mission":
-    """Everything about a source that can be steered, whose first frame has been read: it has reports by then.
+class Instrument(Protocol):
+    """A source of frames that can be steered, such as the simulator, and the reports of its vehicles.
 
-    by_landmarks: whether the ground vehicles' markers are looked for; else telemetry alone lays pictures on the ground.
-    Raises InputError where the reports do not do.
+    camera: the aerial one. colours: of the landmarks. elevation: of the ground, in metres about origin_deg, longitude
+    and latitude. sun_rad: azimuth and height of the sun, None where unknown. plate_m: height of the landmarks' colours
+    above ground.
     """
-    settings = fitted(settings, source)
-    site = _site_of(source)
-    site = replace(site, elevation=_elevation(source, site), sun_rad=source.sun_rad)
+
+    name: str
+    count: int | None
+    exact: bool
+    rate_hz: float
+    size: tuple[int, int]
+    last: int
+    camera: Camera
+    colours: Colours
+    elevation: Elevation
+    origin_deg: tuple[float, float]
+    sun_rad: tuple[float, float] | None
+    plate_m: float
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def steer(self, command: Command) -> None:
+        """Follow a command from the next frame on; places in degrees."""
+
+    def landmarks(self) -> Landmarks:
+        """All that ground vehicles reported until now, in degrees."""
+
+    def telemetry(self) -> Telemetry:
+        """All that the aerial vehicle reported of itself until now, in degrees."""
+
+    def pictures(self) -> list[GroundPicture]:
+        """The pictures of ground vehicles since the last call."""
+
+
+class StartedSource:
+    """A source whose first frame has been read, so that its vehicles have reported; otherwise unchanged."""
+
+    def __init__(self, source: Instrument) -> None:
+        self._source, self._frames = source, iter(source)
+        self._first = next(self._frames, None)
+
+    def __iter__(self) -> Iterator[Frame]:
+        if self._first is not None:
+            yield self._first
+            self._first = None
+        yield from self._frames
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+
+def build_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool = True) -> "Mission":
+    """The closed loop around a source whose first frame has been read: it has reports by then.
+
+    by_landmarks: whether the ground vehicles' markers are looked for; else telemetry alone gives the camera's pose.
+    Raises InputError where the reports are not sufficient.
+    """
+    settings = fit_settings(settings, source)
+    site = _first_site(source)
+    site = replace(site, elevation=_local_elevation(source, site), sun_rad=source.sun_rad)
     locator = AerialLocator.from_site(site, source.camera, settings, load_solver(backend), source.rate_hz, True)
-    colours = source.colours
-    by_landmarks = by_landmarks and len(colours) > 0
-    watch = (
-        LandmarkWatch(locator, colours, load_colours(backend)) if by_landmarks else LandmarkWatch(locator, None, None)
-    )
-    closer = CloserLook(settings, recognizer_of(settings.people, backend)) if len(colours) else None
+    colours = source.colours if by_landmarks and len(source.colours) else None
+    watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
+    confirmation = None
+    if len(source.colours):
+        confirmation = GroundConfirmation(settings, recognizer_of(settings.people, backend))
     steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
     if steering is not None:
         source.steer(steering.begin(locator.telemetry_at(0.0)))
-    return Mission(source, watch, settings, closer, steering)
+    return Mission(source, watch, settings, confirmation, steering)
 
 
-def fitted(settings: Settings, source: Instrument) -> Settings:
-    """The settings with what the source says of itself where nothing else was set: sizes in metres hold by it."""
+def fit_settings(settings: Settings, source: Instrument) -> Settings:
+    """The settings with the source's own focal length and height of markers, unless other values are set."""
     own: dict[str, object] = {}
     if settings.gates.focal_px == Settings().gates.focal_px:
         own["gates.focal_px"] = float(source.camera.focal_px[0])
@@ -55,106 +146,92 @@ def fitted(settings: Settings, source: Instrument) -> Settings:
 
 
 class Mission:
-    """The state of a run that steers. watch: takes the scenes; settings: with what the source itself says."""
+    """The state of a run that steers. settings: as by `fit_settings`."""
 
     def __init__(
         self,
         source: Instrument,
         watch: LandmarkWatch,
         settings: Settings,
-        closer: CloserLook | None,
-        steering: Steering | None,
+        confirmation: GroundConfirmation | None,
+        steering: "Steering | None",
     ) -> None:
         self.source, self.watch, self.settings = source, watch, settings
-        self._closer, self._steering = closer, steering
+        self._confirmation, self._steering = confirmation, steering
         self._origin = watch.locator.site.origin_deg
-        self._vigilance = Vigilance(watch.locator.site.landmarks.names, source.rate_hz)
+        self._monitor = SensorMonitor(watch.locator.site.landmarks.names, source.rate_hz)
 
-    def refresh(self, scene: Scene) -> None:
-        """Before a scene is laid on the ground: take what was reported meanwhile."""
+    def take_reports(self, scene: Scene) -> None:
+        """Take over what was reported meanwhile; call it before the scene is located."""
         locator, frame = self.watch.locator, scene.frame
-        first = frame.number - MEMORY_S * self.source.rate_hz
-        site = self._site(_recent(self.source.landmarks(), first), self.source.telemetry())
-        locator.set_site(site)
-        assert site.telemetry is not None
-        self._vigilance.reports(self.source.last, site.landmarks, site.telemetry)
-        if frame.image.any():  # no picture is all black, but what stands for a missing one
-            self._vigilance.picture(frame, scene.step, self._metres_per_px(frame.time_s))
-        if self._closer is not None:
-            self._closer.take(self.source.pictures())
+        landmarks, telemetry = self.source.landmarks(), self.source.telemetry()
+        landmarks = landmarks[landmarks.frame >= frame.number - _MEMORY_S * self.source.rate_hz]
+        if self._origin is not None:
+            landmarks, telemetry = to_local(landmarks, self._origin), to_local(telemetry, self._origin)
+        locator.set_site(replace(locator.site, landmarks=landmarks, telemetry=telemetry))
+        self._monitor.check_reports(self.source.last, landmarks, telemetry)
+        if frame.image.any():  # an all-black picture stands for a missing one
+            self._monitor.check_picture(frame, scene.step, self._metres_per_px(frame.time_s))
+        if self._confirmation is not None:
+            self._confirmation.take(self.source.pictures())
 
     def notices(self) -> list[Notice]:
-        """What was seen to go wrong, or to be well again, since this was last asked."""
-        return self._vigilance.notices()
+        """The sensor failures and recoveries noticed since the last call."""
+        return self._monitor.notices()
 
-    def after(self, surveyed: FrameResult, step: Registration | None) -> FrameResult:
-        """Judge the targets of a frame by what the ground vehicles saw, and say where all go next.
+    def steer(self, result: FrameResult, step: Registration | None) -> FrameResult:
+        """Confirm the targets of a frame by the ground vehicles' pictures, and command the vehicles.
 
         step: how the background moved up to the frame.
         """
-        grounded = surveyed.grounded
+        grounded = result.grounded
         if grounded is None:
-            return surveyed
-        seconds = dict(grounded.seconds)
+            return result
+        seconds, locator = dict(grounded.seconds), self.watch.locator
         confirmed = None
-        if self._closer is not None:
-            confirmed = self._closer.confirm(grounded, self._extent_m(surveyed))
-            seconds["people"] = self._closer.spent_s
+        if self._confirmation is not None:
+            radius = np.nan_to_num(locator.ground_radii(grounded.fix, grounded.box_px[grounded.row]))
+            confirmed = self._confirmation.confirm(grounded, radius)
+            seconds["people"] = self._confirmation.spent_s
         command = None
         adjustments = grounded.adjustments
         if self._steering is not None:
             start = time.perf_counter()
             now = self.source.last
             now_s = (now - 1) / self.source.rate_hz
-            locator = self.watch.locator
-            there, moved = self._steering.step(
-                grounded, confirmed, now_s, locator.landmarks_at(now), locator.telemetry_at(now_s), step
-            )
-            command = self._in_degrees(there)
+            marks, flight = locator.landmarks_at(now), locator.telemetry_at(now_s)
+            local, made = self._steering.update(grounded, confirmed, now_s, marks, flight, step)
+            command = self._in_degrees(local)
             self.source.steer(command)
-            adjustments = (*adjustments, *moved)
+            adjustments = (*adjustments, *made)
             seconds["steer"] = time.perf_counter() - start
         grounded = replace(grounded, adjustments=adjustments, seconds=seconds)
-        return replace(surveyed, grounded=grounded, confirmed=confirmed, command=command)
-
-    def _site(self, landmarks: Landmarks, telemetry: Telemetry) -> Site:
-        """The reports in the metres of the site."""
-        site = self.watch.locator.site
-        if self._origin is not None:
-            landmarks, telemetry = to_local(landmarks, self._origin), to_local(telemetry, self._origin)
-        return replace(site, landmarks=landmarks, telemetry=telemetry)
+        return replace(result, grounded=grounded, confirmed=confirmed, command=command)
 
     def _metres_per_px(self, time_s: float) -> float:
-        """On level ground in the picture's middle; NaN where the UAV does not say how it flies."""
+        """On level ground in the middle of the picture; NaN without telemetry."""
         flight = self.watch.locator.telemetry_at(time_s)
         if flight is None:
             return float("nan")
         down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
         return float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
 
-    def _extent_m(self, surveyed: FrameResult) -> np.ndarray:
-        """(P,) radius of each located target on the ground; 0 where unknown."""
-        grounded = surveyed.grounded
-        assert grounded is not None
-        return np.nan_to_num(self.watch.locator.ground_radii(grounded.fix, grounded.box_px[grounded.row]))
-
     def _in_degrees(self, command: Command) -> Command:
-        """A command with the places that the vehicles understand."""
         if self._origin is None:
             return command
         origin = self._origin
 
-        def there(place: np.ndarray | None) -> np.ndarray | None:
+        def lonlat(place: np.ndarray | None) -> np.ndarray | None:
             return None if place is None else geometry.lonlat(np.asarray(place, float)[None], origin)[0]
 
         orders = tuple(
-            Order(o.vehicle, geometry.lonlat(o.goal[None], origin)[0], o.speed_m_s, there(o.look_at), o.picture)
-            for o in command.orders
+            replace(order, goal=geometry.lonlat(order.goal[None], origin)[0], look_at=lonlat(order.look_at))
+            for order in command.orders
         )
-        return replace(command, fly_to=there(command.fly_to), look_at=there(command.look_at), orders=orders)
+        return replace(command, fly_to=lonlat(command.fly_to), look_at=lonlat(command.look_at), orders=orders)
 
 
-def _site_of(source: Instrument) -> Site:
+def _first_site(source: Instrument) -> Site:
     """The reports so far, about the first of them; about the source's own origin while no ground vehicle has any."""
     landmarks, telemetry = source.landmarks(), source.telemetry()
     if np.isfinite(landmarks.place).all(axis=1).any():
@@ -163,23 +240,123 @@ def _site_of(source: Instrument) -> Site:
     return Site(to_local(landmarks, origin), to_local(telemetry, origin), origin)
 
 
-def _elevation(source: Instrument, site: Site) -> Elevation:
-    """The heights of the ground in the metres of the site."""
+def _local_elevation(source: Instrument, site: Site) -> Elevation:
     if site.origin_deg is None:
         return source.elevation
-    return shift_origin(source.elevation, -geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
+    origin_m = geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0]
+    return shift_origin(source.elevation, -origin_m)
 
 
-def _recent(landmarks: Landmarks, first: float) -> Landmarks:
-    """The reports from a frame on."""
-    rows = landmarks.frame >= first
-    return replace(
-        landmarks,
-        frame=landmarks.frame[rows],
-        landmark=landmarks.landmark[rows],
-        image_px=landmarks.image_px[rows],
-        place=landmarks.place[rows],
-        sigma_m=landmarks.sigma_m[rows],
-        planned=landmarks.planned[rows],
-        line=landmarks.line[rows],
-    )
+class Steering:
+    """Commands the vehicles and decides which frames are processed. Call it with located frames in order."""
+
+    def __init__(self, settings: Settings, camera: Camera, rate_hz: float, vehicles: Sequence[str]) -> None:
+        """camera: of the aerial vehicle. vehicles: names of the ground vehicles, as the landmarks have them."""
+        self.settings, self.camera, self.rate_hz = settings, camera, rate_hz
+        self._predictor, self._log = TargetPredictor(camera), AdjustmentLog()
+        self._uav, self._team = UavSteering(settings), UgvTeam(settings, vehicles)
+        self._mount: CameraMount | None = None
+        self._command, self._steered_s = Command(), -np.inf
+        self._every, self._every_changed_s, self._last_frame = 1, -np.inf, 0
+        self._alert_s, self._alert = -np.inf, ""
+
+    def begin(self, flight: Flight | None) -> Command:
+        """The command before anything is found: process as many frames as show a walker at this altitude."""
+        parameters = self.settings.steering
+        if parameters.on and parameters.sampling and flight is not None and flight.altitude_m > 0:
+            self._every = int(np.clip(round(self._least_every(flight)), 1, parameters.maximum_every))
+        self._command = Command(self._every)
+        return self._command
+
+    def update(
+        self,
+        grounded: AerialLocations,
+        confirmed: Confirmation | None,
+        now_s: float,
+        marks: LandmarkObservations,
+        flight: Flight | None,
+        step: Registration | None = None,
+    ) -> tuple[Command, tuple[Adjustment, ...]]:
+        """The command after a frame was located, its places in local metres, and what of it is new with its causes.
+
+        confirmed: row = that of grounded.positions. now_s: of the newest frame read; the located one is older. marks,
+        flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
+        while silent. step: how the background moved up to the located frame.
+        """
+        parameters = self.settings.steering
+        if not parameters.on:
+            return Command(), ()
+        self._log.begin(grounded.frame)
+        now_s = max(now_s, grounded.time_s)
+        prediction = self._predictor.update(grounded, confirmed, now_s)
+        self._mount = update_mount(flight, grounded.fix, self._mount, self.camera)
+        if parameters.sampling:
+            self._choose_frames(grounded, prediction, now_s, flight, step)
+        if now_s - self._steered_s < _PERIOD_S - 1e-6:
+            repeated = tuple(replace(order, picture=False) for order in self._command.orders)
+            self._command = replace(self._command, every=self._every, orders=repeated)
+            return self._command, self._log.made()
+        self._steered_s = now_s
+        team_m = self._team.hear(marks, now_s, self._log)
+        if parameters.follow:
+            middle = ground_in_middle(flight, grounded.fix, self._mount) if self._mount is not None else None
+            self._uav.update(prediction, team_m, self._mount, middle, now_s, self._log)
+        look_at, altitude_m = self._uav.look_at, self._uav.altitude_m
+        mount = self._mount
+        if mount is not None and altitude_m is not None:
+            mount = replace(mount, altitude_m=altitude_m)
+        orders: tuple[Order, ...] = ()
+        if parameters.look:
+            orders = self._team.orders(prediction, self._uav.followed(prediction), mount, now_s, self._log)
+        fly_to = None
+        if look_at is not None and mount is not None:
+            fly_to = mount.pose(look_at, mount.altitude_m).place_m[:2]
+        self._command = Command(self._every, fly_to, look_at, altitude_m, orders)
+        return self._command, self._log.made()
+
+    def _least_every(self, flight: Flight) -> float:
+        scale = pixels_per_metre(flight.altitude_m, self.camera.focal_px[0])
+        return every_least(scale, self.rate_hz, self.settings.steering)
+
+    def _choose_frames(
+        self,
+        grounded: AerialLocations,
+        prediction: Prediction,
+        now_s: float,
+        flight: Flight | None,
+        step: Registration | None,
+    ) -> None:
+        """Of how many frames one is processed."""
+        frame, parameters, interval = grounded.frame, self.settings.steering, self.settings.interval
+        between, self._last_frame = max(frame - self._last_frame, 1), frame
+        lost = np.flatnonzero(prediction.wanted & (prediction.missed == _MISSED))
+        if grounded.fix.pose is not None and len(lost):  # a target that left the picture is not lost
+            lost = lost[inside(prediction.east_north_m[lost], grounded.fix.pose, self.camera) > 0]
+        if len(lost):
+            self._alert_s, self._alert = now_s + _ALERT_S, f"target {prediction.target[lost[0]]} was lost"
+        elif step is not None and (not step.reliable or step.inliers < _WEAK * step.tracked):
+            self._alert_s = now_s + _ALERT_S
+            self._alert = f"weak registration: {step.inliers} of {step.tracked} points agree"
+        wanted, why = 1.0, self._alert
+        if now_s >= self._alert_s:
+            if flight is not None and np.isfinite([flight.altitude_m, flight.speed_m_s]).all():
+                wanted = interval_from_telemetry(flight.altitude_m, flight.speed_m_s, self.rate_hz, interval)
+                why = f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+            elif step is not None and step.reliable:
+                wanted = interval_from_flow([step.flow_px / between], self.camera.size_px[0], interval)
+                why = f"background flow {step.flow_px / between:.2f} px a frame"
+            else:
+                return
+            # A target that is missed for a moment still counts.
+            seen = prediction.missed <= _MISSED
+            speed, size = prediction.speed_m_s[seen], 2 * prediction.radius_m[seen]
+            wanted, limit = every_wanted(wanted, self.rate_hz, speed, size, parameters)
+            why += limit
+        if flight is not None and flight.altitude_m > 0:
+            wanted = max(wanted, self._least_every(flight))
+        every, made = sampled(frame, self._every, wanted, why, parameters)
+        if every > self._every and now_s - self._every_changed_s < _CALM_S:
+            return
+        if made:
+            self._every, self._every_changed_s = every, now_s
+        self._log.add(made)

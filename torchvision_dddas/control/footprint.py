@@ -14,7 +14,7 @@ _LEVEL = float(np.sin(np.radians(10)))
 
 
 @dataclass(frozen=True)
-class Stand:
+class CameraMount:
     """How an aerial camera is carried: its height above up = 0, the axes of its view (CameraPose), and its lens."""
 
     altitude_m: float
@@ -60,7 +60,7 @@ class Stand:
 
 
 def inside(points_m: np.ndarray, pose: CameraPose, camera: Camera) -> np.ndarray:
-    """(N,) how far within the picture from a pose places (N, 2) on the ground are, as in Stand.inside."""
+    """(N,) how far within the picture from a pose places (N, 2) on the ground are, as in CameraMount.inside."""
     points = np.asarray(points_m, float).reshape(-1, 2)
     # The lens's distortion is left out: it moves no border by more than the margins that are kept.
     right, down, depth = ((points - pose.place_m[:2]) @ pose.axes[:2] - pose.place_m[2] * pose.axes[2]).T
@@ -69,7 +69,7 @@ def inside(points_m: np.ndarray, pose: CameraPose, camera: Camera) -> np.ndarray
     return np.where(depth > 0, within, -10.0)
 
 
-def stand_of(flight: Flight | None, fix: Fix, before: Stand | None, camera: Camera) -> Stand | None:
+def update_mount(flight: Flight | None, fix: Fix, before: CameraMount | None, camera: Camera) -> CameraMount | None:
     """How the camera is carried: by the telemetry, else by the picture that was located; before: as known till now.
 
     Once it is steered a gimbal runs ahead of the vehicle: how it looks down is that of the beginning. So is its heading
@@ -84,7 +84,7 @@ def stand_of(flight: Flight | None, fix: Fix, before: Stand | None, camera: Came
     if altitude <= 0:
         return before
     if before is not None and before.down < _DOWN:
-        return Stand(altitude, before.axes, camera)
+        return CameraMount(altitude, before.axes, camera)
     if before is None and np.sin(pitch) < _LEVEL:
         return None
     if before is not None or np.sin(pitch) > _DOWN:
@@ -92,7 +92,7 @@ def stand_of(flight: Flight | None, fix: Fix, before: Stand | None, camera: Came
         if upper is not None:
             heading = upper
         pitch = np.pi / 2
-    return Stand(altitude, axes_of(heading, pitch, 0.0), camera)
+    return CameraMount(altitude, axes_of(heading, pitch, 0.0), camera)
 
 
 def _upper_edge(flight: Flight | None, fix: Fix) -> float | None:
@@ -103,11 +103,11 @@ def _upper_edge(flight: Flight | None, fix: Fix) -> float | None:
     return None if axes is None else float(np.arctan2(-axes[0, 1], -axes[1, 1]))
 
 
-def looked_at(flight: Flight | None, fix: Fix, stand: Stand) -> np.ndarray | None:
+def ground_in_middle(flight: Flight | None, fix: Fix, mount: CameraMount) -> np.ndarray | None:
     """(2,) the ground that is in the middle of the picture; None where neither picture nor telemetry tell."""
     if fix.pose is not None and -fix.pose.axes[2, 2] > _LEVEL:
         ahead = fix.pose.axes[:, 2]
         return fix.pose.place_m[:2] + ahead[:2] * fix.pose.place_m[2] / -ahead[2]
     if flight is not None and np.isfinite(flight.place).all():
-        return np.array(flight.place, float) + stand.axes[:2, 2] * stand.altitude_m / stand.down
+        return np.array(flight.place, float) + mount.axes[:2, 2] * mount.altitude_m / mount.down
     return None

@@ -24,7 +24,7 @@ _RADIUS_M = 1.0
 
 
 @dataclass(frozen=True)
-class Outlook:
+class Prediction:
     """The targets that are believed in, as they are expected now, one row a target.
 
     target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
@@ -70,7 +70,7 @@ class _Remembered:
     fast: bool = False
     steady: bool = False
 
-    def see(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
+    def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
         """It was located again."""
         predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
         off = place_m - predicted
@@ -95,14 +95,14 @@ class _Remembered:
         return self.human and (not self.fast or (not self.unseen and self.probability >= _SURE))
 
 
-class Memory:
+class TargetPredictor:
     """The targets of the latest frames. Feed it frames in order."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._known: dict[int, _Remembered] = {}
 
-    def step(self, grounded: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Outlook:
+    def update(self, grounded: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Prediction:
         """The targets as expected at now_s, after a frame was located; confirmed: row = that of its positions."""
         radii = radii_m(grounded, self.camera)
         targets = grounded.positions.target.tolist()
@@ -111,7 +111,7 @@ class Memory:
             if np.isfinite(place).all():
                 when, radius = grounded.time_s, float(radii[row])
                 known = self._known.setdefault(target, _Remembered(place, np.zeros(2), radius, when, when))
-                known.see(place, velocity, radius, when)
+                known.update(place, velocity, radius, when)
         if confirmed is not None:
             for row, kind, probability in zip(confirmed.row, confirmed.kind, confirmed.probability, strict=True):
                 if 0 <= row < len(targets) and targets[row] in self._known:
@@ -131,14 +131,14 @@ class Memory:
             if gone_s > _KEPT_S or renamed or (not known.lasting and known.missed > 2):
                 del self._known[target]
 
-    def _expected(self, now_s: float, time_s: float) -> Outlook:
+    def _expected(self, now_s: float, time_s: float) -> Prediction:
         rows = {target: known for target, known in self._known.items() if known.lasting}
         if not rows:
-            return Outlook()
+            return Prediction()
         all_of = list(rows.values())
         ahead_s = np.clip([now_s - known.seen_s for known in all_of], 0, _HORIZON_S)
         velocity = np.array([known.velocity_m_s for known in all_of])
-        return Outlook(
+        return Prediction(
             np.array(list(rows), np.int64),
             np.array([known.place_m for known in all_of]) + velocity * ahead_s[:, None],
             velocity,

@@ -27,7 +27,7 @@ class Notice:
     text: str
 
 
-class Vigilance:
+class SensorMonitor:
     """Holds what comes in against what came before. Ask it once a scene."""
 
     def __init__(self, names: tuple[str, ...], rate_hz: float) -> None:
@@ -47,7 +47,7 @@ class Vigilance:
         new, self._notices = sorted(self._notices, key=lambda notice: notice.frame), []
         return new
 
-    def reports(self, now: int, landmarks: Landmarks, telemetry: Telemetry) -> None:
+    def check_reports(self, now: int, landmarks: Landmarks, telemetry: Telemetry) -> None:
         """What all vehicles said until frame `now`; places in local metres."""
         for which, name in enumerate(self._names):
             rows = np.flatnonzero((landmarks.landmark == which) & ~landmarks.planned & (landmarks.frame <= now))
@@ -67,7 +67,7 @@ class Vigilance:
             "the UAV reports again",
         )
 
-    def picture(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
+    def check_picture(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
         """The next picture that was read. step: how the ground moved in it since the one before.
 
         metres_per_px: on the ground below its middle; NaN where unknown.

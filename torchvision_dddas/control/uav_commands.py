@@ -3,9 +3,9 @@
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.control.adjustments import Record, counted
-from torchvision_dddas.control.footprint import Stand
-from torchvision_dddas.control.prediction import Outlook
+from torchvision_dddas.control.footprint import CameraMount
+from torchvision_dddas.control.prediction import Prediction
+from torchvision_dddas.control.rules import AdjustmentLog, count_of
 
 NEEDED = 4
 """Landmarks that a picture needs to lie on the ground."""
@@ -27,11 +27,11 @@ _STEP, _SETTLED_S = 1.1, 5.0
 _WIDEN_S, _GIVEN_UP_S = 4.0, 30.0
 # At the highest a body of the expected size measures so much.
 _LEAST_PX = 6.0
-# A way of the picture's middle by this share of its half is a line in the record.
+# A way of the picture's middle by this share of its half is a line in the log.
 _NOTED = 0.5
 
 
-class Follow:
+class UavSteering:
     """Where the aerial vehicle was asked to look, and how high to be; None: as it does by itself."""
 
     def __init__(self, settings: Settings) -> None:
@@ -45,64 +45,64 @@ class Follow:
         self._found_s: float | None = None  # when there was something to follow
         self._group: set[int] = set()
 
-    def step(
+    def update(
         self,
-        outlook: Outlook,
+        prediction: Prediction,
         team_m: np.ndarray,
-        stand: Stand | None,
-        looked_at: np.ndarray | None,
+        mount: CameraMount | None,
+        ground_in_middle: np.ndarray | None,
         now_s: float,
-        record: Record,
+        log: AdjustmentLog,
     ) -> None:
         """Move on what is asked, by the targets expected now and the places (V, 2) of the team's vehicles.
 
-        looked_at: (2,) the ground in the middle of the picture. Nothing is asked where the view is not known.
+        ground_in_middle: (2,) the ground in the middle of the picture. Nothing is asked where the view is not known.
         """
         lapse_s, self._now_s = now_s - self._now_s, now_s
-        if stand is None:
+        if mount is None:
             return
-        self.home_m = self.home_m or stand.altitude_m
-        altitude = self.altitude_m or stand.altitude_m
-        rows = np.flatnonzero(outlook.wanted)
+        self.home_m = self.home_m or mount.altitude_m
+        altitude = self.altitude_m or mount.altitude_m
+        rows = np.flatnonzero(prediction.wanted)
         if len(rows) and self.look_at is None:
-            self._home_at = self.look_at = looked_at
+            self._home_at = self.look_at = ground_in_middle
             lapse_s = 0.0
         if self.look_at is None:
             return
         if not len(rows):
-            self._without(outlook, team_m, altitude, stand, lapse_s, record)
+            self._without(prediction, team_m, altitude, mount, lapse_s, log)
             return
         self._found_s = now_s
-        rows = self._chosen(outlook, rows, stand)
-        points, velocity = outlook.east_north_m[rows], outlook.velocity_m_s[rows]
+        rows = self._chosen(prediction, rows, mount)
+        points, velocity = prediction.east_north_m[rows], prediction.velocity_m_s[rows]
         # Where they are and where they will be: climbing takes time.
-        goal, height, why = self._aim(np.r_[points, points + _AHEAD_S * velocity], team_m, altitude, stand)
-        what = f"{counted(len(rows), 'target')} about {_place(points.mean(axis=0))}: {why}"
-        self._climb(height, altitude, stand, what, record)
+        goal, height, why = self._aim(np.r_[points, points + _AHEAD_S * velocity], team_m, altitude, mount)
+        what = f"{count_of(len(rows), 'target')} about {_place(points.mean(axis=0))}: {why}"
+        self._climb(height, altitude, mount, what, log)
         speed = float(np.linalg.norm(velocity.mean(axis=0)))
-        self._look(goal, stand.half_m(self.altitude_m or altitude), speed, lapse_s, what, record)
+        self._look(goal, mount.half_m(self.altitude_m or altitude), speed, lapse_s, what, log)
 
-    def rows(self, outlook: Outlook) -> np.ndarray:
+    def followed(self, prediction: Prediction) -> np.ndarray:
         """The targets that are followed: the group in the picture, or all that is wanted."""
-        rows = np.flatnonzero(outlook.wanted)
-        held = rows[np.isin(outlook.target[rows], list(self._group))]
+        rows = np.flatnonzero(prediction.wanted)
+        held = rows[np.isin(prediction.target[rows], list(self._group))]
         return held if len(held) else rows
 
-    def highest_m(self, stand: Stand) -> float:
+    def highest_m(self, mount: CameraMount) -> float:
         """How high it may go: by the settings, twice the altitude at the start, and while bodies measure enough."""
         limit = self.settings.steering.maximum_altitude_m or 2 * self.home_m
         size_m = self.settings.gates.expected_size_m
-        return float(max(self.home_m, min(limit, size_m * float(np.mean(stand.camera.focal_px)) / _LEAST_PX)))
+        return float(max(self.home_m, min(limit, size_m * float(np.mean(mount.camera.focal_px)) / _LEAST_PX)))
 
-    def _chosen(self, outlook: Outlook, rows: np.ndarray, stand: Stand) -> np.ndarray:
+    def _chosen(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount) -> np.ndarray:
         """All that is wanted, where it can be in one picture; else the group that weighs most, not lightly another."""
-        highest = self.highest_m(stand)
+        highest = self.highest_m(mount)
         groups = [rows]
-        if stand.centre(outlook.east_north_m[rows], highest)[1] < _LEAST:
-            groups = [_grown(int(seed), rows, outlook, stand, highest) for seed in rows]
+        if mount.centre(prediction.east_north_m[rows], highest)[1] < _LEAST:
+            groups = [_grown(int(seed), rows, prediction, mount, highest) for seed in rows]
         # People who were recognized count more than what nobody has seen yet, and large crowds more than small ones.
-        weights = outlook.probability * np.maximum(outlook.radius_m, 0.5)
-        members = [set(outlook.target[group].tolist()) for group in groups]
+        weights = prediction.probability * np.maximum(prediction.radius_m, 0.5)
+        members = [set(prediction.target[group].tolist()) for group in groups]
         held = max(len(self._group & group) for group in members)
         values = [
             weights[group].sum() * (1.5 if held and len(self._group & names) == held else 1.0)
@@ -113,12 +113,12 @@ class Follow:
         return groups[best]
 
     def _aim(
-        self, points: np.ndarray, team_m: np.ndarray, altitude: float, stand: Stand
+        self, points: np.ndarray, team_m: np.ndarray, altitude: float, mount: CameraMount
     ) -> tuple[np.ndarray, float, str]:
         """Where to look so that targets and four landmarks are in the picture; the altitude it takes; why."""
         needed = min(NEEDED, len(team_m))
-        for height in self._ladder(altitude, stand):
-            place = _between(points, team_m, needed, height, stand, _LEAST if height == altitude else _AIMED)
+        for height in self._ladder(altitude, mount):
+            place = _between(points, team_m, needed, height, mount, _LEAST if height == altitude else _AIMED)
             if place is None:
                 continue
             if height > altitude:
@@ -127,28 +127,28 @@ class Follow:
             if (
                 lower < 0.99 * height
                 and self.altitude_m is not None
-                and _between(points, team_m, needed, lower, stand, _EASY) is not None
+                and _between(points, team_m, needed, lower, mount, _EASY) is not None
             ):
                 return place, lower, "fit easily from lower, too"
             return place, height, f"in the picture with {needed} landmarks" if needed else "in the picture"
-        place = _between(points, team_m, needed, altitude, stand, -np.inf)
+        place = _between(points, team_m, needed, altitude, mount, -np.inf)
         if place is not None:
             return place, altitude, f"waiting for {needed} landmarks"
-        return stand.centre(points, altitude)[0], altitude, f"no place shows {needed} landmarks"
+        return mount.centre(points, altitude)[0], altitude, f"no place shows {needed} landmarks"
 
-    def _ladder(self, altitude: float, stand: Stand) -> list[float]:
-        highest, steps = self.highest_m(stand), [altitude]
+    def _ladder(self, altitude: float, mount: CameraMount) -> list[float]:
+        highest, steps = self.highest_m(mount), [altitude]
         while steps[-1] < highest - 1e-6:
             steps.append(min(steps[-1] * _STEP, highest))
         return steps
 
-    def _climb(self, height: float, altitude: float, stand: Stand, why: str, record: Record) -> None:
+    def _climb(self, height: float, altitude: float, mount: CameraMount, why: str, log: AdjustmentLog) -> None:
         if height == altitude or (height < altitude and self._now_s - self._moved_s < _SETTLED_S):
             return
         self.altitude_m, self._moved_s = height, self._now_s
-        record.set("uav.altitude_m", round(height, 1), why, old=round(stand.altitude_m, 1))
+        log.set("uav.altitude_m", round(height, 1), why, old=round(mount.altitude_m, 1))
 
-    def _look(self, goal: np.ndarray, half: float, speed: float, lapse_s: float, why: str, record: Record) -> None:
+    def _look(self, goal: np.ndarray, half: float, speed: float, lapse_s: float, why: str, log: AdjustmentLog) -> None:
         """Draw the middle of the picture along."""
         assert self.look_at is not None
         before = self.look_at
@@ -157,34 +157,34 @@ class Follow:
         self.look_at = before + way * min(1.0, pace / max(float(np.linalg.norm(way)), 1e-9))
         for axis, name in enumerate(("east", "north")):
             value, old = round(float(self.look_at[axis]), 1), round(float(before[axis]), 1)
-            record.set(f"uav.look_{name}_m", value, why, old=old, least=_NOTED * half)
+            log.set(f"uav.look_{name}_m", value, why, old=old, least=_NOTED * half)
 
     def _without(
         self,
-        outlook: Outlook,
+        prediction: Prediction,
         team_m: np.ndarray,
         altitude: float,
-        stand: Stand,
+        mount: CameraMount,
         lapse_s: float,
-        record: Record,
+        log: AdjustmentLog,
     ) -> None:
         """Nothing to follow: wait where it was last, see more from higher, and at last go back to the team."""
         gone_s = np.inf if self._found_s is None else self._now_s - self._found_s
-        if self._group & set(outlook.target.tolist()):
+        if self._group & set(prediction.target.tolist()):
             why = f"target {min(self._group)} goes on, but is not human"
         elif gone_s > _GIVEN_UP_S:
             why = f"no target for {_GIVEN_UP_S:.0f} s"
         else:
-            highest = self.highest_m(stand)
+            highest = self.highest_m(mount)
             if gone_s > _WIDEN_S and self._now_s - self._moved_s > _WIDEN_S and altitude < highest - 1e-6:
                 higher = min(altitude * _STEP**2, highest)
-                self._climb(higher, altitude, stand, f"no target for {gone_s:.0f} s", record)
+                self._climb(higher, altitude, mount, f"no target for {gone_s:.0f} s", log)
             return
         self._found_s = None
         assert self._home_at is not None
-        rest = stand.centre(team_m, self.home_m)[0] if len(team_m) >= NEEDED else self._home_at
-        self._climb(self.home_m, altitude, stand, why, record)
-        self._look(rest, stand.half_m(altitude), 0.0, lapse_s, why, record)
+        rest = mount.centre(team_m, self.home_m)[0] if len(team_m) >= NEEDED else self._home_at
+        self._climb(self.home_m, altitude, mount, why, log)
+        self._look(rest, mount.half_m(altitude), 0.0, lapse_s, why, log)
 
 
 def leashed(place: np.ndarray, to: np.ndarray, length: float) -> np.ndarray:
@@ -195,30 +195,30 @@ def leashed(place: np.ndarray, to: np.ndarray, length: float) -> np.ndarray:
 
 
 def _between(
-    points: np.ndarray, team_m: np.ndarray, needed: int, altitude: float, stand: Stand, margin: float
+    points: np.ndarray, team_m: np.ndarray, needed: int, altitude: float, mount: CameraMount, margin: float
 ) -> np.ndarray | None:
     """The place nearest the targets' middle that shows them and so many landmarks; None where there is none."""
-    middle, within = stand.centre(points, altitude)
+    middle, within = mount.centre(points, altitude)
     if within < margin:
         return None
     if not needed:
         return middle
     nearest = np.argsort(np.linalg.norm(team_m - middle, axis=1), kind="stable")[:needed]
-    landmarks, _ = stand.centre(team_m[nearest], altitude)
+    landmarks, _ = mount.centre(team_m[nearest], altitude)
     for share in np.linspace(0, 1, 11):
         place = middle + share * (landmarks - middle)
-        shown = int((stand.inside(team_m, place, altitude) >= _LANDMARK).sum())
-        if shown >= needed and stand.inside(points, place, altitude).min() >= margin:
+        shown = int((mount.inside(team_m, place, altitude) >= _LANDMARK).sum())
+        if shown >= needed and mount.inside(points, place, altitude).min() >= margin:
             return place
     return None
 
 
-def _grown(seed: int, rows: np.ndarray, outlook: Outlook, stand: Stand, altitude: float) -> np.ndarray:
+def _grown(seed: int, rows: np.ndarray, prediction: Prediction, mount: CameraMount, altitude: float) -> np.ndarray:
     """A target and those nearest to it, as long as all are in one picture."""
-    places = outlook.east_north_m
+    places = prediction.east_north_m
     group = [seed]
     for row in rows[np.argsort(np.linalg.norm(places[rows] - places[seed], axis=1), kind="stable")]:
-        if row != seed and stand.centre(places[[*group, row]], altitude)[1] >= _LEAST:
+        if row != seed and mount.centre(places[[*group, row]], altitude)[1] >= _LEAST:
             group.append(int(row))
     return np.array(group)
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.control import ugv_placement as stations
-from torchvision_dddas.control.adjustments import Record, counted
-from torchvision_dddas.control.footprint import Stand
-from torchvision_dddas.control.prediction import Outlook
+from torchvision_dddas.control.footprint import CameraMount
+from torchvision_dddas.control.prediction import Prediction
+from torchvision_dddas.control.rules import AdjustmentLog, count_of
 from torchvision_dddas.types import LandmarkObservations, Order
 
-# A vehicle that reports no place is counted on for so long: planned waypoints bridge dropouts.
+# A vehicle that reports no place is count_of on for so long: planned waypoints bridge dropouts.
 _SILENT_S = 10.0
 # A vehicle that was near counts as far again beyond this many times near_m.
 _FAR = 1.5
@@ -44,7 +44,7 @@ class _Vehicle:
     sent_s: float = 0.0
 
 
-class Team:
+class UgvTeam:
     """The ground vehicles, by name."""
 
     def __init__(self, settings: Settings, vehicles: Sequence[str]) -> None:
@@ -55,8 +55,8 @@ class Team:
         self._place_of: np.ndarray | None = None
         self._let_be: dict[int, float] = {}
 
-    def hear(self, marks: LandmarkObservations, now_s: float, record: Record) -> np.ndarray:
-        """Take on the places that the team reports; the places (V, 2) of those that are counted on."""
+    def hear(self, marks: LandmarkObservations, now_s: float, log: AdjustmentLog) -> np.ndarray:
+        """Take on the places that the team reports; the places (V, 2) of those that are count_of on."""
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
                 if row not in self._known:
@@ -65,53 +65,53 @@ class Team:
         before = len(self._known)
         for row in [row for row, vehicle in self._known.items() if now_s - vehicle.heard_s > _SILENT_S]:
             del self._known[row]
-            record.set("team.vehicles", len(self._known), f"{self.names[row]} silent for {_SILENT_S:.0f} s", old=before)
+            log.set("team.vehicles", len(self._known), f"{self.names[row]} silent for {_SILENT_S:.0f} s", old=before)
         if before == len(self._known):
-            record.set("team.vehicles", before, "all that report", old=before)
+            log.set("team.vehicles", before, "all that report", old=before)
         return np.array([self._known[row].place_m for row in self.present]).reshape(-1, 2)
 
     @property
     def present(self) -> list[int]:
-        """The vehicles that are counted on."""
+        """The vehicles that are count_of on."""
         return sorted(self._known)
 
     def orders(
-        self, outlook: Outlook, rows: np.ndarray, stand: Stand | None, now_s: float, record: Record
+        self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None, now_s: float, log: AdjustmentLog
     ) -> tuple[Order, ...]:
         """What each is asked to do; none while there is nothing to go to. rows: the targets that are followed."""
         present = self.present
         if not len(rows) or not present:
             self._ring = None
             return ()
-        middle = self._middle(outlook, rows, stand)
-        self._send(outlook, now_s, record)
+        middle = self._middle(prediction, rows, mount)
+        self._send(prediction, now_s, log)
         team_m = np.array([self._known[v].place_m for v in present])
-        goals = self._stations(outlook, middle, rows, team_m, stand, record)
-        goals = stations.kept_off(goals, outlook, team_m)
-        passing = stations.around(goals, team_m, outlook)
-        drift = outlook.velocity_m_s[rows].mean(axis=0)
+        goals = self._stations(prediction, middle, rows, team_m, mount, log)
+        goals = stations.kept_off(goals, prediction, team_m)
+        passing = stations.around(goals, team_m, prediction)
+        drift = prediction.velocity_m_s[rows].mean(axis=0)
         return tuple(
-            self._order(v, goals[k], passing[k], outlook, float(np.linalg.norm(drift)), now_s, record)
+            self._order(v, goals[k], passing[k], prediction, float(np.linalg.norm(drift)), now_s, log)
             for k, v in enumerate(present)
         )
 
-    def _middle(self, outlook: Outlook, rows: np.ndarray, stand: Stand | None) -> np.ndarray:
+    def _middle(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None) -> np.ndarray:
         """Of what the ring is about: the targets that are wanted, a little later."""
-        later = outlook.east_north_m[rows] + _LEAD_S * outlook.velocity_m_s[rows]
-        return later.mean(axis=0) if stand is None else stand.centre(later, stand.altitude_m)[0]
+        later = prediction.east_north_m[rows] + _LEAD_S * prediction.velocity_m_s[rows]
+        return later.mean(axis=0) if mount is None else mount.centre(later, mount.altitude_m)[0]
 
     def _stations(
         self,
-        outlook: Outlook,
+        prediction: Prediction,
         middle: np.ndarray,
         rows: np.ndarray,
         team_m: np.ndarray,
-        stand: Stand | None,
-        record: Record,
+        mount: CameraMount | None,
+        log: AdjustmentLog,
     ) -> np.ndarray:
         """(V, 2) the goals of those on the ring and of those sent to look."""
         present, parameters = self.present, self.parameters
-        reach = np.linalg.norm(outlook.east_north_m[rows] - middle, axis=1) + outlook.radius_m[rows]
+        reach = np.linalg.norm(prediction.east_north_m[rows] - middle, axis=1) + prediction.radius_m[rows]
         radius = float(np.clip(reach.max() + stations.KEEP_OFF_M, parameters.station_m, _WIDEST * parameters.station_m))
         on = [k for k, v in enumerate(present) if self._known[v].sent_to < 0]
         names = tuple(present[k] for k in on)
@@ -122,65 +122,65 @@ class Team:
             self._ring, self._place_of = stations.assigned(team_m[on], stations.Ring(middle, radius, turn), held)
             self._on_ring = names
             goals[on] = self._ring.places(len(on))[self._place_of]
-            about = f"{counted(len(rows), 'target')} at ({middle[0]:.0f}, {middle[1]:.0f}) m"
-            why = f"{counted(len(on), 'vehicle')} about {about}"
-            record.set("team.ring_m", round(radius, 1), why, least=2.0)
+            about = f"{count_of(len(rows), 'target')} at ({middle[0]:.0f}, {middle[1]:.0f}) m"
+            why = f"{count_of(len(on), 'vehicle')} about {about}"
+            log.set("team.ring_m", round(radius, 1), why, least=2.0)
         for k, v in enumerate(present):
             if self._known[v].sent_to >= 0:
-                row = int(np.flatnonzero(outlook.target == self._known[v].sent_to)[0])
-                goals[k] = self._close_to(outlook, row, team_m[k])
+                row = int(np.flatnonzero(prediction.target == self._known[v].sent_to)[0])
+                goals[k] = self._close_to(prediction, row, team_m[k])
         tied = on if len(present) > NEEDED else list(range(len(present)))
-        goals[tied] = stations.drawn_in(goals[tied], middle, stand)
+        goals[tied] = stations.drawn_in(goals[tied], middle, mount)
         return goals
 
-    def _close_to(self, outlook: Outlook, row: int, from_m: np.ndarray) -> np.ndarray:
+    def _close_to(self, prediction: Prediction, row: int, from_m: np.ndarray) -> np.ndarray:
         """A place from which a vehicle sees a target well, on its own side of it."""
-        place = outlook.east_north_m[row] + _LEAD_S * outlook.velocity_m_s[row]
+        place = prediction.east_north_m[row] + _LEAD_S * prediction.velocity_m_s[row]
         apart = from_m - place
-        away = outlook.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.parameters.look_m)
+        away = prediction.radius_m[row] + max(stations.KEEP_OFF_M, 0.6 * self.parameters.look_m)
         return place + apart / max(float(np.linalg.norm(apart)), 1e-6) * away
 
-    def _send(self, outlook: Outlook, now_s: float, record: Record) -> None:
+    def _send(self, prediction: Prediction, now_s: float, log: AdjustmentLog) -> None:
         """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
-        parameters, wanted = self.parameters, dict(zip(outlook.target.tolist(), range(len(outlook)), strict=True))
-        needs = stations.need(outlook)
+        parameters, wanted = self.parameters, dict(zip(prediction.target.tolist(), range(len(prediction)), strict=True))
+        needs = stations.need(prediction)
         for v, vehicle in self._known.items():
             if vehicle.sent_to < 0:
                 continue
             row, why = wanted.get(vehicle.sent_to), ""
             if row is None:
                 why = f"target {vehicle.sent_to} is lost"
-            elif not outlook.unseen[row] and needs[row] < 1 - _UNSURE:
-                why = f"target {vehicle.sent_to}: {_known(outlook, row)}"
+            elif not prediction.unseen[row] and needs[row] < 1 - _UNSURE:
+                why = f"target {vehicle.sent_to}: {_known(prediction, row)}"
             elif now_s - vehicle.sent_s > _TRIED_S:
                 why = f"target {vehicle.sent_to} told nothing for {_TRIED_S:.0f} s"
                 self._let_be[vehicle.sent_to] = now_s
             if why:
                 vehicle.sent_to = -1
-                record.set(f"{self.names[v]}.sent_to", 0, why)
+                log.set(f"{self.names[v]}.sent_to", 0, why)
         free = max(len(self._known) - NEEDED, 1) - sum(vehicle.sent_to >= 0 for vehicle in self._known.values())
         gone_to = {vehicle.sent_to for vehicle in self._known.values()}
         if self._ring is None:
             return
         ring_m = self._ring.places(max(len(self._on_ring), 1))
-        afar = np.linalg.norm(outlook.east_north_m[:, None] - ring_m, axis=2).min(axis=1) - outlook.radius_m
+        afar = np.linalg.norm(prediction.east_north_m[:, None] - ring_m, axis=2).min(axis=1) - prediction.radius_m
         for row in np.argsort(-needs, kind="stable"):
-            target = int(outlook.target[row])
+            target = int(prediction.target[row])
             let_be = now_s - self._let_be.get(target, -np.inf) < _LET_BE_S
             if free <= 0 or needs[row] < 1 - _UNSURE:
                 break
             seen_from_ring = afar[row] < parameters.look_m
-            too_fast = outlook.speed_m_s[row] > parameters.fast_m_s or not outlook.steady[row]
-            if target in gone_to or let_be or too_fast or seen_from_ring or outlook.lost_s[row] > 1:
+            too_fast = prediction.speed_m_s[row] > parameters.fast_m_s or not prediction.steady[row]
+            if target in gone_to or let_be or too_fast or seen_from_ring or prediction.lost_s[row] > 1:
                 continue
             idle = [v for v, vehicle in self._known.items() if vehicle.sent_to < 0]
-            away = [float(np.linalg.norm(self._known[v].place_m - outlook.east_north_m[row])) for v in idle]
-            if min(away) - outlook.radius_m[row] < 0.8 * parameters.look_m:
+            away = [float(np.linalg.norm(self._known[v].place_m - prediction.east_north_m[row])) for v in idle]
+            if min(away) - prediction.radius_m[row] < 0.8 * parameters.look_m:
                 continue  # somebody sees it already
             v = idle[int(np.argmin(away))]
             self._known[v].sent_to, self._known[v].sent_s = target, now_s
-            why = f"{afar[row]:.0f} m from the nearest station: {_known(outlook, row)}"
-            record.set(f"{self.names[v]}.sent_to", target, why)
+            why = f"{afar[row]:.0f} m from the nearest station: {_known(prediction, row)}"
+            log.set(f"{self.names[v]}.sent_to", target, why)
             free -= 1
 
     def _order(
@@ -188,63 +188,63 @@ class Team:
         v: int,
         station: np.ndarray,
         goal: np.ndarray,
-        outlook: Outlook,
+        prediction: Prediction,
         drift_m_s: float,
         now_s: float,
-        record: Record,
+        log: AdjustmentLog,
     ) -> Order:
         vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
         away = float(np.linalg.norm(station - vehicle.place_m))
         vehicle.near = away < parameters.near_m * (_FAR if vehicle.near else 1.0)
         # It must not fall behind a crowd that walks faster than it should go near it.
         slow = round(min(max(parameters.slow_m_s, 1.1 * drift_m_s), max(parameters.fast_m_s, parameters.slow_m_s)), 1)
-        record.set(
+        log.set(
             f"{name}.speed_m_s",
             slow if vehicle.near else parameters.fast_m_s,
             f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s",
             least=1.0,
         )
-        row = self._watched(v, outlook, now_s, record)
+        row = self._watched(v, prediction, now_s, log)
         speed = slow if vehicle.near else parameters.fast_m_s
-        picture = self._pictured(v, outlook, row, now_s, record)
-        return Order(name, goal, speed, outlook.east_north_m[row], picture)
+        picture = self._pictured(v, prediction, row, now_s, log)
+        return Order(name, goal, speed, prediction.east_north_m[row], picture)
 
-    def _watched(self, v: int, outlook: Outlook, now_s: float, record: Record) -> int:
+    def _watched(self, v: int, prediction: Prediction, now_s: float, log: AdjustmentLog) -> int:
         """The row of the target that a vehicle looks at."""
         vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
-        row = stations.most_needed(outlook, vehicle.place_m, parameters.look_m, vehicle.watches)
-        here = np.flatnonzero(outlook.target == vehicle.watches)
+        row = stations.most_needed(prediction, vehicle.place_m, parameters.look_m, vehicle.watches)
+        here = np.flatnonzero(prediction.target == vehicle.watches)
         if len(here) and now_s - vehicle.watched_s < _LOOK_S:
             row = int(here[0])
         if vehicle.sent_to >= 0:
-            row = int(np.flatnonzero(outlook.target == vehicle.sent_to)[0])
-        target = int(outlook.target[row])
+            row = int(np.flatnonzero(prediction.target == vehicle.sent_to)[0])
+        target = int(prediction.target[row])
         if target != vehicle.watches:
-            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, self._sure(outlook, row, False)
-            apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m))
+            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, self._sure(prediction, row, False)
+            apart = float(np.linalg.norm(prediction.east_north_m[row] - vehicle.place_m))
             often = f"a picture every {self._period_s(vehicle):g} s"
-            record.set(
-                f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {_known(outlook, row)}; {often}"
+            log.set(
+                f"{name}.looks_at", target, f"target {target}, {apart:.0f} m off: {_known(prediction, row)}; {often}"
             )
-            record.know(f"{name}.picture_s", self._period_s(vehicle))
+            log.know(f"{name}.picture_s", self._period_s(vehicle))
         return row
 
-    def _sure(self, outlook: Outlook, row: int, now: bool) -> bool:
+    def _sure(self, prediction: Prediction, row: int, now: bool) -> bool:
         """Whether a target counts as surely human or surely not; now: whether it did."""
-        surely = abs(float(outlook.probability[row]) - 0.5) + 0.5
-        return not bool(outlook.unseen[row]) and surely > (_UNSURE if now else _SURE)
+        surely = abs(float(prediction.probability[row]) - 0.5) + 0.5
+        return not bool(prediction.unseen[row]) and surely > (_UNSURE if now else _SURE)
 
     def _period_s(self, vehicle: _Vehicle) -> float:
         return self.parameters.picture_s * (_SELDOM if vehicle.sure else 1)
 
-    def _pictured(self, v: int, outlook: Outlook, row: int, now_s: float, record: Record) -> bool:
+    def _pictured(self, v: int, prediction: Prediction, row: int, now_s: float, log: AdjustmentLog) -> bool:
         """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
         vehicle, name = self._known[v], self.names[v]
-        vehicle.sure = self._sure(outlook, row, vehicle.sure)
+        vehicle.sure = self._sure(prediction, row, vehicle.sure)
         period = self._period_s(vehicle)
-        why = f"target {outlook.target[row]}: {_known(outlook, row)}"
-        record.set(f"{name}.picture_s", period, why, old=self.parameters.picture_s)
-        apart = float(np.linalg.norm(outlook.east_north_m[row] - vehicle.place_m)) - float(outlook.radius_m[row])
+        why = f"target {prediction.target[row]}: {_known(prediction, row)}"
+        log.set(f"{name}.picture_s", period, why, old=self.parameters.picture_s)
+        apart = float(np.linalg.norm(prediction.east_north_m[row] - vehicle.place_m)) - float(prediction.radius_m[row])
         # One vehicle after the other, each in its part of the period.
         shift_s = 1e-6 - v * period / len(self.names)
         turn, last = (int((when_s + shift_s) // period) for when_s in (now_s, vehicle.pictured_s))
@@ -254,5 +254,5 @@ class Team:
         return True
 
 
-def _known(outlook: Outlook, row: int) -> str:
-    return "nobody has seen it" if outlook.unseen[row] else f"human with {outlook.probability[row]:.2f}"
+def _known(prediction: Prediction, row: int) -> str:
+    return "nobody has seen it" if prediction.unseen[row] else f"human with {prediction.probability[row]:.2f}"

@@ -1,12 +1,12 @@
-"""Where ground vehicles stand and look: on a ring about the crowd, never on one line, and near what needs a look."""
+"""Where ground vehicles mount and look: on a ring about the crowd, never on one line, and near what needs a look."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.control.footprint import Stand
-from torchvision_dddas.control.prediction import Outlook
+from torchvision_dddas.control.footprint import CameraMount
+from torchvision_dddas.control.prediction import Prediction
 
 # No vehicle comes nearer to the border of a crowd than this: from above they would be one blob.
 KEEP_OFF_M = 5.0
@@ -56,24 +56,24 @@ def _ways(team_m: np.ndarray, ring: Ring) -> np.ndarray:
     return np.linalg.norm(team_m[:, None] - ring.places(len(team_m))[None], axis=2)
 
 
-def drawn_in(places_m: np.ndarray, middle_m: np.ndarray, stand: Stand | None) -> np.ndarray:
+def drawn_in(places_m: np.ndarray, middle_m: np.ndarray, mount: CameraMount | None) -> np.ndarray:
     """The places (V, 2), those outside an aerial picture of the middle drawn towards it until they are well within."""
-    if stand is None:
+    if mount is None:
         return places_m
     drawn = places_m.copy()
     for share in np.linspace(1.0, 0.3, 8):
-        outside = stand.inside(drawn, middle_m, stand.altitude_m) < _WITHIN
+        outside = mount.inside(drawn, middle_m, mount.altitude_m) < _WITHIN
         if not outside.any():
             break
         drawn[outside] = middle_m + share * (places_m[outside] - middle_m)
     return drawn
 
 
-def kept_off(places_m: np.ndarray, outlook: Outlook, from_m: np.ndarray) -> np.ndarray:
+def kept_off(places_m: np.ndarray, prediction: Prediction, from_m: np.ndarray) -> np.ndarray:
     """The places (V, 2), those too near a target moved away from it, towards where the vehicle is (V, 2)."""
     moved = places_m.copy()
     for _ in range(3):  # away from one may be nearer to another
-        for place, radius in zip(outlook.east_north_m, outlook.radius_m + KEEP_OFF_M, strict=True):
+        for place, radius in zip(prediction.east_north_m, prediction.radius_m + KEEP_OFF_M, strict=True):
             apart = moved - place
             distance = np.linalg.norm(apart, axis=1)
             near = distance < radius
@@ -84,7 +84,7 @@ def kept_off(places_m: np.ndarray, outlook: Outlook, from_m: np.ndarray) -> np.n
     return moved
 
 
-def around(places_m: np.ndarray, from_m: np.ndarray, outlook: Outlook) -> np.ndarray:
+def around(places_m: np.ndarray, from_m: np.ndarray, prediction: Prediction) -> np.ndarray:
     """The next goals (V, 2) on the ways from (V, 2) to places: past a crowd that is in the way, not through it."""
     goals = places_m.copy()
     for k, (start, goal) in enumerate(zip(from_m, places_m, strict=True)):
@@ -95,7 +95,7 @@ def around(places_m: np.ndarray, from_m: np.ndarray, outlook: Outlook) -> np.nda
         along = way / length
         aside = np.array([along[1], -along[0]])
         nearest = np.inf
-        for place, radius in zip(outlook.east_north_m, outlook.radius_m + KEEP_OFF_M, strict=True):
+        for place, radius in zip(prediction.east_north_m, prediction.radius_m + KEEP_OFF_M, strict=True):
             ahead, off = float((place - start) @ along), float((place - start) @ aside)
             if 0 < ahead < min(length, nearest) and abs(off) < radius:
                 nearest = ahead
@@ -104,22 +104,22 @@ def around(places_m: np.ndarray, from_m: np.ndarray, outlook: Outlook) -> np.nda
     return goals
 
 
-def need(outlook: Outlook) -> np.ndarray:
+def need(prediction: Prediction) -> np.ndarray:
     """(N,) how much a closer look would tell: 1 where nobody has looked, else up to 1/2, and 0 where sure."""
-    doubt = 0.5 - np.abs(outlook.probability - 0.5)
-    return np.where(outlook.unseen, 1.0, doubt)
+    doubt = 0.5 - np.abs(prediction.probability - 0.5)
+    return np.where(prediction.unseen, 1.0, doubt)
 
 
-def most_needed(outlook: Outlook, place_m: np.ndarray, far_m: float, now: int) -> int:
+def most_needed(prediction: Prediction, place_m: np.ndarray, far_m: float, now: int) -> int:
     """The row of the target that a vehicle at a place (2,) should look at; -1: there is none. now: the one it looks at.
 
     Those in reach before others; of these the one most in need, and of equals the nearest.
     """
-    if not len(outlook):
+    if not len(prediction):
         return -1
-    distance = np.linalg.norm(outlook.east_north_m - place_m, axis=1) - outlook.radius_m
-    held = outlook.target == now
-    doubt = np.round(need(outlook) * 4) / 4  # what differs by less is alike
+    distance = np.linalg.norm(prediction.east_north_m - place_m, axis=1) - prediction.radius_m
+    held = prediction.target == now
+    doubt = np.round(need(prediction) * 4) / 4  # what differs by less is alike
     # A vehicle that changed its mind at each step would see nothing.
     score = 2.0 * (distance <= far_m * np.where(held, 1.1, 1.0)) + doubt + 0.2 * held - 1e-3 * np.maximum(distance, 0)
     return int(np.argmax(score))
