@@ -5,6 +5,11 @@ neither torch nor OpenCV.
 """
 
 from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchvision_dddas.types import Source
 
 __version__ = "0.1.0"
 
@@ -19,10 +24,31 @@ _HOME = {
     "Settings": ("config", "Settings"),
     "Telemetry": ("types", "Telemetry"),
     "load_settings": ("config", "load_config"),
-    "open_source": ("io.sources", "open_source"),
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", "open_source", "open_video", *_HOME]
+
+
+def open_video(spec: str | Path, **options: Any) -> "Source":
+    """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`, or `sim:` and a scenario.
+
+    options: rate_hz, full_scale, single, as `io.sources.open_source` has them. A simulated clip can be steered.
+    Raises InputError with one line when it cannot be read.
+    """
+    text = str(spec)
+    if not text.startswith("sim:"):
+        from torchvision_dddas.io.sources import open_source
+
+        return open_source(spec, **options)
+    from torchvision_dddas.errors import InputError
+    from torchvision_dddas.simulation import open_scenario  # takes 0.4 s to import
+
+    if options.get("rate_hz") is not None:
+        raise InputError(f"the scenario of {text} sets the frame rate (clip.rate_hz): leave --rate out")
+    return open_scenario(text.removeprefix("sim:"))
+
+
+open_source = open_video
 
 
 def __getattr__(name: str) -> object:

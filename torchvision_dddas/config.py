@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
@@ -890,20 +891,29 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """What a TOML file holds. Raises InputError with file and line."""
+def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
+    """What a TOML file holds. what: what the file is, for messages. Raises InputError with file and line."""
+    name = f"{what} {path}".strip()
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        found = re.search(r"line (\d+)", str(error))
-        line = found[1] if found else str(path.read_text(encoding="utf-8").count("\n") + 1)
-        raise InputError(f"{path}, line {line}: not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text: {error}") from None
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except RecursionError:
-        raise InputError(f"{path}: not valid TOML: its brackets go too deep") from None
-    except ValueError as error:  # a number of thousands of digits
-        raise InputError(f"{path}: not valid TOML: {str(error).split(';')[0]}") from None
+        raise InputError(f"{name} is not valid TOML: its brackets are nested too deeply") from None
+    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
+        raise InputError(f"{name} is not valid TOML: {str(error).split(';')[0]}") from None
+
+
+def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
+    """TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it."""
+    text = tomli_w.dumps(content, indent=1)
+    while (shorter := _ARRAY.sub(lambda found: "[" + ", ".join(re.split(r",\n *", found[1])[:-1]) + "]", text)) != text:
+        text = shorter
+    return "".join(f"# {line}\n" for line in comments) + ("\n" if comments else "") + text
+
+
+# An array without further arrays in it, one element a line, as tomli_w writes it.
+_ARRAY = re.compile(r"\[\n +((?:[^\n]*,\n *)+?)\]")
 
 
 def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:

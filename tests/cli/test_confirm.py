@@ -205,7 +205,6 @@ def test_a_table_without_rows_is_confirmed_to_one_without_rows(dddas, scene, tmp
         (["{blobs}", "{people}", "--camera", "{degrees}"], "no longitude_deg and latitude_deg"),
         (["{bytes}", "{people}"], "is no CSV text"),
         (["{blobs}", "{empty}"], "empty.csv is empty; wanted a first line"),
-        (["{quoted}", "{boxes}"], "has cells that go over several lines"),
         (["{blobs}", "{people}", "--interval", str(10**30)], "--interval is 1000"),
         (["{blobs}", "{people}", "--rate", "nan"], "a frame rate of nan"),
     ],
@@ -221,7 +220,6 @@ def test_a_mistake_gets_one_line_and_leaves_nothing(dddas, scene, tmp_path, word
         "twice": write(tmp_path / "twice.csv", HEADER, place(1, 3, 0, 0), place(1, 3, 1, 1), place(1, 4, 1, 1)),
         "odd": write(tmp_path / "odd.csv", HEADER, "1,1,x,0,1,0,1"),
         "empty": write(tmp_path / "empty.csv", ""),
-        "quoted": write(tmp_path / "quoted.csv", BOXES, '1,1,1,1,9,9,1,"moving', '1,2,1,1,9,9,1,moving"'),
         "degrees": write(tmp_path / "degrees.toml", degrees),
         "bytes": tmp_path / "bytes.csv",
     }

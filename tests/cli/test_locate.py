@@ -8,7 +8,7 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.upright import boxes, camera
-from torchvision_dddas.io.position_tables import read_positions
+from torchvision_dddas.io.ground_tables import read_positions
 
 CAMERA = "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheight_m = 1.2\n"
 PEOPLE = np.array([[-1.0, 10.0], [2.0, 14.0]])
@@ -38,7 +38,7 @@ def test_tracks_become_positions_with_covariances(dddas, file, tmp_path):
         "locate", "ground", file("t.csv", tracks(camera())), "--camera", file("c.toml", CAMERA), "--out", out
     )
     assert result.exit_code == 0, result.output
-    left = "no pitch_deg: it looks level; no heading_deg: it looks north; no place: it stands at 0, 0"
+    left = "no pitch_deg: level is assumed; no heading_deg: north is assumed; no place: 0, 0 is assumed"
     assert result.stdout.splitlines() == [
         "3 frames, 6 sightings (6 by height and feet, 0 by height, 0 by feet alone), 6 positions",
         f"note: {tmp_path / 'c.toml'} has {left}",

@@ -9,7 +9,7 @@ import pytest
 from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry
-from torchvision_dddas.io.position_tables import read_positions
+from torchvision_dddas.io.ground_tables import read_positions
 
 FAULTS = ({"what": "frozen", "time_s": 1.0, "seconds": 0.25}, {"what": "dropped", "time_s": 1.5, "seconds": 0.15})
 

@@ -9,13 +9,11 @@ import pytest
 
 from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
-from torchvision_dddas import geometry
+from torchvision_dddas import geometry, open_video
 from torchvision_dddas.evaluation.metrics import truth as judges
 from torchvision_dddas.io.camera_files import read_camera, read_poses
 from torchvision_dddas.io.colour_files import read_colours
-from torchvision_dddas.io.landmark_tables import read_landmarks
-from torchvision_dddas.io.position_tables import read_positions
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.simulation import load_scenario, scenario_names
 
@@ -38,19 +36,19 @@ def made(tmp_path_factory):
 
 def test_the_pictures_are_a_clip_that_keeps_its_numbers(made):
     folder, _ = made
-    source = open_source(folder / "frames")
+    source = open_video(folder / "frames")
     frames = list(source)
     assert [f.number for f in frames] == [n for n in range(1, 21) if n not in (6, 7)]
     assert source.size == (160, 120)
     assert len(source.problems) == 2
-    run = {f.number: f.image for f in open_source(f"sim:{folder / 'scenario.toml'}")}
+    run = {f.number: f.image for f in open_video(f"sim:{folder / 'scenario.toml'}")}
     apart = np.abs(frames[0].image.astype(int) - run[1])
     assert apart.mean() < 3  # what JPEG takes away
 
 
 def test_the_film_has_a_picture_for_every_frame(made):
     folder, _ = made
-    assert len(list(open_source(folder / "clip.mp4"))) == 20
+    assert len(list(open_video(folder / "clip.mp4"))) == 20
 
 
 def test_the_scenario_is_written_as_it_was_run(made):
@@ -115,7 +113,7 @@ def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
     folder, _ = made
     camera = read_camera(folder / "ground" / "ugv2" / "camera.toml")
     table = read_poses(folder / "ground" / "ugv2" / "poses.csv")
-    pictures = list(open_source(folder / "ground" / "ugv2"))
+    pictures = list(open_video(folder / "ground" / "ugv2"))
     assert [p.number for p in pictures] == table.at.tolist() == [1, 2, 3, 4]
     assert [int(r["aerial_frame"]) for r in csv.DictReader((folder / "ground" / "ugv2" / "poses.csv").open())] == [
         1,

@@ -133,7 +133,7 @@ def _record(path: Path) -> None:
 
 
 def _positions(path: Path) -> None:
-    from torchvision_dddas.io.position_tables import read_positions
+    from torchvision_dddas.io.ground_tables import read_positions
 
     found = read_positions(path)
     _finite(found.east_north_m)
@@ -141,7 +141,7 @@ def _positions(path: Path) -> None:
 
 def _landmarks(path: Path) -> None:
     from torchvision_dddas.geo.site import looks_swapped
-    from torchvision_dddas.io.landmark_tables import read_landmarks
+    from torchvision_dddas.io.ground_tables import read_landmarks
 
     found = read_landmarks(path, 10.0, 0.5)
     _finite(found.frame)
@@ -149,16 +149,16 @@ def _landmarks(path: Path) -> None:
 
 
 def _measurements(path: Path) -> None:
-    from torchvision_dddas.io.measurements import has_measurements, read_measurements
+    from torchvision_dddas.io.camera_files import has_measurements, read_measurements
 
     has_measurements(path)
     _finite(*read_measurements(path))
 
 
 def _camera(path: Path) -> None:
-    from torchvision_dddas.io.camera_files import left_open, read_camera
+    from torchvision_dddas.io.camera_files import describe_missing, read_camera
 
-    left_open(path)
+    describe_missing(path)
     read_camera(path)
 
 
@@ -295,11 +295,11 @@ def _address(path: Path) -> None:
 
 
 def _camera_word(path: Path) -> None:
-    from torchvision_dddas.io.stream_capture import target_of, without_secrets
+    from torchvision_dddas.io.video import stream_target, without_secrets
 
     words = path.read_bytes().decode("utf-8", "surrogateescape")
     without_secrets(words)
-    target_of(words)
+    stream_target(words)
 
 
 def _stream_word(path: Path) -> None:

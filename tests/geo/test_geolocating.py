@@ -16,7 +16,7 @@ from torchvision_dddas.geo.pose_estimation import focal_prior
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Camera, Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
 

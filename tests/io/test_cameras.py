@@ -7,7 +7,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import poses_at
-from torchvision_dddas.io.camera_files import camera_keys, read_camera, read_poses
+from torchvision_dddas.io.camera_files import read_camera, read_camera_keys, read_poses
 
 LEAST = "focal_px = 1000\nwidth_px = 640\nheight_px = 480\n"
 
@@ -89,9 +89,9 @@ def test_every_key_reaches_the_camera(toml):
         (LEAST + "name = 3", "name is 3; wanted a text in quotes"),
         (LEAST.replace("640", "640.5"), "width_px is 640.5; wanted a whole number"),
         (LEAST + "k1 = 0x" + "f" * 9999, "k1 is far too large; wanted a number from -10 to 10"),
-        (LEAST + "k1 = " + "9" * 9999, "is no TOML: Exceeds the limit"),
-        (LEAST + "name = " + "[" * 5000, "its brackets go too deep"),
-        ("focal_px == 3", "is no TOML"),
+        (LEAST + "k1 = " + "9" * 9999, "is not valid TOML: Exceeds the limit"),
+        (LEAST + "name = " + "[" * 5000, "its brackets are nested too deeply"),
+        ("focal_px == 3", "is not valid TOML"),
     ],
 )
 def test_a_mistake_in_a_camera_is_named(toml, text, words):
@@ -106,9 +106,9 @@ def test_a_camera_that_is_not_there_is_named(tmp_path):
 
 
 def test_the_keys_of_a_camera_without_a_focal_length_can_be_read(toml):
-    assert camera_keys(toml("width_px = 640")) == {"width_px": 640}
+    assert read_camera_keys(toml("width_px = 640")) == {"width_px": 640}
     with pytest.raises(InputError, match="heading_deg is 500; wanted a number"):
-        camera_keys(toml("width_px = 640\nheading_deg = 500"))
+        read_camera_keys(toml("width_px = 640\nheading_deg = 500"))
 
 
 def test_a_camera_without_poses_stands_still(toml):
@@ -159,7 +159,7 @@ def test_poses_that_do_not_cover_the_frames_are_said(toml, poses):
         ("frame,heading_deg\n", "a header but no rows"),
         ("frame,heading_deg\n1,2\n1,3\n", "line 3: frame goes from 1 to 1; wanted each after"),
         ("frame,heading_deg\n1,north\n", "line 2: heading_deg is 'north'; wanted a number from -360 to 360"),
-        ("frame,pitch_deg\n1\n", "line 2: pitch_deg is ''; wanted a number"),
+        ("frame,pitch_deg\n1\n", "line 2: pitch_deg is missing: the line ends before it"),
         ("frame,heading_deg,heading_deg\n1,2,3\n", "heading_deg is named twice"),
         ("", "its columns are none"),
     ],

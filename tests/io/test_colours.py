@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.colour_files import overlapping, read_colours
-from torchvision_dddas.io.colour_output import colours_toml
+from torchvision_dddas.io.colour_files import find_overlaps, format_colours, read_colours
 from torchvision_dddas.types import Colours
 
 
@@ -34,7 +33,7 @@ def test_what_is_written_is_read_again(toml):
     names = ("red", "rover 2", 'the "big" one')
     low = np.array([[172, 90, 60], [20, 0, 0], [60, 1, 1]])
     written = Colours(names, low, np.array([[8, 255, 255], [40, 255, 255], [90, 200, 200]]))
-    found = read_colours(toml(colours_toml(written)))
+    found = read_colours(toml(format_colours(written)))
     assert found.names == names
     assert (found.low == written.low).all() and (found.high == written.high).all()
 
@@ -43,7 +42,7 @@ def test_what_is_written_is_read_again(toml):
     ("text", "message"),
     [
         ("", "names no colour"),
-        ("[red", "is no TOML"),
+        ("[red", "is not valid TOML"),
         ("red = 3", "red lacks low or high"),
         ("[red]\nlow = [1, 2, 3]", "red lacks low or high"),
         ("[red]\nlow = [1, 2, 3]\nhigh = [2, 3, 4]\nhue = 1", "red has hue, which no colour has"),
@@ -67,10 +66,10 @@ def test_each_mistake_is_one_clear_line(toml, text, message):
 def test_ranges_overlap_only_where_hue_saturation_and_value_all_do():
     low = np.array([[170, 100, 0], [0, 0, 0], [176, 100, 200], [11, 0, 0]])
     high = np.array([[5, 255, 199], [10, 99, 255], [179, 255, 255], [20, 99, 255]])
-    assert overlapping(low, high) == []
+    assert find_overlaps(low, high) == []
     high[1] = (10, 100, 255)
-    assert overlapping(low, high) == [(0, 1)]
+    assert find_overlaps(low, high) == [(0, 1)]
 
 
 def test_a_hue_of_180_is_that_of_0():
-    assert overlapping(np.array([[175, 0, 0], [0, 0, 0]]), np.array([[180, 9, 9], [3, 9, 9]])) == [(0, 1)]
+    assert find_overlaps(np.array([[175, 0, 0], [0, 0, 0]]), np.array([[180, 9, 9], [3, 9, 9]])) == [(0, 1)]

@@ -10,9 +10,9 @@ from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas import geometry
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
+from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.io.output.location_output import GroundedOutput
 from torchvision_dddas.io.output.location_tables import angles_deg, upper_edge_deg
-from torchvision_dddas.io.position_tables import read_positions
 from torchvision_dddas.types import Adjustment, CameraPose
 
 ALL = {

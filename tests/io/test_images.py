@@ -176,7 +176,7 @@ def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("options", [{"rate_hz": 0}, {"rate_hz": -1}, {"rate_hz": float("nan")}, {"full_scale": 0}])
 def test_an_impossible_rate_or_scale_is_refused(tmp_path: Path, options: dict) -> None:
-    with pytest.raises(InputError, match="will not do"):
+    with pytest.raises(InputError, match="must be"):
         open_source(write_images(tmp_path), **options)
 
 

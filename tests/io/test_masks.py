@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.masks import Masks
+from torchvision_dddas.io.images import Masks
 
 
 @pytest.mark.parametrize(("targets", "kind"), [(0, np.uint8), (255, np.uint8), (256, np.uint16)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.output.landmark_table import MarkTable
 from torchvision_dddas.io.output.pipeline_output import FoundOutput, SurveyOutput
 from torchvision_dddas.io.output.run_log import PROBLEM

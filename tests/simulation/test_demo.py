@@ -89,14 +89,14 @@ def test_the_tuning_of_the_readme_is_that_of_its_own_page_which_is_run():
 def test_the_camera_the_study_and_the_configuration_of_the_readme_are_taken(tmp_path):
     from torchvision_dddas.config import load_config
     from torchvision_dddas.evaluation.studies.spec import read_spec
-    from torchvision_dddas.io.camera_files import left_open, read_camera
+    from torchvision_dddas.io.camera_files import describe_missing, read_camera
 
     camera, study, own = blocks("toml")
     (tmp_path / "study.toml").write_text(study)
     assert read_spec(tmp_path / "study.toml").tasks == ("motion", "tracking")
     (tmp_path / "ugv.toml").write_text(camera)
     assert read_camera(tmp_path / "ugv.toml").geographic
-    assert left_open(tmp_path / "ugv.toml") == ""
+    assert describe_missing(tmp_path / "ugv.toml") == ""
     (tmp_path / "own.toml").write_text(own)
     assert load_config(tmp_path / "own.toml").gates.min_area_px == 80
 

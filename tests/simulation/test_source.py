@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from tests.simulation.small import as_file, small
-from torchvision_dddas import geometry
+from torchvision_dddas import geometry, open_video
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.simulation.source import KEPT, Rows
 from torchvision_dddas.types import Command, Order
@@ -171,13 +170,13 @@ def path(tmp_path_factory):
 
 
 def test_open_source_takes_a_scenarios_name_or_file(path):
-    source = open_source(f"sim:{path}")
+    source = open_video(f"sim:{path}")
     assert isinstance(source, SimulatorSource)
     assert source.name == "tiny"
     with pytest.raises(InputError, match="no scenario is named 'nowhere'; there are border100"):
-        open_source("sim:nowhere")
+        open_video("sim:nowhere")
     with pytest.raises(InputError, match="leave --rate out"):
-        open_source(f"sim:{path}", rate_hz=5)
+        open_video(f"sim:{path}", rate_hz=5)
 
 
 def test_a_scenario_that_the_world_refuses_is_named(tmp_path):
@@ -185,7 +184,7 @@ def test_a_scenario_that_the_world_refuses_is_named(tmp_path):
         tmp_path / "low.toml", small(uav={"altitude_m": 2.0, "way_m": ((25.0, 25.0),)}, world={"trees_per_ha": 500.0})
     )
     with pytest.raises(InputError, match=r"low.toml: uav.altitude_m = 2 is too low"):
-        open_source(f"sim:{path}")
+        open_video(f"sim:{path}")
 
 
 def test_a_raster_that_cannot_be_read_is_named(tmp_path):
@@ -193,15 +192,15 @@ def test_a_raster_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "hills.tif").write_bytes(b"no raster")
     path = as_file(tmp_path / "odd.toml", small(world={"elevation": "hills.tif"}))
     with pytest.raises(InputError, match=r"hills.tif cannot be read as a raster"):
-        open_source(f"sim:{path}")
+        open_video(f"sim:{path}")
 
 
 def test_it_needs_no_torch(path):
     script = f"""
 import sys
 sys.modules["torch"] = None
-from torchvision_dddas.io.sources import open_source
-frame = next(iter(open_source("sim:{path}")))
+from torchvision_dddas import open_video
+frame = next(iter(open_video("sim:{path}")))
 print(frame.number, "kornia" in sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.evaluation.metrics import truth as read
-from torchvision_dddas.io.position_tables import read_positions
+from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.simulation import TruthOutput
 from torchvision_dddas.simulation.truth import FEWEST_PX, gather_targets, label_boxes
 from torchvision_dddas.types import Bodies, CameraPose, Truth

@@ -85,18 +85,18 @@ def aerial_into(
     quiet: bool = False,
 ) -> "GroundedJournal":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
+    from torchvision_dddas import open_video
     from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
     from torchvision_dddas.io.output.location_output import GroundedOutput
-    from torchvision_dddas.io.sources import open_source
 
     check_rate(rate_hz)
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
     refuse_own_input(inputs, [folder / name for name in GroundedOutput.files], "folder with --out")
     with GroundedOutput(folder, save) as output:
         read = read_detections(table)
-        source = open_source(clip, rate_hz=rate_hz) if clip else None
+        source = open_video(clip, rate_hz=rate_hz) if clip else None
         rate = source.rate_hz if source is not None else rate_hz
         if source is not None:
             check_within_clip(read, source)

@@ -1,6 +1,5 @@
 """`dddas calibrate`: what ranging needs to know of a camera, from people in its pictures."""
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,7 +54,7 @@ def calibrate(
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.measurements import has_measurements
+    from torchvision_dddas.io.camera_files import has_measurements
 
     settings = load_config(config, set_ or [])
     tall = settings.ground.body_height_m if body_height is None else body_height
@@ -90,7 +89,7 @@ def calibrate(
 
 
 def _from_measurements(table: Path, body_height_m: float) -> Found:
-    from torchvision_dddas.io.measurements import read_measurements
+    from torchvision_dddas.io.camera_files import read_measurements
 
     distance, height = read_measurements(table)
     return _focal(distance.tolist(), height.tolist(), body_height_m)
@@ -170,9 +169,9 @@ def _known(camera: Path | None, size: str | None) -> dict[str, object]:
     """The keys of the camera that is to be completed."""
     known: dict[str, object] = {}
     if camera is not None:
-        from torchvision_dddas.io.camera_files import camera_keys
+        from torchvision_dddas.io.camera_files import read_camera_keys
 
-        known = camera_keys(camera)
+        known = read_camera_keys(camera)
     if size is not None:
         width, _, height = size.lower().partition("x")
         if not all(side.isdecimal() and len(side) < 7 and 0 < int(side) <= 100_000 for side in (width, height)):
@@ -188,14 +187,13 @@ def _without_focal(known: dict[str, object], found: dict[str, float]) -> dict[st
 
 
 def _toml(keys: dict[str, object]) -> str:
-    # JSON's texts and lists of numbers are TOML's, but for characters that JSON writes in two halves.
-    return "".join(f"{key} = {_value(key, value)}\n" for key, value in keys.items())
+    from torchvision_dddas.config import format_toml
+
+    return format_toml({key: _rounded(value) if key not in PLACES else value for key, value in keys.items()})
 
 
-def _value(key: str, value: object) -> str:
-    if isinstance(value, float) and key not in PLACES:
-        return str(float(f"{value:.6g}"))
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _rounded(value: object) -> object:
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _check(key: str, value: float, unit: str) -> None:

@@ -171,10 +171,10 @@ def _called(names: list[str], groups: Sequence[Sequence["ColourSample"]]) -> lis
 
 
 def _checked(names: list[str], low: "np.ndarray", high: "np.ndarray") -> "Colours":
-    from torchvision_dddas.io.colour_files import overlapping
+    from torchvision_dddas.io.colour_files import find_overlaps
     from torchvision_dddas.types import Colours
 
-    for a, b in overlapping(low, high):
+    for a, b in find_overlaps(low, high):
         raise InputError(
             f"{names[a]} and {names[b]} are too near each other in hue (about {low[a, 0]} and {low[b, 0]}) to be told "
             "apart; give the landmarks colours of their own"
@@ -195,19 +195,19 @@ def _write(
 
     from torchvision_dddas.geo.colour_calibration import mask_range
     from torchvision_dddas.io.atomic_files import cannot_write, write_whole
-    from torchvision_dddas.io.colour_output import colours_picture, colours_toml
+    from torchvision_dddas.io.colour_files import draw_colours, format_colours
 
     sheets = []
     for number, (image, hsv) in enumerate(zip(images, found, strict=True)):
         masks = np.stack([mask_range(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
         own = [np.array([s.box_px for s in group if s.picture == number], float).reshape(-1, 4) for group in groups]
-        sheet = colours_picture(image, masks, ranges, own)
+        sheet = draw_colours(image, masks, ranges, own)
         width = images[0].shape[1]
         sheets.append(cv2.resize(sheet, (width, max(round(sheet.shape[0] * width / sheet.shape[1]), 1))))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_whole(drawing, cv2.imencode(".png", np.concatenate(sheets))[1].tobytes())
-        write_whole(out, colours_toml(ranges).encode())
+        write_whole(out, format_colours(ranges).encode())
     except OSError as error:
         raise cannot_write(out, error) from error
 

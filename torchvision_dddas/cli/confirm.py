@@ -143,8 +143,8 @@ def _on_the_ground(
     notes: list[str],
 ) -> _Found:
     from torchvision_dddas.io.detection_tables import read_rows
+    from torchvision_dddas.io.ground_tables import read_positions
     from torchvision_dddas.io.output.confirmation_output import COLUMNS
-    from torchvision_dddas.io.position_tables import read_positions
     from torchvision_dddas.people.confirmation import confirm_positions
 
     given = read_positions(blobs)
@@ -161,8 +161,8 @@ def _vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
     """The tables with their cameras: one each, or all of them to a single table. Raises InputError otherwise."""
-    from torchvision_dddas.io.camera_files import left_open, read_camera, read_poses
-    from torchvision_dddas.io.position_tables import read_positions
+    from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
+    from torchvision_dddas.io.ground_tables import read_positions
     from torchvision_dddas.people.confirmation import Vehicle
 
     if len(people) > 1 and cameras and len(cameras) != len(people):
@@ -175,7 +175,7 @@ def _vehicles(
         )
     kinds = [read_camera(path) for path in cameras]
     where = [read_poses(path) for path in poses] if poses else [None] * len(kinds)
-    notes += [note for path, pose in zip(cameras, where, strict=True) if (note := left_open(path, pose))]
+    notes += [note for path, pose in zip(cameras, where, strict=True) if (note := describe_missing(path, pose))]
     tables = [read_positions(path) for path in people]
     names = _names(people)
     if len(people) == 1:

@@ -71,11 +71,11 @@ def detect_clip(
 
     refuse_own_input([Path(clip)], [folder / name for name in Output.files], "folder with --out")
     with Output(folder, save) as output:
+        from torchvision_dddas import open_video
         from torchvision_dddas.detection import detect_motion, load_engine
-        from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.io.telemetry import read_telemetry
 
-        source = open_source(clip, rate_hz=rate_hz)
+        source = open_video(clip, rate_hz=rate_hz)
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip) if telemetry else None
         engine = load_engine(backend, settings)
         facts = {

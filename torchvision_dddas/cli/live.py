@@ -45,7 +45,7 @@ def run_live(
     """
     from torchvision_dddas.detection import check_length
     from torchvision_dddas.io.output.live_session import RESULTS, claim
-    from torchvision_dddas.io.stream_capture import without_secrets
+    from torchvision_dddas.io.video import without_secrets
     from torchvision_dddas.live import LiveSource
     from torchvision_dddas.live.routes import served
     from torchvision_dddas.live.runner import Failing, Feed
@@ -168,7 +168,7 @@ def _facts(
     people: bool,
 ) -> dict[str, Any]:
     """What run.json says beside how it goes."""
-    from torchvision_dddas.io.stream_capture import without_secrets
+    from torchvision_dddas.io.video import without_secrets
 
     located = {} if given is None or ready.watch is None else {**given.facts, **about(ready.watch.locator)}
     return {

@@ -62,7 +62,7 @@ def ground_into(
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.geo.ground_locator import GroundLocator
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.camera_files import left_open, read_camera, read_poses
+    from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.detection_tables import read_detections
     from torchvision_dddas.io.output.position_output import PositionOutput
 
@@ -87,7 +87,9 @@ def ground_into(
             "settings": settings.model_dump(),
         }
         journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), locator.origin_deg is not None)
-        journal.notes += [note for file, pose in zip(cameras, where, strict=True) if (note := left_open(file, pose))]
+        journal.notes += [
+            note for file, pose in zip(cameras, where, strict=True) if (note := describe_missing(file, pose))
+        ]
         with progress("locate", None, quiet) as tick:
             for frame in frames:
                 output.write(frame)

@@ -86,13 +86,13 @@ def people_into(
     given = [Path(clip), *([] if around is None else [around])]
     refuse_own_input(given, [folder / name for name in PeopleOutput.files], "folder with --out")
     with PeopleOutput(folder, save) as output:
+        from torchvision_dddas import open_video
         from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
-        from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.people.detector import recognize
         from torchvision_dddas.people.pyramid import levels
 
         table = read_detections(around) if around is not None else None
-        source = open_source(clip, rate_hz=rate_hz, single=True)
+        source = open_video(clip, rate_hz=rate_hz, single=True)
         if table is not None:
             check_within_clip(table, source)
         try:

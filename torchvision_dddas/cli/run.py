@@ -158,10 +158,10 @@ def run_into(
     files = given.files if given is not None else [telemetry] if telemetry is not None else []
     refuse_own_input([Path(clip), *files], [folder / name for name in kind.files], "folder with --out")
     with kind(folder, save) as output:
-        from torchvision_dddas.io.sources import open_source
+        from torchvision_dddas import open_video
         from torchvision_dddas.pipeline import survey
 
-        source = open_source(clip, rate_hz=rate_hz)
+        source = open_video(clip, rate_hz=rate_hz)
         ready = prepare_run(given, telemetry, settings, source, backend, clip)
         settings, engine, watch, notes = ready.settings, ready.engine, ready.watch, ready.notes
         facts: dict[str, Any] = {

@@ -84,13 +84,13 @@ def track_into(
     given = [Path(name) for name in (clip, detections) if name is not None]
     refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
     with TrackOutput(folder, save) as output:
+        from torchvision_dddas import open_video
         from torchvision_dddas.detection import load_engine
         from torchvision_dddas.io.detection_tables import check_birth_score, check_table, read_detections
-        from torchvision_dddas.io.sources import open_source
         from torchvision_dddas.types import is_sampled
 
         table = read_detections(detections) if detections is not None else None
-        source = open_source(clip, rate_hz=rate_hz) if clip is not None else None
+        source = open_video(clip, rate_hz=rate_hz) if clip is not None else None
         notes = check_table(table, interval, source) if table is not None else []
         if table is not None and settings.track.mode == "default":
             notes += check_birth_score(table, settings.track.birth_score)

@@ -1,4 +1,4 @@
-"""Cameras on the ground from TOML files, and where a moving one stood from a CSV.
+"""Cameras on the ground: their TOML files, CSVs of where a moving one stood, and CSVs of measured heights.
 
 focal_px = 1195            # or hfov_deg; `dddas calibrate` finds it
 width_px = 768
@@ -11,16 +11,15 @@ latitude_deg = 32.23
 """
 
 import math
-from collections.abc import Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.csv_text import Line, opened
-from torchvision_dddas.io.toml_text import toml_of
+from torchvision_dddas.io.tables import Column, Schema, read_csv, read_table
 from torchvision_dddas.types import Camera, PoseTable
 
 LIMITS: dict[str, tuple[float, float]] = {
@@ -45,7 +44,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "heading_sigma_deg": (0, 180),
     "position_sigma_m": (0, 1000),
 }
-"""Every key that is a number, and what it may be. `centre_px` is a pair; `name` a text.
+"""Range of every key that is a number. `centre_px` is a pair; `name` is text.
 
 focal_v_px: along the columns, where pixels are not square. centre_px: u, v of the optical axis. pitch_deg: positive
 down. roll_deg: turned clockwise. k1, k2: radial distortion as OpenCV has it. The sigmas are standard deviations; of the
@@ -59,18 +58,18 @@ SIGMAS = {
     "heading_sigma_deg": "heading_sigma_rad",
     "position_sigma_m": "position_sigma_m",
 }
-"""What Camera calls them. Left out: 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %)."""
+"""Fields of Camera by key. Defaults: 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %)."""
 
 KEYS = (*LIMITS, "centre_px", "name")
 PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
 
 
-def camera_keys(path: str | Path) -> dict[str, Any]:
+def read_camera_keys(path: str | Path) -> dict[str, Any]:
     """The keys of a camera's file, complete or not, each checked.
 
     Raises InputError with the file and the key: unreadable, no TOML, a key that no camera has, a value out of range.
     """
-    content = toml_of(path, "camera")
+    content = read_toml(path, "camera")
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)
@@ -87,24 +86,24 @@ def camera_keys(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def left_open(camera: str | Path, poses: PoseTable | None = None) -> str:
-    """What a camera's file, and its poses, do not say, and what is taken for it, in words; empty where all is there."""
-    given = {*camera_keys(camera), *(poses.values if poses is not None else ())}
+def describe_missing(camera: str | Path, poses: PoseTable | None = None) -> str:
+    """The keys that a camera's file and its poses lack, and what is assumed instead, in words; "" where none lacks."""
+    given = {*read_camera_keys(camera), *(poses.values if poses is not None else ())}
     gaps = []
     if "height_m" not in given:
-        gaps.append("no height_m: the foot row tells nothing")
+        gaps.append("no height_m: distances by the foot row are unknown")
     if "pitch_deg" not in given:
-        gaps.append("no pitch_deg: it looks level")
+        gaps.append("no pitch_deg: level is assumed")
     if "heading_deg" not in given:
-        gaps.append("no heading_deg: it looks north")
+        gaps.append("no heading_deg: north is assumed")
     if not given & {"east_m", "longitude_deg"}:
-        gaps.append("no place: it stands at 0, 0")
+        gaps.append("no place: 0, 0 is assumed")
     return f"{camera} has {'; '.join(gaps)}" if gaps else ""
 
 
 def read_camera(path: str | Path) -> Camera:
     """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
-    content = camera_keys(path)
+    content = read_camera_keys(path)
     numbers = {key: float(content[key]) for key in LIMITS if key in content}
     if missing := [key for key in ("width_px", "height_px") if key not in numbers]:
         raise InputError(f"camera {path} lacks {', '.join(missing)}: the size of its pictures")
@@ -180,60 +179,59 @@ def _place(numbers: dict[str, float], path: str | Path) -> tuple[tuple[float, fl
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Where a moving camera stood.
+# Tables.
 
-POSE_COLUMNS = ("frame", "time_s", "longitude_deg", "latitude_deg", "east_m", "north_m", "heading_deg", "pitch_deg")
+_POSE_NAMES = ("frame", "time_s", *PLACES[0], *PLACES[1], "heading_deg", "pitch_deg")
+POSES = Schema("poses", *(Column(name, "g", *LIMITS.get(name, (-1e12, 1e12))) for name in _POSE_NAMES))
 
 
 def read_poses(path: str | Path) -> PoseTable:
-    """Read the poses of a camera: `frame` or `time_s`, and any of the other POSE_COLUMNS; further ones are ignored.
+    """Read the poses of a camera: `frame` or `time_s`, and any other column of POSES; further ones are ignored.
 
-    Raises InputError with file and line: unreadable, no such column, half a place, no rows, not a finite number, out
-    of range, a frame or time that does not come after the one before.
+    Raises InputError with file and line: as read_table, no such column, half a place, no rows, a frame or time that
+    does not come after the one before.
     """
-    with opened(path, "poses") as (header, lines):
-        return _parse(header, lines, str(path))
-
-
-def _parse(header: list[str], lines: Iterator[Line], path: str) -> PoseTable:
-    columns = ", ".join(header) or "none"
-    if twice := [name for name in POSE_COLUMNS if header.count(name) > 1]:
-        raise InputError(f"poses {path}: column {twice[0]} is named twice; wanted each name once")
-    known = [name for name in POSE_COLUMNS if name in header]
+    text = read_csv(path, "poses")
+    columns = f"poses {path}: its columns are {', '.join(text.header) or 'none'}"
+    known = [name for name in POSES.names if name in text.header]
     if not {"frame", "time_s"} & set(known):
-        raise InputError(f"poses {path}: its columns are {columns}; wanted frame or time_s among them")
-    timed = "frame" not in known
-    wanted = [name for name in known if name not in ("frame", "time_s")]
+        raise InputError(f"{columns}; wanted frame or time_s among them")
+    clock, *wanted = [name for name in known if name != "time_s" or "frame" not in known]
     if not wanted:
-        raise InputError(f"poses {path}: its columns are {columns}; wanted any of {', '.join(POSE_COLUMNS[2:])}")
+        raise InputError(f"{columns}; wanted any of {', '.join(POSES.names[2:])}")
     for kind in PLACES:
         if (kind[0] in wanted) != (kind[1] in wanted):
-            raise InputError(f"poses {path}: its columns are {columns}; wanted {' and '.join(kind)} together")
+            raise InputError(f"{columns}; wanted {' and '.join(kind)} together")
     if PLACES[0][0] in wanted and PLACES[1][0] in wanted:
         raise InputError(f"poses {path} has longitude_deg and east_m; give places in degrees or in metres")
-    names = ["time_s" if timed else "frame", *wanted]
-    places = [header.index(name) for name in names]
-    rows: list[list[float]] = []
-    for number, row in lines:
-        cells = [row[place] if place < len(row) else "" for place in places]
-        rows.append([_cell(c, n, path, number) for c, n in zip(cells, names, strict=True)])
-        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
-            raise InputError(
-                f"poses {path}, line {number}: {names[0]} goes from {rows[-2][0]:g} to {rows[-1][0]:g}; "
-                "wanted each after the one before"
-            )
-    if not rows:
+    table = read_table(path, Schema("poses", *(c for c in POSES.columns if c.name in (clock, *wanted))), (), True, text)
+    if not len(table):
         raise InputError(f"poses {path} has a header but no rows")
-    table = np.array(rows, float).T
-    return PoseTable(path, table[0], timed, dict(zip(wanted, table[1:], strict=True)))
+    at = table[clock]
+    if (is_back := np.diff(at) <= 0).any():
+        row = int(is_back.argmax()) + 1
+        raise table.error(f"{clock} goes from {at[row - 1]:g} to {at[row]:g}; wanted each after the one before", row)
+    return PoseTable(str(path), at, clock == "time_s", {name: table[name] for name in wanted})
 
 
-def _cell(text: str, name: str, path: str, line: int) -> float:
-    low, high = LIMITS.get(name, (-1e12, 1e12))
+MEASUREMENTS = Schema(
+    "measurements",
+    *(Column(name, "g", 1e-9, 1e9, wanted="a number above 0") for name in ("distance_m", "height_px")),
+)
+
+
+def has_measurements(path: str | Path) -> bool:
+    """Whether the first line of a file names the columns of MEASUREMENTS. A file that cannot be read does not."""
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high:
-        raise InputError(f"poses {path}, line {line}: {name} is '{text}'; wanted a number from {low:g} to {high:g}")
-    return value
+        with Path(path).open(encoding="utf-8-sig") as file:
+            return set(MEASUREMENTS.names) <= {name.strip() for name in file.readline().split(",")}
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def read_measurements(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """A person's distances (N,) in metres and heights (N,) in pixels. Raises InputError as read_table; no rows."""
+    table = read_table(path, MEASUREMENTS, MEASUREMENTS.names, is_ragged=True)
+    if not len(table):
+        raise InputError(f"measurements {path} has a header but no rows")
+    return table["distance_m"], table["height_px"]

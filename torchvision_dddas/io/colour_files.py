@@ -1,18 +1,23 @@
-"""The colours that landmarks wear, from a TOML file: ranges of hue (0 to 180), saturation and value (0 to 255).
+"""The colours of landmarks in TOML files, and a picture that shows them.
+
+Ranges of hue (0 to 180), saturation and value (0 to 255):
 
 [red]                     # the landmark's name; `dddas colours` finds the ranges in a picture
 low = [172, 90, 60]       # a hue above the one of `high`: the range goes over 0
 high = [8, 255, 255]
 """
 
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from torchvision_dddas.config import format_toml, read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.toml_text import toml_of
+from torchvision_dddas.io.overlay.drawing import label, line_width, rectangle
 from torchvision_dddas.types import Colours
 
 HIGHEST = (180, 255, 255)
@@ -27,20 +32,20 @@ def read_colours(path: str | Path) -> Colours:
     Raises InputError with the file and the name: unreadable, no TOML, no colours, low or high missing or no three whole
     numbers in range, lowest saturation or value above the highest, two ranges that overlap.
     """
-    content = toml_of(path, "colours")
+    content = read_toml(path, "colours")
     if not content:
         raise InputError(f"colours {path} names no colour; wanted [name] with low and high, as `dddas colours` writes")
     ends = np.array([_range(name, given, path) for name, given in content.items()], np.int64).reshape(-1, 2, 3)
     names, low, high = tuple(content), ends[:, 0], ends[:, 1]
-    for a, b in overlapping(low, high):
+    for a, b in find_overlaps(low, high):
         raise InputError(
             f"colours {path}: {names[a]} and {names[b]} overlap in hue, saturation and value; wanted ranges of their "
-            "own, so that each landmark is told from the others"
+            "own, so that each landmark differs from the others"
         )
     return Colours(names, low, high)
 
 
-def overlapping(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
+def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
     """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
     return [
         (a, b)
@@ -75,3 +80,38 @@ def _range(name: str, given: Any, path: str | Path) -> list[list[int]]:
                 f"{given['high'][axis]}; only a hue may go over 0"
             )
     return [given["low"], given["high"]]
+
+
+def format_colours(colours: Colours) -> str:
+    """A table a landmark, as `read_colours` wants it."""
+    ranges = zip(colours.names, colours.low.tolist(), colours.high.tolist(), strict=True)
+    comment = "Ranges of hue (0 to 180), saturation and value (0 to 255); a range from 172 to 8 goes over 0."
+    return format_toml({name: {"low": low, "high": high} for name, low, high in ranges}, [comment])
+
+
+def draw_colours(image: np.ndarray, masks: np.ndarray, colours: Colours, own_px: Sequence[np.ndarray]) -> np.ndarray:
+    """(H, W, 3) uint8 BGR: grey but where a range marks it, outlined in the range's colour, its landmark named.
+
+    masks: (K, H, W) uint8 of the ranges. own_px: (P, 4) of each colour, the boxes of its landmark in this picture.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) // 2 + 40
+    drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    thick = line_width(image)
+    drawn[masks.any(axis=0)] = image[masks.any(axis=0)]
+    for name, mask, shade, boxes in zip(colours.names, masks, _shades(colours), own_px, strict=True):
+        grown = cv2.dilate(mask, np.ones((2 * thick + 1,) * 2, np.uint8))
+        drawn[(grown > 0) & ~masks.any(axis=0)] = shade
+        for box in boxes:
+            around = box + 4 * thick * np.array([-1, -1, 2, 2])
+            rectangle(drawn, around, shade, thick)
+            label(drawn, around, name, shade)
+    return drawn
+
+
+def _shades(colours: Colours) -> list[tuple[int, int, int]]:
+    """A bright BGR colour for each range: that of the middle of its hues."""
+    low, high = colours.low[:, 0], colours.high[:, 0]
+    hue = (low + (high - low) % 180 / 2) % 180
+    vivid = np.stack([hue, np.full(len(hue), 255), np.full(len(hue), 255)], axis=1).astype(np.uint8)
+    blue_green_red = cv2.cvtColor(vivid[None], cv2.COLOR_HSV2BGR)[0].tolist()
+    return [(b, g, r) for b, g, r in blue_green_red]

@@ -22,7 +22,7 @@ from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation
-from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Colours, Source, Telemetry
 

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from torchvision_dddas import open_video
 from torchvision_dddas.config import LiveParameters
-from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.io.stream_capture import OpenedStream, Stream, target_of, without_secrets
+from torchvision_dddas.io.video import OpenedStream, Stream, stream_target, without_secrets
 from torchvision_dddas.live.capture_log import Diary
 from torchvision_dddas.live.clock import Clock
 from torchvision_dddas.live.frame_queue import Inbox
@@ -49,18 +49,18 @@ class LiveSource:
         opener: Callable[[], Stream] | None = None,
         clock: Clock | None = None,
     ) -> None:
-        """spec, rate_hz, full_scale: as `open_source` takes them. opener: opens the stream in place of OpenCV."""
+        """spec, rate_hz, full_scale: as `open_video` takes them. opener: opens the stream in place of OpenCV."""
         text = str(spec)
         self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
         self.parameters, self.health, self._clock = parameters or LiveParameters(), health or Health(), clock or Clock()
         self._inbox = Inbox(self.parameters.queue_frames, self.health, self._clock)
         self._diary = Diary(self.health, self._clock)
         told = (self._inbox, self._diary, self.health, self._clock)
-        target = target_of(text)
+        target = stream_target(text)
         self._feed: Player | Receiver
         self.recorded: int | None = None
         if opener is None and target is None:
-            recording = open_source(text, rate_hz=rate_hz, full_scale=full_scale)
+            recording = open_video(text, rate_hz=rate_hz, full_scale=full_scale)
             self._feed = Player(recording, self.parameters.pace, *told)
             self.rate_hz, self.size = recording.rate_hz, recording.size
             self.recorded = recording.count if recording.exact else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.stream_capture import Stream, first_picture, scaled
+from torchvision_dddas.io.video import Stream, first_picture, scaled
 from torchvision_dddas.live.capture_log import Diary
 from torchvision_dddas.live.clock import Clock
 from torchvision_dddas.live.frame_queue import Inbox

@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
+from torchvision_dddas.config import format_toml
 from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
-from torchvision_dddas.io.colour_output import colours_toml
+from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output.detection_output import RunFolder
 from torchvision_dddas.io.output.run_record import NAME, Record
 from torchvision_dddas.io.overlay import OverlayVideo
@@ -88,7 +89,7 @@ class RecordingOutput(RunFolder[RecordedFrame]):
         self.journal = kept = Record(self.folder, {**facts, "outputs": ["tables", *self._save]})
         texts = {"camera.toml": camera_toml(camera), "scenario.toml": scenario}
         if len(colours):
-            texts["colours.toml"] = colours_toml(colours)
+            texts["colours.toml"] = format_colours(colours)
         self._sinks = [_Kept(kept), _Texts(self.folder, texts), _Reports(self.folder), _Truth(self, lonlat)]
         if "frames" in self._save:
             self._sinks.append(_Frames(self.folder / "frames"))
@@ -307,28 +308,32 @@ def clear_after(folder: Path, last: int) -> None:
 
 def camera_toml(camera: Camera, standing: bool = False) -> str:
     """A camera's file. standing: with height, pitch, roll and how well it knows its place, as one on the ground has."""
-    lines = [
-        f'name = "{camera.name}"',
-        f"width_px = {camera.size_px[0]}",
-        f"height_px = {camera.size_px[1]}",
-        f"focal_px = {float(camera.focal_px[0])!r}",
-        f"focal_v_px = {float(camera.focal_px[1])!r}",
-        f"centre_px = [{camera.centre_px[0]}, {camera.centre_px[1]}]",
-        f"k1 = {camera.k1}",
-        f"k2 = {camera.k2}",
-    ]
+    keys: dict[str, object] = {
+        "name": camera.name,
+        "width_px": camera.size_px[0],
+        "height_px": camera.size_px[1],
+        "focal_px": float(camera.focal_px[0]),
+        "focal_v_px": float(camera.focal_px[1]),
+        "centre_px": [float(value) for value in camera.centre_px],
+        "k1": camera.k1,
+        "k2": camera.k2,
+    }
     if standing:
-        lines += [
-            f"height_m = {camera.height_m}",
-            f"pitch_deg = {math.degrees(camera.pitch_rad):.6g}",
-            f"roll_deg = {math.degrees(camera.roll_rad):.6g}",
-            f"focal_sigma = {camera.focal_sigma}",
-            f"height_sigma_m = {camera.height_sigma_m}",
-            f"pitch_sigma_deg = {math.degrees(camera.pitch_sigma_rad):.6g}",
-            f"heading_sigma_deg = {math.degrees(camera.heading_sigma_rad):.6g}",
-            f"position_sigma_m = {camera.position_sigma_m:.6g}",
-        ]
-    return "\n".join(lines) + "\n"
+        keys |= {
+            "height_m": camera.height_m,
+            "pitch_deg": _rounded(math.degrees(camera.pitch_rad)),
+            "roll_deg": _rounded(math.degrees(camera.roll_rad)),
+            "focal_sigma": camera.focal_sigma,
+            "height_sigma_m": camera.height_sigma_m,
+            "pitch_sigma_deg": _rounded(math.degrees(camera.pitch_sigma_rad)),
+            "heading_sigma_deg": _rounded(math.degrees(camera.heading_sigma_rad)),
+            "position_sigma_m": _rounded(camera.position_sigma_m),
+        }
+    return format_toml(keys)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def _report_line(heard: RadioReport) -> str:

@@ -10,9 +10,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
+from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.maps.geojson import encoded, geojson
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks
-from torchvision_dddas.io.masks import Masks
 from torchvision_dddas.io.output.detection_output import uninterrupted
 from torchvision_dddas.io.output.pipeline_output import ALL, SurveyOutput
 from torchvision_dddas.io.output.pipeline_output import SAVED as MADE

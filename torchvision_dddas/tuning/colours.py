@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.hsv import FULL, TURN, from_bgr, within
-from torchvision_dddas.io.colour_files import overlapping
+from torchvision_dddas.io.colour_files import find_overlaps
 from torchvision_dddas.types import Colours
 
 SOFTNESS = (20.0, 2.0)
@@ -54,7 +54,7 @@ def fit_colours(
         if (wrong := _hard(soft.ranges(), bgr, worn)) < least:
             best, least = soft.ranges(), wrong
     low, high = (end.numpy() for end in best)
-    for a, b in overlapping(low, high):
+    for a, b in find_overlaps(low, high):
         raise InputError(
             f"the colours of {names[a]} and {names[b]} come out overlapping: these pictures do not tell them apart; "
             "paint one of them anew, or label more pictures"

@@ -57,7 +57,7 @@ def test_everything_said(tmp_path: Path) -> None:
         ("", "names no data set; wanted [[dataset]] with kind and folder, once or more"),
         ("dataset = 3", "names no data set"),
         ("[dataset]\nkind = 'bms'\nfolder = 'x'", "names no data set; wanted [[dataset]]"),
-        ("name = 'a", "is no TOML"),
+        ("name = 'a", "is not valid TOML"),
         ("task = ['motion']\n" + SET, "has no key 'task'; wanted name, tasks, config, set, backend, interval, dataset"),
         ("tasks = ['flying']\n" + SET, "'flying' is no task; wanted some of motion, tracking, association, people"),
         ("tasks = 'motion'\n" + SET, "tasks = 'motion' will not do; wanted a list of texts"),

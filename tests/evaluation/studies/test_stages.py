@@ -13,7 +13,7 @@ from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.studies.record import Source
 from torchvision_dddas.evaluation.studies.stages import KNOBS, allowed, find, narrowed, opened, scenes_again, upstream
-from torchvision_dddas.io.image_bytes import decoded
+from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.tracking.sequence import follow_scenes
 
 
@@ -47,7 +47,7 @@ def test_motion_is_what_the_loop_finds(clips) -> None:
         rows = found.frame == scene.frame.number
         assert (found.box_px[rows] == scene.detections.box_px).all()
         assert (found.score[rows] == scene.detections.score).all()
-        mask = decoded(found.masks[scene.frame.number], cv2.IMREAD_UNCHANGED)
+        mask = decode_image(found.masks[scene.frame.number], cv2.IMREAD_UNCHANGED)
         assert mask is not None and np.array_equal(mask > 0, scene.mask > 0)
 
 

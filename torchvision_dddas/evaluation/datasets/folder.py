@@ -111,7 +111,7 @@ def truth_at(place: Path, pictures: tuple[Path, ...], labels: Labels) -> Truth |
 
 def positions_at(path: Path) -> Positions:
     """True places on the ground. Raises InputError where they cannot be read."""
-    from torchvision_dddas.io.position_tables import read_positions
+    from torchvision_dddas.io.ground_tables import read_positions
 
     said = read_positions(path)
     return Positions(said.frame, said.target, said.east_north_m, said.lonlat_deg)

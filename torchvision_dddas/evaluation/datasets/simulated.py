@@ -29,7 +29,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked,
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
 from torchvision_dddas.io.detection_tables import read_rows
-from torchvision_dddas.io.position_tables import read_positions
+from torchvision_dddas.io.ground_tables import read_positions
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:

@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.io.image_bytes import decoded
+from torchvision_dddas.io.images import decode_image
 
 Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | GroundLocations]
 
@@ -69,7 +69,7 @@ class Result:
     def mask_at(self, frame: int) -> np.ndarray:
         """(H, W) mask of a frame. Raises InputError if it is not there."""
         path = self.place / "masks" / f"{frame:06d}.png"
-        mask = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+        mask = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED) if path.is_file() else None
         if mask is None:
             raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
         return mask if mask.ndim == 2 else mask.max(axis=2)

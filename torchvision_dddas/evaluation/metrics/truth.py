@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
-from torchvision_dddas.io.image_bytes import decoded
+from torchvision_dddas.io.images import decode_image
 
 UNNAMED = 1 << 24
 """The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
@@ -109,7 +109,7 @@ def load(place: Path, first_frame: int | None = None) -> Truth:
 def read_mask(path: Path) -> np.ndarray:
     """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
     try:
-        image = decoded(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED)
     except OSError:
         image = None
     if image is None:

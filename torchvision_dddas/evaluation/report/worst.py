@@ -14,8 +14,7 @@ from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.report.pictures import Boxes, Pair, box_pair, mask_pair, matched
 from torchvision_dddas.evaluation.report.tallies import Tally, main_group, tally
 from torchvision_dddas.evaluation.studies.record import Case, Found
-from torchvision_dddas.io.image_bytes import decoded
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
+from torchvision_dddas.io.images import IMAGE_SUFFIXES, decode_image, read_image
 from torchvision_dddas.io.report import format_number
 from torchvision_dddas.io.sources import open_source
 
@@ -125,7 +124,7 @@ def _with_pair(one: Worst, picture: np.ndarray | None) -> Worst:
     if found is None:
         return one
     if truth is not None and one.frame in truth.masks and one.frame in found.masks:
-        mask = decoded(found.masks[one.frame], cv2.IMREAD_UNCHANGED)
+        mask = decode_image(found.masks[one.frame], cv2.IMREAD_UNCHANGED)
         labels = truths.labels_of(truth, one.frame)
         if mask is None or mask.shape[:2] != labels.shape:
             raise InputError("the result's mask cannot be read")

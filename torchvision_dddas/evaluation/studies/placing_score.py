@@ -131,7 +131,7 @@ def _marks(clip: "Clip") -> tuple[np.ndarray, np.ndarray, np.ndarray, bool] | No
     """What the clip's landmarks report: frames, which, (N, 2) where, and whether in degrees; None without any."""
     if clip.landmarks is None:
         return None
-    from torchvision_dddas.io.landmark_tables import read_landmarks
+    from torchvision_dddas.io.ground_tables import read_landmarks
 
     table = read_landmarks(clip.landmarks, clip.rate_hz)
     kept = ~table.planned & np.isfinite(table.place).all(axis=1) & (table.frame == np.round(table.frame))

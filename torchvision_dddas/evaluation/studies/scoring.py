@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.metrics.pixels import Still
 from torchvision_dddas.evaluation.metrics.tracking import Each
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.scored import Scored
-from torchvision_dddas.io.image_bytes import decoded
+from torchvision_dddas.io.images import decode_image
 
 if TYPE_CHECKING:
     from torchvision_dddas.evaluation.datasets.record import Clip
@@ -85,7 +85,7 @@ class _Held(Result):
 
     def mask_at(self, frame: int) -> np.ndarray:
         """(H, W) mask of a frame. Raises InputError if it is not there."""
-        mask = decoded(self.masks[frame], cv2.IMREAD_UNCHANGED) if frame in self.masks else None
+        mask = decode_image(self.masks[frame], cv2.IMREAD_UNCHANGED) if frame in self.masks else None
         if mask is None:
             raise InputError(f"{self.called}: frame {frame} is labelled, but has no result; was the clip cut short?")
         return mask if mask.ndim == 2 else mask.max(axis=2)

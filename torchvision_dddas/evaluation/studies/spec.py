@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
+from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.studies.record import TASKS, Source, Spec, Task
-from torchvision_dddas.io.toml_text import toml_of
 
 KEYS = ("name", "tasks", "config", "set", "backend", "interval", "dataset")
 BACKENDS = ("auto", "torch", "onboard")
@@ -21,7 +21,7 @@ def read_spec(path: Path) -> Spec:
     Raises InputError with one line: unreadable, a key that is unknown or lacks, a value that will not do, an unknown
     kind of data set.
     """
-    said = toml_of(path, "study")
+    said = read_toml(path, "study")
     where = f"study {path}"
     _known(said, KEYS, where)
     name = _text(said, "name", where, path.stem)

@@ -4,14 +4,13 @@ Nothing random is left open and every study takes from the cache what it has com
 off and is asked for again goes the same way, and is soon where it was.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from torchvision_dddas.config import Settings, changes
+from torchvision_dddas.config import Settings, changes, format_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.axes import Axis, Choice, points, possible
 
@@ -101,23 +100,17 @@ def ranked(trials: Sequence[Trial], least: bool) -> list[Trial]:
 
 
 def written(value: object) -> str:
-    """A knob's value as TOML has it, and as `--set` takes it."""
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(written(entry) for entry in value) + "]"
-    # Numbers, words and truth values are written alike in JSON.
-    return json.dumps(value)
+    """A parameter's value as TOML has it, and as `--set` takes it."""
+    return format_toml({"value": value}).removeprefix("value = ").rstrip()
 
 
 def as_toml(settings: Settings, heading: Sequence[str]) -> str:
     """What differs from the defaults, as `--config` takes it, under some lines of comment."""
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, dict[str, object]] = {}
     for name, value in changes(settings).items():
         group, parameter = name.split(".")
-        groups.setdefault(group, []).append(f"{parameter} = {written(value)}")
-    lines = [f"# {line}" for line in heading]
-    for group, parameters in groups.items():
-        lines += ["", f"[{group}]", *parameters]
-    return "\n".join(lines) + "\n"
+        groups.setdefault(group, {})[parameter] = value
+    return format_toml(groups, heading)
 
 
 def told(trials: Sequence[Trial]) -> list[dict[str, Any]]:

@@ -10,8 +10,7 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
-from torchvision_dddas.io.masks import NAME as MASK_NAME
-from torchvision_dddas.io.masks import Masks
+from torchvision_dddas.io.images import MASK_NAME, Masks
 from torchvision_dddas.io.output import run_record as journal
 from torchvision_dddas.io.output.run_record import Journal, Record
 from torchvision_dddas.io.overlay import OverlayVideo, draw_scene

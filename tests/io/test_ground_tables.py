@@ -1,4 +1,4 @@
-"""Landmarks from CSV: what a table means, and one line for each mistake."""
+"""Landmarks and positions from CSV: what a table means, and one line for each mistake."""
 
 import re
 
@@ -7,7 +7,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.site import looks_swapped
-from torchvision_dddas.io.landmark_tables import read_landmarks
+from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
 
 HEADER = "frame,landmark,longitude_deg,latitude_deg\n"
 
@@ -65,13 +65,13 @@ def test_what_a_picture_shows_is_in_a_whole_frame_though_its_time_is_rounded(tab
         (HEADER, "has a header but no rows"),
         ("frame,frame,landmark,east_m,north_m\n", "column frame is named twice"),
         ("frame,time_s,landmark,east_m,north_m\n", "has both frame and time_s"),
-        ("time_s,landmark,east_m,north_m\n0,a,0,0\n", "are by time_s; say with --rate"),
+        ("time_s,landmark,east_m,north_m\n0,a,0,0\n", "has times (time_s); pass --rate"),
         (HEADER + "1,a,3\n", "line 2: 3 columns; the first line names 4"),
         (HEADER + "1,a,1,1\n1,b,x,1\n", "line 3: longitude_deg is 'x'; wanted a number"),
         (HEADER + "1,a,inf,1\n", "line 2: longitude_deg is 'inf'; wanted a number"),
-        (HEADER + "1.5,a,1,1\n", "line 2: frame is '1.5'; wanted a whole number, from 1; between two pictures, give"),
+        (HEADER + "1.5,a,1,1\n", "line 2: frame is '1.5'; wanted a whole number from 1; between two pictures, give"),
         (HEADER + ",a,1,1\n", "line 2: frame is ''; wanted a whole number"),
-        (HEADER + "0,a,1,1\n", "line 2: frame is '0'; wanted 1 to"),
+        (HEADER + "0,a,1,1\n", "line 2: frame is '0'; wanted a whole number"),
         (HEADER + "1,,1,1\n", "line 2: landmark is empty; wanted its name or number"),
         (HEADER + "1,a,32.23,-110.95\n", "line 2: latitude_deg is '-110.95'; wanted -90 to 90; longitude and latitude"),
         (HEADER + "1,a,500123,3566000\n", "wanted -90 to 90; if these are metres, name the columns east_m,north_m"),
@@ -88,7 +88,10 @@ def test_what_a_picture_shows_is_in_a_whole_frame_though_its_time_is_rounded(tab
             "frame,landmark,longitude_deg,latitude_deg,east_m,north_m\n1,a,,,,\n2,a,1,1,1,1\n",
             "line 3: a place in degrees and in metres",
         ),
-        ("frame,landmark,east_m,north_m,sigma_m\n1,a,0,0,-1\n", "line 2: sigma_m is '-1'; wanted 0 to 100000"),
+        (
+            "frame,landmark,east_m,north_m,sigma_m\n1,a,0,0,-1\n",
+            "line 2: sigma_m is '-1'; wanted a number from 0 to 100000",
+        ),
         ("frame,landmark,east_m,north_m,planned\n1,a,0,0,0.5\n", "line 2: planned is '0.5'; wanted 0 or 1"),
         ("frame,landmark,east_m,north_m,planned\n1,a,,,1\n", "line 2: planned is 1 but there is no place"),
         (
@@ -101,11 +104,6 @@ def test_each_mistake_is_one_clear_line(table, text, message):
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         read_landmarks(table(text))
     assert str(caught.value).startswith("landmarks ") and "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"landmarks .*nothing\.csv cannot be read"):
-        read_landmarks(tmp_path / "nothing.csv")
 
 
 def test_a_report_and_a_waypoint_may_be_in_one_frame(table):
@@ -128,3 +126,52 @@ def test_swapped_longitude_and_latitude_are_seen_by_a_place_that_is_near(table, 
 def test_places_on_both_sides_of_180_degrees_are_near_each_other(table):
     found = read_landmarks(table(HEADER + "1,a,179.9999,1\n1,b,-179.9999,1\n1,c,179.9998,1\n1,d,-179.9998,1\n"))
     assert len(found) == 4
+
+
+LOCATED = "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,score"
+PLACES = "frame,target,east_m,north_m,longitude_deg,latitude_deg"
+
+
+def test_rows_are_sorted_by_frame_and_unknown_covariances_are_nan(table):
+    found = read_positions(table(LOCATED + "\n2,7,1.5,-2,0.1,0.02,0.3,0.5\n\n1,8,3,4,,,,1\n"))
+    assert found.frame.tolist() == [1, 2] and found.target.tolist() == [8, 7]
+    assert found.east_north_m.tolist() == [[3, 4], [1.5, -2]]
+    assert np.isnan(found.covariance_m2[0]).all()
+    assert found.covariance_m2[1].tolist() == [[0.1, 0.02], [0.02, 0.3]]
+    assert found.score.tolist() == [1, 0.5] and found.lonlat_deg is None
+
+
+def test_the_places_alone_are_enough(table):
+    found = read_positions(table(PLACES + "\n1,1,0,0,10,50\n"))
+    assert np.isnan(found.covariance_m2).all() and found.score.tolist() == [1]
+    assert found.lonlat_deg is not None and found.lonlat_deg.tolist() == [[10, 50]]
+
+
+def test_degrees_that_no_row_has_are_none(table):
+    assert read_positions(table(PLACES + "\n1,1,0,0,,\n")).lonlat_deg is None
+
+
+def test_a_covariance_of_a_line_survives_its_rounding(table):
+    # Written with four decimals, as `dddas locate` does, 9.9999 * 0.0001 is a little less than 0.0317 squared.
+    assert len(read_positions(table(LOCATED + "\n1,1,0,0,9.9999,0.0317,0.0001,1\n"))) == 1
+
+
+def test_a_table_without_rows_is_valid(table):
+    assert len(read_positions(table(LOCATED + "\n"))) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frame,target,east_m\n", "lacks north_m; its columns are frame, target, east_m"),
+        (LOCATED + "\n1,1,x,0,1,0,1,1\n", "line 2: east_m is 'x'; wanted a number from"),
+        (LOCATED + "\n1,1.5,0,0,1,0,1,1\n", "line 2: target is '1.5'; wanted a whole number from 1"),
+        (LOCATED + "\n2,1,0,0,1,0,1,1\n1,1,0,0,-1,0,1,1\n", "line 3: -1, 0, 1 are no variances"),
+        (LOCATED + "\n1,1,0,0,1,5,1,1\n", "line 2: 1, 5, 1 are no variances"),
+        (PLACES + "\n1,1,0,0,10,95\n", "line 2: latitude_deg is '95'; wanted a number from -90 to 90"),
+        (PLACES + "\n2,1,0,0,10,50\n1,1,0,0,,\n", "line 3: no longitude_deg or latitude_deg, which other rows"),
+    ],
+)
+def test_a_mistake_in_positions_is_named(table, text, words):
+    with pytest.raises(InputError, match=words):
+        read_positions(table(text))

@@ -1,0 +1,234 @@
+"""Places on the ground from CSV: reports of landmarks, which are ground vehicles of known place, and located targets.
+
+frame,landmark,longitude_deg,latitude_deg       # or time_s; or east_m,north_m; optional u_px,v_px, sigma_m, planned
+1,rover,-110.95000,32.23000
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import great_circle_m
+from torchvision_dddas.io.tables import (
+    COVARIANCE,
+    DEGREES,
+    EAST_NORTH,
+    FARTHEST,
+    FRAME,
+    TARGET,
+    Column,
+    CsvTable,
+    CsvText,
+    Schema,
+    read_csv,
+    read_table,
+)
+from torchvision_dddas.types import Landmarks, Positions
+
+PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
+"""The two kinds of place that a table may have."""
+
+IMAGE = ("u_px", "v_px")
+
+LANDMARKS = Schema(
+    "landmarks",
+    Column("frame", "d", 1, FRAME.high, True, wanted="a whole number from 1; between two pictures, give time_s"),
+    Column("time_s", "g", -1e10, 1e10),
+    Column("landmark"),
+    *(Column(name, ".9f", may_be_empty=True, wanted="a number") for name in ("latitude_deg", "longitude_deg")),
+    *(Column(name, ".4f", -1e7, 1e7, may_be_empty=True) for name in PLACES[1]),
+    *(Column(name, ".3f", -1e6, 1e6, may_be_empty=True) for name in IMAGE),
+    Column("sigma_m", ".6g", 0, 1e5, may_be_empty=True),
+    Column("planned", "d", 0, 1, True, may_be_empty=True, wanted="0 or 1"),
+)
+FARTHEST_M = 100_000.0
+"""Landmarks of one table are no further apart: what lies beyond is a typing mistake."""
+
+
+def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_s: float = 0.0) -> Landmarks:
+    """Read `frame` or `time_s`, `landmark` (a name or a number), a place; `u_px,v_px`, `sigma_m`, `planned` if there.
+
+    Rows may come in any order; further columns are ignored. An empty place is a dropout, an empty u_px and v_px means
+    not seen; `nan` counts as empty. Times become frames, 1 + (time_s + clock_offset_s) rate_hz, whole ones where the
+    row has a place in the picture; a table by frames ignores rate and offset.
+    Raises InputError with file and line: as read_table, times without a rate, longitude and latitude swapped, degrees
+    and metres mixed, half a place, a landmark twice in a frame, places further apart than FARTHEST_M.
+    """
+    header, line, rows = read_csv(path, "landmarks")
+    _check_header(header, path, rate_hz)
+    names = header.index("landmark")
+    rows = [["" if cell.lower() == "nan" and k != names else cell for k, cell in enumerate(row)] for row in rows]
+    table = read_table(path, LANDMARKS, text=CsvText(header, line, rows))
+    if not len(table):
+        raise InputError(f"landmarks {path} has a header but no rows")
+    _check_degrees(table)
+    place, is_geographic = _places(table)
+    image = _pair(table, IMAGE)
+    planned, is_seen = table["planned"] == 1, np.isfinite(image[:, 0])
+    table.refuse(planned & np.isnan(place[:, 0]), "planned is 1 but there is no place; wanted the waypoint's")
+    table.refuse(
+        planned & is_seen, "planned is 1 and there is a u_px; a waypoint is not seen, leave u_px and v_px empty"
+    )
+    frame = table["frame"]
+    if "frame" not in table:
+        frame = 1 + (table["time_s"] + clock_offset_s) * (rate_hz or 1.0)
+        # A picture's time is written with three digits or so: what is seen is seen in a whole frame.
+        frame = np.round(np.where(is_seen, np.round(frame), frame), 6)
+    index: dict[str, int] = {}
+    landmark = np.array([index.setdefault(name, len(index)) for name in table.columns["landmark"]], np.int64)
+    if "" in index:
+        table.refuse(landmark == index[""], "landmark is empty; wanted its name or number")
+    order = np.argsort(frame, kind="stable")
+    found = Landmarks(
+        tuple(index),
+        frame[order],
+        landmark[order],
+        image[order],
+        place[order],
+        table["sigma_m"][order],
+        planned[order],
+        table.line[order],
+        is_geographic,
+        str(path),
+    )
+    _check_once_a_frame(found)
+    _check_far(found)
+    return found
+
+
+def _check_header(header: list[str], path: str | Path, rate_hz: float | None) -> None:
+    missing = ["frame or time_s"] if not {"frame", "time_s"} & set(header) else []
+    if "landmark" not in header:
+        missing.append("landmark")
+    halves = [name for pair in (*PLACES, IMAGE) if len(set(pair) & set(header)) == 1 for name in pair]
+    missing += [name for name in halves if name not in header]
+    if not halves and not any(set(kind) <= set(header) for kind in PLACES):
+        missing.append("longitude_deg,latitude_deg (or east_m,north_m)")
+    if missing:
+        columns = ", ".join(header) or "none"
+        raise InputError(f"landmarks {path} lacks {', '.join(missing)}; its columns are {columns}")
+    if {"frame", "time_s"} <= set(header):
+        raise InputError(f"landmarks {path} has both frame and time_s; give one of them")
+    if "time_s" in header and rate_hz is None:
+        raise InputError(f"landmarks {path} has times (time_s); pass --rate, the number of frames a second")
+
+
+def _check_degrees(table: CsvTable) -> None:
+    """A latitude tells more of a mistake than a longitude, so that it comes first."""
+    for name, most in (("latitude_deg", 90), ("longitude_deg", 180)):
+        is_wrong = np.abs(table[name]) > most
+        if is_wrong.any():
+            row = int(is_wrong.argmax())
+            longitude, latitude = table.stack(*PLACES[0])[row]
+            hint = ""
+            if abs(latitude) <= 180 and abs(longitude) <= 90:
+                hint = "; longitude and latitude look swapped"
+            elif abs(table[name][row]) > 180:
+                hint = "; if these are metres, name the columns east_m,north_m"
+            raise table.error(f"{name} is '{table.text[name][row]}'; wanted -{most} to {most}{hint}", row)
+
+
+def _places(table: CsvTable) -> tuple[np.ndarray, bool]:
+    """(N, 2) places, and whether they are longitudes and latitudes."""
+    degrees, metres = (_pair(table, kind) for kind in PLACES)
+    in_degrees, in_metres = (np.isfinite(place[:, 0]) for place in (degrees, metres))
+    table.refuse(
+        in_degrees & in_metres,
+        "a place in degrees and in metres; give one kind in all rows and leave the columns of the other out",
+    )
+    if in_degrees.any() and in_metres.any():
+        first, second = (table.line[known.argmax()] for known in (in_degrees, in_metres))
+        raise table.error(f"line {first} has its place in degrees, line {second} in metres; give one kind in all rows")
+    is_geographic = bool(in_degrees.any()) or ("longitude_deg" in table and not in_metres.any())
+    return degrees if is_geographic else metres, is_geographic
+
+
+def _pair(table: CsvTable, names: tuple[str, str]) -> np.ndarray:
+    """(N, 2), NaN where a row has neither."""
+    pair = table.stack(*names)
+    is_half = np.isnan(pair).sum(axis=1) == 1
+    if is_half.any():
+        row = int(is_half.argmax())
+        here = names[int(np.isnan(pair[row, 0]))]
+        raise table.error(f"{here} alone; wanted {' and '.join(names)}, or neither", row)
+    return pair
+
+
+def _check_once_a_frame(found: Landmarks) -> None:
+    order = np.lexsort((found.line, found.planned, found.landmark, found.frame))
+    keys = np.stack([found.frame, found.landmark, found.planned])[:, order]
+    is_same = (keys[:, 1:] == keys[:, :-1]).all(axis=0)
+    if is_same.any():
+        # The first in the file, whatever the order of frames.
+        k = int(np.where(is_same, found.line[order][1:], np.iinfo(np.int64).max).argmin())
+        first, again = (int(found.line[order[k + i]]) for i in (0, 1))
+        raise InputError(
+            f"landmarks {found.path}, line {again}: {found.names[found.landmark[order[k]]]} is in frame "
+            f"{found.frame[order[k]]:g} already, by line {first}; wanted each landmark once in a frame"
+        )
+
+
+def _check_far(found: Landmarks) -> None:
+    is_known = np.isfinite(found.place[:, 0])
+    if not is_known.any():
+        return
+    start = found.place[is_known][0]
+    from_start = found.place - start
+    if found.geographic:
+        from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # both sides of 180 degrees are near each other
+    middle = start + np.median(from_start[is_known], axis=0)
+    away = great_circle_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
+    away = np.where(is_known, away, 0.0)
+    k = int(away.argmax())
+    if away[k] > FARTHEST_M:
+        first, second = found.place[k]
+        fix = "a receiver without a fix says so: leave the place empty" if first == second == 0 else "check the digits"
+        raise InputError(
+            f"landmarks {found.path}, line {found.line[k]}: {first:g}, {second:g} lies {away[k] / 1000:.0f} km from "
+            f"most others; wanted at most {FARTHEST_M / 1000:g} km: {fix}"
+        )
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Positions of targets, as `dddas locate` writes them.
+
+SCORE = Column("score", ".6g", -FARTHEST, FARTHEST, may_be_empty=True)
+POSITIONS = Schema("positions", FRAME, TARGET, *EAST_NORTH, *COVARIANCE, *DEGREES, SCORE)
+POSITION_COLUMNS = ("frame", "target", "east_m", "north_m")
+
+
+def read_positions(path: str | Path) -> Positions:
+    """Read POSITION_COLUMNS, and the covariance, longitude_deg, latitude_deg and score where they are there.
+
+    Rows may come in any order. An empty cell of a covariance or score is unknown. A table without rows is valid.
+    Raises InputError with file and line: as read_table, variances that cannot be, a longitude and latitude that only
+    some rows have.
+    """
+    table = read_table(path, POSITIONS, POSITION_COLUMNS)
+    east, both, north = (table[column.name] for column in COVARIANCE)
+    # Unknown variances pass each comparison; a share above 1 allows for rounding.
+    is_wrong = (east < 0) | (north < 0) | (both**2 > east * north * 1.01 + 1e-8)
+    if is_wrong.any():
+        row = int(is_wrong.argmax())
+        raise table.error(
+            f"{east[row]:g}, {both[row]:g}, {north[row]:g} are no variances of one place; wanted var_east_m2 and "
+            "var_north_m2 of 0 or more, and cov_east_north_m2 squared below their product",
+            row,
+        )
+    degrees = table.stack(*(column.name for column in DEGREES))
+    is_known = np.isfinite(degrees).all(axis=1)
+    if is_known.any():
+        table.refuse(
+            ~is_known,
+            "no longitude_deg or latitude_deg, which other rows have; wanted both in all rows or in none",
+        )
+    order = np.argsort(table["frame"], kind="stable")
+    return Positions(
+        table["frame"][order].astype(np.int64),
+        table["target"][order].astype(np.int64),
+        table.stack("east_m", "north_m")[order],
+        np.stack([east, both, both, north], axis=1).reshape(-1, 2, 2)[order],
+        table["score"][order] if "score" in table else np.ones(len(table)),
+        lonlat_deg=degrees[order] if "longitude_deg" in table and is_known.all() else None,
+    )
