@@ -55,14 +55,6 @@ def test_the_torch_free_twin_agrees(size):
         np.testing.assert_allclose(jaccard.triplets(first, second, third)[1:, 1:, 1:], triplets[w], atol=2e-6)
 
 
-def test_a_batch_is_its_windows_one_by_one():
-    a, b, c = features()
-    whole = affinity.triplets(a, b, c, *masks(a, b, c))
-    for w in range(2):
-        rows = a[w : w + 1], b[w : w + 1], c[w : w + 1]
-        torch.testing.assert_close(affinity.triplets(*rows, *masks(*rows))[0], whole[w])
-
-
 def test_padding_changes_no_affinity_and_has_none():
     a, b, c = features()
     known = masks(a, b, c)

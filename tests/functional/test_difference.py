@@ -1,23 +1,11 @@
 """Differences between registered frames, and the light that is taken out of them first."""
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from torchvision_dddas.functional import difference
-
-
-def row(*values: float) -> torch.Tensor:
-    return torch.tensor(values).reshape(1, 1, 1, -1)
-
-
-def test_equation_9_marks_where_the_two_later_frames_differ():
-    assert torch.equal(difference.three_frame(row(0.5, 0.25, 0), row(0.5, 1, 0.5)), row(0, 0.75, 0.5))
-
-
-def test_the_pair_marks_a_mover_once_where_it_stands_in_the_reference():
-    reference, later, last = row(1, 0, 0, 0), row(0, 1, 0, 0), row(0, 0, 1, 0)
-    assert torch.equal(difference.pair(reference, later, last), row(1, 0, 0, 0))
-    assert torch.equal(difference.three_frame(later, last), row(0, 1, 1, 0))
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.15, 0.0), (0.85, 0.03), (1.0, -0.05)])
@@ -48,22 +36,27 @@ def test_exposure_of_a_blank_frame_or_of_nothing_seen_keeps_the_gain(seen):
     assert offset.item() == pytest.approx(0.1 if seen else 0.0, abs=1e-6)
 
 
-def test_exposure_of_a_batch_is_that_of_each_clip_alone(texture, tensor):
-    reference = torch.cat([tensor(texture(seed, 37, 53)) for seed in range(3)])
-    warped = reference * torch.tensor([0.9, 1.0, 1.1])[:, None, None, None] + 0.01
-    inside = torch.rand(3, 1, 37, 53, generator=torch.Generator().manual_seed(0)) > 0.3
-    together = difference.exposure(reference, warped, inside)
-    for clip in range(3):
-        one = slice(clip, clip + 1)
-        for whole, alone in zip(together, difference.exposure(reference[one], warped[one], inside[one]), strict=True):
-            torch.testing.assert_close(whole[one], alone)
-
-
 def test_gradients_are_those_of_finite_differences():
     generator = torch.Generator().manual_seed(0)
-    pictures = [torch.rand(1, 1, 4, 5, generator=generator, dtype=torch.float64).requires_grad_() for _ in range(3)]
-    assert torch.autograd.gradcheck(difference.three_frame, tuple(pictures[:2]))
-    assert torch.autograd.gradcheck(difference.pair, tuple(pictures))
+    pictures = [torch.rand(1, 1, 4, 5, generator=generator, dtype=torch.float64).requires_grad_() for _ in range(2)]
     inside = torch.ones(1, 1, 4, 5, dtype=torch.bool)
     # A floor above all errors: trimming, which has no gradient, does not take part.
-    assert torch.autograd.gradcheck(lambda a, b: difference.exposure(a, b, inside, floor=9.0), tuple(pictures[:2]))
+    assert torch.autograd.gradcheck(lambda a, b: difference.exposure(a, b, inside, floor=9.0), tuple(pictures))
+
+
+@pytest.mark.parametrize("shape", [(120, 160), (61, 87)])
+def test_the_gradient_is_opencvs(texture, shape):
+    picture = texture(2, *shape)
+    across = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.5)
+    down = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.5)
+    wanted = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
+    np.testing.assert_array_equal(
+        difference.gradient(torch.from_numpy(picture.astype(np.float32))[None, None])[0, 0].numpy().astype(np.uint8),
+        wanted,
+    )
+
+
+def test_the_masked_median_is_of_the_masked_values_alone():
+    values = torch.tensor([[5.0, 1.0, 9.0, 3.0, 7.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
+    mask = torch.tensor([[True, True, False, True, True], [False] * 5])
+    assert difference.masked_median(values, mask).tolist() == [[3.0], [0.0]]

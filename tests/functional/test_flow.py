@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.functional import flow, homography
+from torchvision_dddas.functional import consensus, flow
 
 MOTION = np.array([[1.01, 0.02, 4.0], [-0.015, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
 
@@ -62,7 +62,7 @@ def test_agrees_with_opencv_to_a_hundredth_of_a_pixel(scene, tensor, levels, win
 
 def test_with_a_prediction_one_level_and_a_small_table_do(scene, tensor):
     first, second, corners, points = scene
-    truth = homography.transfer(torch.from_numpy(MOTION).float()[None], points)
+    truth = consensus.transfer(torch.from_numpy(MOTION).float()[None], points)
     guess = truth + 0.4 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
     found, ok = flow.track(
         points, *pyramids(tensor, first, second, 1), guess=guess, window_px=15, iterations=5, reach_px=2
@@ -120,7 +120,7 @@ def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tens
     first, second, _, points = scene
     covered = second.copy()
     covered[60:140, 80:180] = texture(9, 80, 100)
-    truth = homography.transfer(torch.from_numpy(MOTION).float()[None], points)
+    truth = consensus.transfer(torch.from_numpy(MOTION).float()[None], points)
     inside = ((truth > torch.tensor([90.0, 70.0])) & (truth < torch.tensor([170.0, 130.0]))).all(-1)
     away = ((truth < torch.tensor([60.0, 40.0])) | (truth > torch.tensor([200.0, 160.0]))).any(-1)
     away &= ((truth > 10) & (truth < torch.tensor([250.0, 190.0]))).all(-1)
@@ -128,19 +128,6 @@ def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tens
     assert inside.sum() >= 8
     assert found[inside].float().mean() < 0.2
     assert found[away].float().mean() > 0.9
-
-
-def test_a_batch_is_the_same_as_each_clip_alone(two_views, tensor):
-    clips = [two_views(seed, 90, 121, MOTION) for seed in range(3)]
-    first = torch.cat([tensor(a) for a, _ in clips])
-    second = torch.cat([tensor(b) for _, b in clips])
-    points = torch.rand(3, 40, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([120.0, 89.0])
-    together, found = flow.track(points, flow.pyramid(first, 3), flow.pyramid(second, 3))
-    for k in range(3):
-        one = slice(k, k + 1)
-        alone, ok = flow.track(points[one], flow.pyramid(first[one], 3), flow.pyramid(second[one], 3))
-        assert torch.equal(found[one], ok)
-        torch.testing.assert_close(together[one][ok], alone[ok], atol=1e-3, rtol=0)
 
 
 def test_gradients_are_those_of_finite_differences(two_views, tensor):

@@ -1,91 +1,109 @@
-"""The perspective warp against OpenCV."""
+"""Warping and resizing 8-bit levels against OpenCV."""
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from torchvision_dddas.functional import warp
+from torchvision_dddas.functional.warp import resize
 
-MOTION = np.array([[1.01, 0.02, 3.3], [-0.015, 0.99, -4.6], [1e-5, -2e-5, 1.0]])
-
-
-def matrix(values: np.ndarray, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    return torch.from_numpy(values).to(dtype)[None]
+CAMERA = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
+SIZES = [(120, 160), (61, 87)]
 
 
-@pytest.mark.parametrize("shape", [(37, 53), (240, 320)])
-def test_agrees_with_opencv_to_a_grey_level_inside(texture, tensor, shape):
-    picture = texture(0, *shape)
-    wanted = torch.from_numpy(cv2.warpPerspective(picture, MOTION, shape[::-1])).double()
-    # OpenCV rounds positions to 1/32 px and the result to whole grey levels; nothing else differs.
-    found, inside = warp.warp(tensor(picture).double(), matrix(MOTION, torch.float64), subpixels=32)
-    apart = (found[0, 0] * 255 - wanted).abs()[inside[0, 0]]
-    assert inside.float().mean() > 0.7
-    assert apart.quantile(0.999) < 0.6
-    # A position that falls on a rounding limit may go either way.
-    assert (apart > 1).float().mean() < 1e-4
+def levels(picture):
+    return torch.from_numpy(picture.astype(np.float32))[None, None]
 
 
-def test_without_rounding_positions_nearly_all_pixels_agree_to_a_grey_level(texture, tensor):
-    picture = texture(0, 240, 320)
-    wanted = torch.from_numpy(cv2.warpPerspective(picture, MOTION, (320, 240)))
-    found, inside = warp.warp(tensor(picture), matrix(MOTION))
-    apart = (found[0, 0] * 255 - wanted).abs()[inside[0, 0]]
-    assert apart.mean() < 0.5
-    assert (apart > 1).float().mean() < 0.05
+@pytest.mark.parametrize("shape", SIZES)
+def test_sampled_levels_are_opencvs_up_to_ties(texture, shape):
+    picture = texture(1, *shape)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    wanted = cv2.warpPerspective(picture, CAMERA, shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    sampled = warp.sample(levels(picture), torch.from_numpy(CAMERA)[None]).add(0.5).byte()[0, 0].numpy()
+    differs = np.abs(sampled.astype(int) - wanted)
+    assert (differs > 0).mean() < 0.01 and differs.max() <= 1
 
 
-def test_the_identity_returns_the_picture_and_all_of_it_is_inside(texture, tensor):
-    picture = tensor(texture(0, 37, 53))
-    found, inside = warp.warp(picture, torch.eye(3)[None])
-    torch.testing.assert_close(found, picture, atol=1e-5, rtol=0)
-    assert inside.all()
+@pytest.mark.parametrize("border", [0, 4])
+@pytest.mark.parametrize("matrix", [CAMERA, np.eye(3), np.array([[1, 0, 400.0], [0, 1, 0], [0, 0, 1]])])
+def test_the_columns_seen_are_those_of_a_warped_mask(matrix, border):
+    height, width = 61, 87
+    inset = np.zeros((height, width), np.uint8)
+    inset[border : height - border, border : width - border] = 255
+    wanted = cv2.warpPerspective(inset, matrix, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP) > 0
+    size = height, width
+    first, last = warp.seen_columns(torch.from_numpy(matrix)[None], size, size, border)
+    np.testing.assert_array_equal(warp.between(first, last, width)[0, 0].numpy(), wanted)
 
 
-def test_a_shift_of_two_pixels_by_hand():
-    picture = torch.arange(12.0).reshape(1, 1, 3, 4)
-    found, inside = warp.warp(picture, torch.tensor([[[1.0, 0, 2], [0, 1, 0], [0, 0, 1]]]), fill=-1.0)
-    torch.testing.assert_close(
-        found[0, 0], torch.tensor([[-1.0, -1, 0, 1], [-1, -1, 4, 5], [-1, -1, 8, 9]]), atol=1e-5, rtol=0
-    )
-    assert torch.equal(inside[0, 0], torch.tensor([[False, False, True, True]] * 3))
+def test_nothing_is_seen_of_what_lies_behind_the_camera():
+    behind = -torch.eye(3)[None]
+    first, last = warp.seen_columns(behind, (5, 6), (5, 6))
+    assert (first > last).all()
 
 
-def test_inside_means_that_all_four_source_pixels_are(tensor):
-    half = torch.tensor([[[1.0, 0, 0.5], [0, 1, 0], [0, 0, 1]]])
-    _, inside = warp.warp(torch.ones(1, 1, 3, 5), half)
-    assert inside[0, 0, 1].tolist() == [False, True, True, True, True]
+def opencv(picture: np.ndarray, size: tuple[int, int]) -> torch.Tensor:
+    found = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_LINEAR_EXACT)
+    return batch(found)
 
 
-def test_the_size_may_differ_from_the_frames(texture, tensor):
-    picture = texture(0, 60, 80)
-    wanted = torch.from_numpy(cv2.warpPerspective(picture, MOTION, (50, 41)))
-    found, inside = warp.warp(tensor(picture), matrix(MOTION), size=(41, 50))
-    assert found.shape == (1, 1, 41, 50)
-    assert (found[0, 0] * 255 - wanted).abs()[inside[0, 0]].mean() < 0.5
+def batch(picture: np.ndarray) -> torch.Tensor:
+    """uint8 picture -> (1, C, H, W) float32 levels."""
+    return torch.from_numpy(np.atleast_3d(picture)).permute(2, 0, 1)[None].float()
 
 
-def test_nothing_behind_the_horizon_is_inside():
-    tilted = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [-0.05, 0, 1]]])
-    _, inside = warp.warp(torch.ones(1, 1, 40, 60), torch.linalg.inv(tilted))
-    columns = inside[0, 0].any(0)
-    assert columns[:10].any() and not columns[20:].any()
+@pytest.mark.parametrize("shape", [(97, 131, 3), (96, 128), (61, 40)])
+def test_every_level_of_a_pyramid_is_opencvs_to_the_bit_enlarged_ones_too(shape):
+    picture = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    scale, sizes = 0.5, set()
+    while round(shape[0] / scale) >= 2:
+        sizes.add((round(shape[0] / scale), round(shape[1] / scale)))
+        scale *= 1.05
+    assert len(sizes) > 50
+    for size in sizes:
+        assert torch.equal(resize(batch(picture), size), opencv(picture, size)), size
 
 
-def test_a_batch_of_colours_is_the_same_as_each_plane_alone(texture):
-    pictures = torch.rand(2, 3, 37, 53, generator=torch.Generator().manual_seed(0))
-    motions = torch.cat([matrix(MOTION), torch.eye(3)[None]])
-    found, inside = warp.warp(pictures, motions)
-    for clip in range(2):
-        one = slice(clip, clip + 1)
-        for colour in range(3):
-            alone, seen = warp.warp(pictures[one, colour : colour + 1], motions[one])
-            assert torch.equal(found[clip, colour], alone[0, 0])
-            assert torch.equal(inside[one], seen)
+@settings(max_examples=150, deadline=None)
+@given(st.tuples(*[st.integers(1, 40)] * 4), st.integers(0, 2**32 - 1))
+def test_any_size_from_any_size_is_opencvs_to_the_bit(sizes, seed):
+    picture = np.random.default_rng(seed).integers(0, 256, sizes[:2], np.uint8)
+    assert torch.equal(resize(batch(picture), sizes[2:]), opencv(picture, sizes[2:]))
 
 
-def test_gradients_are_those_of_finite_differences():
-    picture = torch.rand(1, 1, 6, 7, dtype=torch.float64, requires_grad=True)
-    motion = torch.tensor([[[1.0, 0.02, 0.3], [0.01, 1, -0.4], [1e-3, 0, 1]]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda a, b: warp.warp(a, b)[0], (picture, motion))
+def test_two_pixels_into_four_by_hand():
+    # Sources at -0.25, 0.25, 0.75 and 1.25: the right one's share is 0, 1/4, 3/4 and 1; 18.75 rounds to 19.
+    found = resize(torch.tensor([[[[0.0, 75.0]]]]), (1, 4))
+    assert found.flatten().tolist() == [0, 19, 56, 75]
+
+
+def test_halves_are_rounded_up():
+    picture = np.array([[1, 2], [1, 2]], np.uint8)
+    assert resize(batch(picture), (1, 1)).item() == 2 == opencv(picture, (1, 1)).item()
+
+
+def test_chosen_rows_and_columns_are_those_of_the_whole(texture):
+    picture = batch(texture(1, 60, 80))
+    rows, columns = torch.tensor([3, 2, 2, 40]), torch.tensor([0, 65, 7])
+    assert torch.equal(resize(picture, (50, 66), rows, columns), resize(picture, (50, 66))[..., rows, :][..., columns])
+
+
+def test_unrounded_gradients_are_those_of_finite_differences():
+    values = torch.rand(1, 2, 6, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    picture = (values * 255).requires_grad_()
+    assert torch.autograd.gradcheck(lambda a: resize(a, (9, 4), rounded=False), picture)
+
+
+def test_rounding_changes_no_gradient_and_no_level_for_having_one(texture):
+    picture = batch(texture(2, 24, 30))
+    asked, smooth = picture.clone().requires_grad_(), picture.clone().requires_grad_()
+    found = resize(asked, (17, 23))
+    assert torch.equal(found, resize(picture, (17, 23)))
+    weight = torch.rand(17, 23, generator=torch.Generator().manual_seed(0))
+    (found * weight).sum().backward()
+    (resize(smooth, (17, 23), rounded=False) * weight).sum().backward()
+    torch.testing.assert_close(asked.grad, smooth.grad)

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.nn.motion_segmenter import Core, Differences, Regions, SoftMotion
+from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions
 
 KNOBS: dict[str, float] = {
     "difference.noise_levels": 4.0,
@@ -41,7 +41,7 @@ def values(changed: dict[str, float] | None = None) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> None:
-    motion, windows = SoftMotion(NOISY if noisy else SETTINGS), differences(noisy=noisy)
+    motion, windows = MotionSegmenter(NOISY if noisy else SETTINGS), differences(noisy=noisy)
     hard = motion(windows, {}).mask
     assert 0 < float(hard.mean()) < 1 and set(hard.unique().tolist()) == {0.0, 1.0}
     misses = [float((motion(windows, {}, softness).mask - hard).abs().mean()) for softness in (0.5, 0.1, 0.02, 0.004)]
@@ -51,7 +51,7 @@ def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> 
 @pytest.mark.parametrize("kind", ["normalized", "to_reference"])
 def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
     settings = with_parameters(SETTINGS, {"difference.kind": kind})
-    motion, windows = SoftMotion(settings), differences()
+    motion, windows = MotionSegmenter(settings), differences()
     given, tuned = motion(windows, {}, 0.1), motion(windows, values(), 0.1)
     torch.testing.assert_close(given.mask, tuned.mask)
     torch.testing.assert_close(given.evidence, tuned.evidence)
@@ -61,7 +61,7 @@ def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
 def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> None:
     """In double precision, between whole sizes, and where nothing is rounded."""
     windows = differences(torch.float64, noisy)
-    motion = SoftMotion(NOISY if noisy else SETTINGS, whole=False)
+    motion = MotionSegmenter(NOISY if noisy else SETTINGS, whole=False)
     names = [name for name in KNOBS if name not in ("difference.peak", "gates.min_area_px")]
     at = (4.1, 0.16, 1.6 if noisy else 3.9, 4.3, 2.4, 5.6)
     weight = torch.rand(2, 1, 24, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -81,7 +81,7 @@ def regions(core: Core) -> Regions:
 
 
 def test_a_region_below_its_area_or_its_peak_is_gone_and_one_above_both_is_whole() -> None:
-    motion, windows = SoftMotion(SETTINGS), differences()
+    motion, windows = MotionSegmenter(SETTINGS), differences()
     core = motion(windows, {})
     for name, value, left in (
         ("gates.min_area_px", 20.0, True),
@@ -94,7 +94,7 @@ def test_a_region_below_its_area_or_its_peak_is_gone_and_one_above_both_is_whole
 
 
 def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
-    motion, windows = SoftMotion(SETTINGS), differences()
+    motion, windows = MotionSegmenter(SETTINGS), differences()
     core = motion(windows, {})
     found = regions(core)
     filled = found.filled.clone()
@@ -110,7 +110,7 @@ def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
 
 def test_every_parameter_has_a_finite_gradient_that_is_not_nothing() -> None:
     windows = differences(noisy=True)
-    motion = SoftMotion(NOISY)
+    motion = MotionSegmenter(NOISY)
     near = {"difference.blur_px": 4.5, "difference.threshold": 1.5, "difference.peak": 1.6}
     parameters = {name: value.requires_grad_() for name, value in values(near).items()}
     core = motion(windows, parameters, 0.3)
@@ -129,7 +129,7 @@ def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
         240.0,
     )
     parameters = {name: value.requires_grad_() for name, value in values().items()}
-    motion = SoftMotion(SETTINGS)
+    motion = MotionSegmenter(SETTINGS)
     core = motion(empty, parameters, 0.1)
     none = torch.zeros(1, 1, 20, 20, dtype=torch.int64)
     mask = motion.outlined(core, Regions(none, none, 0), parameters, 0.1)

@@ -1,6 +1,6 @@
 import torch
 
-from torchvision_dddas.nn.motion_segmenter import Core
+from torchvision_dddas.nn import Core
 from torchvision_dddas.tuning.motion import regions_of
 
 

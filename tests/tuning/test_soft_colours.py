@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional.hsv import from_bgr, within
+from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
 from torchvision_dddas.tuning.colours import SoftColours, about, confusion
 
 LOW = torch.tensor([[172, 90, 60], [50, 100, 40]])
@@ -19,7 +19,7 @@ def test_ranges_come_out_as_they_went_in():
 def test_hard_colours_are_those_of_the_operation():
     bgr = torch.as_tensor(np.random.default_rng(0).uniform(0, 1, (1, 3, 40, 50)))
     found = SoftColours(LOW, HIGH)(bgr, 0.0)
-    wanted = within(from_bgr(bgr), LOW.double(), HIGH.double())
+    wanted = within_ranges(bgr_to_hsv(bgr), LOW.double(), HIGH.double())
     assert 0 < float(wanted.mean()) < 1
     torch.testing.assert_close(found.detach(), wanted)
 

@@ -16,7 +16,7 @@ from torchvision_dddas.config import DifferenceParameters, Settings, SmallParame
 from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Foreground, View, Window
 from torchvision_dddas.detection.registration import exposure_between
 from torchvision_dddas.detection.torch_registration import LEVEL, join_batch, levels_of, register
-from torchvision_dddas.functional import blur, difference, morphology, warp
+from torchvision_dddas.functional import difference, filters, morphology, warp
 from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
@@ -163,9 +163,9 @@ def combine_evidence(
         both = find_seen_by_both(seen[pair[0]], seen[pair[1]], width)
         least = smaller_difference(pair, distance, warped)
         if parameters.kind != "normalized":
-            return blur.gaussian_levels(least, parameters.blur_px) * both
+            return filters.gaussian_levels(least, parameters.blur_px) * both
         z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
-        z = blur.gaussian_levels(z, parameters.blur_px)
+        z = filters.gaussian_levels(z, parameters.blur_px)
         return _normalize(z, textured & both)
 
     near = of(window.near[0])
@@ -182,7 +182,7 @@ def find_small(
         return None
     a, b = window.small
     least = torch.minimum(absolute_difference(grey, warped[a]), absolute_difference(grey, warped[b]))
-    least = blur.gaussian_levels(least, 5) * find_seen_by_both(seen[a], seen[b], grey.shape[-1])
+    least = filters.gaussian_levels(least, 5) * find_seen_by_both(seen[a], seen[b], grey.shape[-1])
     mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
     level = (parameters.noise_ratio * mean).clamp(min=parameters.threshold).floor()
     return close_masks((least > level).to(torch.uint8) * 255, parameters.close_px)

@@ -186,7 +186,7 @@ def _from_guess(
     end, found = _there_and_back(points, earlier[:1], later[:1], guess, parameters, settings)
     gates_px = tuple(share * parameters.ransac_px for share in (1.5, 1.0, 0.5, 0.5))
     model = _model(parameters)
-    refits = consensus.refitted(
+    refits = consensus.refit(
         points.double(), end.double(), valid & found, motion, gates_px, model.SAMPLE_SIZE, model.fit
     )
     return end, found, refits

@@ -25,7 +25,7 @@ from torchvision_dddas.detection.torch_registration import LEVEL
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph
 from torchvision_dddas.export.tracing import open_session, trace_graph
-from torchvision_dddas.functional import affine, blur, consensus, flow, homography, keypoints, morphology, warp
+from torchvision_dddas.functional import affine, consensus, filters, flow, homography, keypoints, morphology, warp
 
 TOLERANCE_PX = 1e-6
 HYPOTHESES = 128
@@ -180,7 +180,7 @@ class WarpDifference(nn.Module):
         )
         seen = find_seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
         least = torch.minimum(absolute_difference(grey, warped[:1]), absolute_difference(grey, warped[1:]))
-        found = blur.gaussian_levels(least, self.difference.blur_px) * seen
+        found = filters.gaussian_levels(least, self.difference.blur_px) * seen
         core = (found > threshold).to(torch.uint8) * 255
         core = morphology.erode(core, self.morphology.erode_px, "ellipse")
         return found[0, 0], morphology.closing(core, self.morphology.close_px, "ellipse")[0, 0]

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torchvision_dddas.functional import consensus, linear
-from torchvision_dddas.functional.homography import _hartley, _shifted, _wide
+from torchvision_dddas.functional import consensus
+from torchvision_dddas.functional.homography import _hartley, _shifted, _wide, solve_linear
 
 SAMPLE_SIZE = 3
 
@@ -40,7 +40,7 @@ def fit(
     q_unit, q_mean, q_scale = _hartley(q.to(wide), weight.to(wide))
     share = (weight.to(wide) / weight.to(wide).sum(1, keepdim=True).clamp(min=1e-12))[..., None]
     rows = torch.cat([p_unit, torch.ones_like(p_unit[..., :1])], -1)
-    solution, valid = linear.solve(rows.mT @ (rows * share), rows.mT @ (q_unit * share), tolerance=1e-8)
+    solution, valid = solve_linear(rows.mT @ (rows * share), rows.mT @ (q_unit * share), tolerance=1e-8)
     valid = valid & ((weight > 0).sum(1) >= SAMPLE_SIZE)
     matrix = _shifted(_with_last_row(solution.mT), p_mean, p_scale, q_mean, q_scale)
     return torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=wide, device=p.device)).to(p.dtype), valid

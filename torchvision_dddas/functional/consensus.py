@@ -1,4 +1,4 @@
-"""Agreement among point pairs: the robust part of registration, shared by the homography and the affine baseline.
+"""RANSAC: the robust part of registration, shared by the homography and the affine baseline.
 
 Randomness is an input (which pairs each hypothesis is drawn from), so that a run repeats and the graph exports.
 """
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.functional.soft import step
 
 Minimal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Fit = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -83,12 +84,12 @@ def ransac(
     matrix = hypotheses.gather(1, best[..., None, None].expand(-1, 1, 3, 3))[:, 0]
     found = possible.gather(1, best)[:, 0] & (valid.sum(1) >= size)
     matrix = torch.where(found[:, None, None], matrix, torch.eye(3, dtype=p.dtype, device=p.device))
-    matrix = refitted(p, q, valid & found[:, None], matrix, refits, size, fit)
+    matrix = refit(p, q, valid & found[:, None], matrix, refits, size, fit)
     inliers = valid & found[:, None] & (transfer_error(matrix, p, q) < tolerance)
     return matrix, inliers, found & (inliers.sum(1) >= size)
 
 
-def refitted(
+def refit(
     p: Float[Tensor, "B N 2"],
     q: Float[Tensor, "B N 2"],
     valid: Bool[Tensor, "B N"],
@@ -110,34 +111,40 @@ def refitted(
     return matrix
 
 
-def reweighted(
-    p: Float[Tensor, "B N 2"],
-    q: Float[Tensor, "B N 2"],
-    weight: Float[Tensor, "B N"],
-    guess: Float[Tensor, "B 3 3"],
-    tolerances_px: tuple[float, ...],
-    tolerance_px: float,
-    size: int,
-    fit: Fit,
-) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
-    """Iteratively reweighted least squares (Geman-McClure) from a predicted matrix, one round per tolerance."""
-    matrix = guess
-    valid = (weight > 0).sum(1) >= size
-    for gate_px in tolerances_px:
-        squared = transfer_error(matrix, p, q).square()
-        robust = (gate_px**2 / (gate_px**2 + squared)).square()
-        refitted, solved = fit(p, q, weight * robust / _depth(matrix, p).square())
-        valid = valid & solved
-        matrix = torch.where(solved[:, None, None], refitted, matrix)
-    inliers = (weight > 0) & (transfer_error(matrix, p, q) < tolerance_px)
-    return matrix, inliers, valid & (inliers.sum(1) >= size)
-
-
 def spread(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
     """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer."""
     batch, available = valid.shape
     samples = torch.arange(count, device=valid.device) * available // count
     return _ranks_to_points(valid, samples.expand(batch, 1, -1))[:, 0]
+
+
+def inlier_weights(
+    error_px: Float[Tensor, "*batch N"],
+    tolerance_px: float | Tensor,
+    softness: float = 0.0,
+) -> Float[Tensor, "*batch N"]:
+    """1 for a pair that misses by less than the tolerance, else 0; softness is a share of the tolerance."""
+    return step(1 - error_px / tolerance_px, softness)
+
+
+def fit_to_inliers(
+    earlier_px: Float[Tensor, "B N 2"],
+    later_px: Float[Tensor, "B N 2"],
+    valid: Bool[Tensor, "B N"] | Float[Tensor, "B N"],
+    guess: Float[Tensor, "B 3 3"],
+    tolerance_px: float | Tensor,
+    fit: Fit,
+    softness: float = 0.0,
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B"]]:
+    """later_from_earlier by least squares over the inliers of a guess, and their share of the valid pairs.
+
+    valid: whether a pair counts, or how much. fit: as `homography.fit` takes pairs and weights. The gradient reaches
+    the points, the tolerance and what counts; that of the guess is left out, for a refit forgets what it began with.
+    """
+    weight = inlier_weights(transfer_error(guess.detach(), earlier_px, later_px), tolerance_px, softness) * valid
+    matrix, solved = fit(earlier_px, later_px, weight)
+    matrix = torch.where(solved[:, None, None], matrix, guess)
+    return matrix, weight.sum(-1) / valid.sum(-1).clamp(min=1)
 
 
 def _ranks_to_points(valid: Bool[Tensor, "B N"], samples: Int64[Tensor, "B S size"]) -> Int64[Tensor, "B S size"]:
@@ -167,6 +174,6 @@ def _squared_errors(
 
 def _depth(matrix: Float[Tensor, "B 3 3"], p: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N"]:
     """The denominator of the transfer: dividing by it turns the algebraic residual into pixels."""
-    # Written out: torch multiplies a matrix and a vector differently in a batch of one, by the last digit.
+    # Written out, so that a batch of one takes the same path as a larger one.
     depth = p[..., 0] * matrix[:, 2, :1] + p[..., 1] * matrix[:, 2, 1:2] + matrix[:, 2, 2:]
     return depth.abs().clamp(min=1e-3)

@@ -4,20 +4,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from torchvision_dddas.functional.blur import box_sum
-from torchvision_dddas.functional.borders import reflected
-
-
-def three_frame(warped_1: Float[Tensor, "B C H W"], warped_2: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
-    """|I(t+2dt -> t) - I(t+dt -> t)|: both warped frames, never one against the raw reference (appendix B, eq. 9)."""
-    return (warped_2 - warped_1).abs()
-
-
-def pair(
-    reference: Float[Tensor, "B C H W"], warped_a: Float[Tensor, "B C H W"], warped_b: Float[Tensor, "B C H W"]
-) -> Float[Tensor, "B C H W"]:
-    """min(|I - A|, |I - B|): marks a mover once, where it stands in the reference (departs from eq. 9)."""
-    return torch.minimum((reference - warped_a).abs(), (reference - warped_b).abs())
+from torchvision_dddas.functional.filters import box_sum, pad_reflect
 
 
 def exposure(
@@ -97,7 +84,7 @@ def gradient(levels: Float[Tensor, "B 1 H W"], block: int = 5) -> Float[Tensor, 
 
     Rounded to whole numbers and cut off at 255 before and after the mean, as OpenCV's 8-bit pictures are.
     """
-    padded = reflected(levels, 1, 1)
+    padded = pad_reflect(levels, 1, 1)
     steep = padded[..., 2:, :] - padded[..., :-2, :]
     smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
     across = smooth[..., 2:] - smooth[..., :-2]

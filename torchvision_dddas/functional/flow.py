@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvision_dddas.functional.borders import reflected, reflected_index
+from torchvision_dddas.functional.filters import pad_reflect, reflect_index
 
 Pyramid = list[Tensor]
 
@@ -170,8 +170,8 @@ def _gather(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side
     """Pixels from each whole corner (u, v), mirrored outside the picture."""
     batch, _, height, width = image.shape
     steps = torch.arange(side, device=image.device)
-    columns = reflected_index(corner[..., :1] + steps, width)
-    rows = reflected_index(corner[..., 1:] + steps, height) * width
+    columns = reflect_index(corner[..., :1] + steps, width)
+    rows = reflect_index(corner[..., 1:] + steps, height) * width
     frame = torch.arange(batch, device=image.device).reshape(-1, 1, 1) * (height * width)
     return image.take((rows + frame)[..., :, None] + columns[..., None, :])
 
@@ -186,7 +186,7 @@ def _inside(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side
 
 
 def _halved(gray: Tensor) -> Tensor:
-    padded = reflected(gray, 2, 2)
+    padded = pad_reflect(gray, 2, 2)
     for dim in (-2, -1):
         size = (padded.shape[dim] - 3) // 2
         taps = [padded.narrow(dim, k, padded.shape[dim] - k) for k in range(5)]

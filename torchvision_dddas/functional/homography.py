@@ -8,21 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torchvision_dddas.functional import consensus, linear
-from torchvision_dddas.functional.consensus import draw_samples, transfer, transfer_error
-
-__all__ = [
-    "compose",
-    "draw_samples",
-    "fit",
-    "fit_raw",
-    "four_point",
-    "invert",
-    "ransac",
-    "refine",
-    "transfer",
-    "transfer_error",
-]
+from torchvision_dddas.functional import consensus
 
 SAMPLE_SIZE = 4
 # Depth of a point, as a share of the depth of the middle of all, from which on it is on the horizon.
@@ -54,7 +40,7 @@ def four_point(
     matrix = _shifted(matrix, p[..., 0, :], p_scale, q[..., 0, :], q_scale)
     valid = valid & (matrix[..., 2, 2].abs() > 1e-12) & torch.isfinite(matrix).all(-1).all(-1)
     matrix = torch.where(valid[..., None, None], matrix, torch.eye(3, dtype=p.dtype, device=p.device))
-    return normalised(matrix), valid
+    return normalize(matrix), valid
 
 
 def fit(
@@ -79,15 +65,14 @@ def fit(
     rows = torch.cat([rows_u, rows_v], 1)
     share = weight.to(wide) / weight.to(wide).sum(1, keepdim=True).clamp(min=1e-12)
     normal = rows.mT @ (rows * share.repeat(1, 2)[..., None])
-    solution, valid = linear.solve(normal[:, :8, :8], normal[:, :8, 8:], tolerance=1e-10)
-    # Written out: torch multiplies a matrix and a vector differently in a batch of one, by the last digit.
+    solution, valid = solve_linear(normal[:, :8, :8], normal[:, :8, 8:], tolerance=1e-10)
     depth = x * solution[:, 6] + y * solution[:, 7] + 1
     valid = valid & ((depth > HORIZON) | ~used).all(1)
     matrix = torch.cat([solution[..., 0], torch.ones_like(solution[:, :1, 0])], 1).reshape(-1, 3, 3)
     matrix = _shifted(matrix, p_mean, p_scale, q_mean, q_scale)
     valid = valid & (used.sum(1) >= SAMPLE_SIZE) & (matrix[:, 2, 2].abs() > 1e-9)
     matrix = torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=wide, device=p.device))
-    return normalised(matrix).to(p.dtype), valid
+    return normalize(matrix).to(p.dtype), valid
 
 
 def fit_raw(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
@@ -105,7 +90,7 @@ def fit_raw(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> tuple[Float
     rows = torch.cat([rows_u, rows_v], 1)
     if p.shape[1] != SAMPLE_SIZE:
         rows = rows[..., :8].mT @ rows
-    solution, valid = linear.solve(rows[..., :8], rows[..., 8:], tolerance=0.0)
+    solution, valid = solve_linear(rows[..., :8], rows[..., 8:], tolerance=0.0)
     valid = valid & torch.isfinite(solution).all(-1).all(-1) & (p.shape[1] >= SAMPLE_SIZE)
     matrix = torch.cat([solution[..., 0], torch.ones_like(solution[:, :1, 0])], 1).reshape(-1, 3, 3)
     return torch.where(valid[:, None, None], matrix, torch.eye(3, dtype=p.dtype, device=p.device)), valid
@@ -126,37 +111,44 @@ def ransac(
     return consensus.ransac(p, q, valid, samples, tolerance_px, refits, four_point, fit)
 
 
-def refine(
-    p: Float[Tensor, "B N 2"],
-    q: Float[Tensor, "B N 2"],
-    weight: Float[Tensor, "B N"],
-    guess: Float[Tensor, "B 3 3"],
-    tolerances_px: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0),
-    tolerance_px: float = 3.0,
-) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
-    """As `ransac`, from a predicted matrix: reweighted least squares, as good as 128 hypotheses."""
-    return consensus.reweighted(p, q, weight, guess, tolerances_px, tolerance_px, SAMPLE_SIZE, fit)
-
-
-def compose(
-    third_from_second: Float[Tensor, "*batch 3 3"], second_from_first: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch 3 3"]:
-    """third_from_first."""
-    return normalised(third_from_second @ second_from_first)
-
-
-def invert(later_from_earlier: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """earlier_from_later, by the adjugate: finite even for a singular matrix."""
-    a, b, c = later_from_earlier.unbind(-1)
-    cross = torch.linalg.cross
-    return normalised(torch.stack([cross(b, c), cross(c, a), cross(a, b)], -2))
-
-
-def normalised(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+def normalize(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The same mapping with h33 = 1."""
     corner = matrix[..., 2:, 2:]
     tiny = torch.finfo(matrix.dtype).tiny
     return matrix / torch.where(corner.abs() < tiny, torch.full_like(corner, tiny), corner)
+
+
+def solve_linear(
+    matrix: Float[Tensor, "*batch n n"], right: Float[Tensor, "*batch n m"], tolerance: float | None = None
+) -> tuple[Float[Tensor, "*batch n m"], Bool[Tensor, "*batch"]]:
+    """Solve matrix @ x = right for every member of the batch; valid is False where the matrix is singular.
+
+    Gaussian elimination with row exchange, the source's own solver (appendix A, IV-B). Written out because
+    `torch.linalg.solve` neither exports nor survives a singular member of a batch.
+
+    A pivot smaller than `tolerance` times the matrix's largest entry counts as zero (default: 8 n machine epsilons).
+    Invalid members come back as zeros. Differentiable in both inputs.
+    """
+    n = matrix.shape[-1]
+    if tolerance is None:
+        tolerance = 8 * n * torch.finfo(matrix.dtype).eps
+    smallest = tolerance * matrix.detach().abs().amax((-2, -1))
+    joined = torch.cat([matrix, right], -1)
+    rows = torch.arange(n, device=matrix.device)
+    valid = torch.ones_like(smallest, dtype=torch.bool)
+    for k in range(n):
+        pivot_row = joined[..., k:, k].detach().abs().argmax(-1, keepdim=True) + k
+        exchanged = torch.where(rows == k, pivot_row, torch.where(rows == pivot_row, k, rows))
+        joined = joined.gather(-2, exchanged[..., None].expand(joined.shape))
+        pivot = joined[..., k, k]
+        usable = pivot.detach().abs() > smallest
+        valid = valid & usable
+        row = joined[..., k : k + 1, :] / torch.where(usable, pivot, torch.ones_like(pivot))[..., None, None]
+        # Subtracting (pivot - 1) of the scaled row from itself leaves the scaled row: no special case for row k.
+        factor = joined[..., k : k + 1] - (rows == k).to(joined.dtype)[:, None]
+        joined = joined - factor * row
+    solution = joined[..., n:]
+    return torch.where(valid[..., None, None], solution, torch.zeros_like(solution)), valid
 
 
 def _wide(points: Tensor) -> torch.dtype:

@@ -64,7 +64,7 @@ class OpenCVColourFinder:
 
 
 class TorchColourFinder:
-    """ColourFinder by `functional.hsv`, on a CPU or GPU.
+    """ColourFinder by `functional.color`, on a CPU or GPU.
 
     Hue and saturation are compared unrounded. OpenCV's 8-bit conversion is up to 0.64 of a level off, so a pixel next
     to a bound may be classified differently.
@@ -76,9 +76,9 @@ class TorchColourFinder:
         """device: by default the GPU where there is one."""
         import torch
 
-        from torchvision_dddas.functional import hsv
+        from torchvision_dddas.functional import color
 
-        self._torch, self._hsv = torch, hsv
+        self._torch, self._color = torch, color
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
     def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ class TorchColourFinder:
         with torch.inference_mode():
             pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None]
             lowest, highest = (torch.from_numpy(np.array(bound, np.float32)).to(self.device) for bound in (low, high))
-            found = self._hsv.within(self._hsv.from_bgr(pixels.float() / 255), lowest, highest)[0]
+            found = self._color.within_ranges(self._color.bgr_to_hsv(pixels.float() / 255), lowest, highest)[0]
             masks: np.ndarray = (found * 255).byte().cpu().numpy()
         return masks
 

@@ -1,15 +1,15 @@
-"""What moves, softly: from differences of registered pictures to a mask with a gradient in the parameters.
+"""Soft motion segmentation: from differences of registered pictures to a mask with a gradient in the parameters.
 
-Up to the differences no parameter that can be tuned has a say: registration, warps and exposure are done once, hard.
-After them every step is that of the hard pipeline, by the same functions of `ops`:
+No parameter that can be tuned acts before the differences: registration, warps and exposure are done once, hard. After
+them every step is that of the hard pipeline, by the same functions of `functional`:
 
     noise units -> blur -> largest over the pairs -> margin over the threshold -> erode -> close -> soft threshold
 
 Thresholds and extrema commute, so the margin goes through the morphology, whose extrema stay hard, and the threshold is
 softened last: the outline lies where the hard one does, whatever the softness. Whole grey levels are rounded straight
-through. Regions are labelled hard and gated softly; a hull is the hard one of a region, and is there as far as its
-region is. What then acts on single blobs (persistence, outlines by colour, shadows, small targets) has no useful
-gradient, and is given as two masks: what it takes away, and what it adds.
+through. Regions are labelled hard and gated softly; a hull is the hard one of a region, and counts as far as its region
+does. What then acts on single blobs (persistence, outlines by colour, shadows, small targets) has no useful gradient
+and is given as two masks: what it takes away, and what it adds.
 """
 
 from collections.abc import Mapping
@@ -21,22 +21,24 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor, nn
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.functional import blur, difference
-from torchvision_dddas.functional.soft import fractional_size as sizes
-from torchvision_dddas.functional.soft import morphology as extremum
-from torchvision_dddas.functional.soft import regions
-from torchvision_dddas.functional.soft import straight_through as passing
-from torchvision_dddas.functional.threshold import step
+from torchvision_dddas.functional import difference, filters, morphology
+    blend_sizes,
+    gate_regions,
+    gates_of_pixels,
+    round_straight_through,
+    step,
+    straight_through,
+)
 
 Values = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
 class Differences:
-    """A batch of windows as far as no tunable parameter has a say.
+    """A batch of windows, before any tunable parameter acts.
 
     least: (B, P, H, W) uint8, the difference that both neighbours of each near pair show, grey levels. both: where both
-    are seen. texture: (B, 1, H, W), 4 x grey levels a pixel, and textured: where it is enough to tell how well the
+    are seen. texture: (B, 1, H, W), 4 x grey levels a pixel; textured: where it is enough to show how well the
     registration fits. steps: evidence is kept in so many steps a noise unit, up to `highest` of them.
     """
 
@@ -62,9 +64,9 @@ class Core(NamedTuple):
 
 @dataclass(frozen=True)
 class Regions:
-    """What hangs together in a core, by labelling it hard: 0 nothing, else a region's number, up to `count`.
+    """The connected regions of a hard core: 0 is none, else the number of the region, up to `count`.
 
-    near: the regions, and the pixels about them that may come to them. filled: their hulls, or themselves.
+    near: the regions, and the pixels around them that may join them. filled: their hulls, or themselves.
     """
 
     near: Int64[Tensor, "B 1 H W"]
@@ -72,10 +74,10 @@ class Regions:
     count: int
 
 
-class SoftMotion(nn.Module):
-    """The steps from differences to a mask, with some knobs given as tensors and the others as the settings have them.
+class MotionSegmenter(nn.Module):
+    """The steps from differences to a mask; some parameters are given as tensors, the others are those of the settings.
 
-    whole: round where the back ends do, straight through; False leaves numbers whole nowhere, for gradient checks.
+    whole: round where the engines do, straight through; False rounds nowhere, for gradient checks.
     """
 
     def __init__(self, settings: Settings, whole: bool = True) -> None:
@@ -84,16 +86,16 @@ class SoftMotion(nn.Module):
         self.whole = whole
 
     def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
-        """The core mask. values: by name, those that are tuned. softness: a share of the settings' threshold."""
+        """The core mask. values: the tuned parameters by name. softness: a share of the settings' threshold."""
         threshold = self._parameter("difference.threshold", values)
         evidence = self.evidence(differences, values)
         margin = evidence - threshold
-        margin = sizes.between(
-            self._parameter("morphology.erode_px", values), lambda side: extremum.erode(margin, side, "ellipse")
+        margin = blend_sizes(
+            self._parameter("morphology.erode_px", values), lambda side: morphology.erode(margin, side, "ellipse")
         )
         eroded = margin
-        margin = sizes.between(
-            self._parameter("morphology.close_px", values), lambda side: extremum.closing(eroded, side, "ellipse")
+        margin = blend_sizes(
+            self._parameter("morphology.close_px", values), lambda side: morphology.closing(eroded, side, "ellipse")
         )
         return Core(step(margin, softness * self.settings.difference.threshold), margin, evidence)
 
@@ -119,7 +121,7 @@ class SoftMotion(nn.Module):
 
     def outlined(self, core: Core, found: Regions, values: Values, softness: float = 0.0) -> Float[Tensor, "B 1 H W"]:
         """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
-        gate = regions.gates(
+        gate = gate_regions(
             core.mask,
             core.evidence,
             found.near,
@@ -128,10 +130,10 @@ class SoftMotion(nn.Module):
             self._parameter("difference.peak", values),
             softness,
         )
-        drawn = core.mask * regions.of_pixels(gate, found.near)
-        # In the hull of a region, a hole or a speck is foreground as far as that region is: its evidence has no say.
+        drawn = core.mask * gates_of_pixels(gate, found.near)
+        # In the hull of a region, a hole or a speck is foreground as far as that region is, whatever its evidence.
         carried = (core.margin <= 0) | (found.filled != found.near)
-        return torch.maximum(drawn, regions.of_pixels(gate, found.filled) * carried)
+        return torch.maximum(drawn, gates_of_pixels(gate, found.filled) * carried)
 
     def _parameter(self, name: str, values: Values) -> float | Tensor:
         if name in values:
@@ -143,22 +145,22 @@ class SoftMotion(nn.Module):
         def of_size(side: int) -> Tensor:
             if side == 1:
                 return levels
-            smooth = blur.gaussian(levels, side)
-            return passing.through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
+            smooth = filters.gaussian(levels, side)
+            return straight_through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
 
-        return sizes.between(self._parameter("difference.blur_px", values), of_size, pitch=2)
+        return blend_sizes(self._parameter("difference.blur_px", values), of_size, pitch=2)
 
     def _in_units(self, z: Tensor, textured: Tensor, steps: float) -> Tensor:
         """Evidence by its median over textured pixels, where that is above one noise unit."""
         units = difference.noise_units(z.detach().round().to(torch.uint8), textured, steps)
         if bool((units == 1.0).all()):
             return z
-        # Counted in whole numbers, as the hard pipeline counts; the gradient is that of the pixel in the middle.
+        # Computed in whole numbers, as in the hard pipeline; the gradient is that of the pixel in the middle.
         median = difference.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / steps
         per_unit = units.reciprocal().to(z.dtype)
         slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
-        per_unit = passing.through(per_unit, slope) if self.whole else slope
+        per_unit = straight_through(per_unit, slope) if self.whole else slope
         return self._rounded(z * per_unit.reshape(-1, 1, 1, 1))
 
     def _rounded(self, x: Tensor) -> Tensor:
-        return passing.rounded(x) if self.whole else x
+        return round_straight_through(x) if self.whole else x

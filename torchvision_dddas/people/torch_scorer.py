@@ -11,7 +11,8 @@ from torch import Tensor
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import hog
-from torchvision_dddas.functional.resize import reflected, resize
+from torchvision_dddas.functional.filters import reflect_index
+from torchvision_dddas.functional.warp import resize
 from torchvision_dddas.types import LinearSvm, Part
 
 # So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
@@ -69,8 +70,8 @@ class TorchScorer:
         levels: (B, C, H, W) floats 0 .. 255, BGR.
         """
         width, height = part.level
-        rows = reflected(part.y - 1, part.y + part.height + 1, height, levels.device)
-        columns = reflected(part.x - 1, part.x + part.width + 1, width, levels.device)
+        rows = reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
+        columns = reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
         bordered = resize(levels, (height, width), rows, columns)
         return strided_scores(bordered, self.weights, self.bias, self.layout, self.parameters.window_stride_px)
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional.hsv import FULL, TURN, from_bgr, within
+from torchvision_dddas.functional.color import FULL, TURN, bgr_to_hsv, within_ranges
 from torchvision_dddas.io.colour_files import find_overlaps
 from torchvision_dddas.types import Colours
 
@@ -63,10 +63,10 @@ def fit_colours(
 
 
 def _hard(ranges: tuple[Tensor, Tensor], bgr: Tensor, worn: Tensor) -> float:
-    from torchvision_dddas.functional.hsv import from_bgr, within
+    from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
 
     low, high = (end.to(bgr) for end in ranges)
-    return float(confusion(within(from_bgr(bgr), low, high), worn).sum())
+    return float(confusion(within_ranges(bgr_to_hsv(bgr), low, high), worn).sum())
 
 
 def _pixels(
@@ -126,7 +126,7 @@ class SoftColours(nn.Module):
     def forward(self, bgr: Float[Tensor, "B 3 H W"], softness: float) -> Float[Tensor, "B K H W"]:
         """How much each pixel of pictures in [0, 1] is of each colour; softness in levels, hard at 0."""
         low, high = self.ends()
-        return within(from_bgr(bgr), low.to(bgr), high.to(bgr), softness)
+        return within_ranges(bgr_to_hsv(bgr), low.to(bgr), high.to(bgr), softness)
 
     def ranges(self) -> tuple[Int[Tensor, "K 3"], Int[Tensor, "K 3"]]:
         """Lowest and highest in whole levels, as `Colours` has them: hues from 0 to 180."""
@@ -140,7 +140,7 @@ class SoftColours(nn.Module):
 
 def about(bgr: Float[Tensor, "B 3 H W"], worn: Float[Tensor, "B K H W"]) -> SoftColours:
     """Ranges to begin with: about the mean colour of what wears each. Raises InputError where nothing wears one."""
-    hsv = from_bgr(bgr)
+    hsv = bgr_to_hsv(bgr)
     angle = hsv[:, 0] * (2 * torch.pi / TURN)
     middles = []
     for k in range(worn.shape[1]):

@@ -35,8 +35,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.evaluation.studies.stages import opened
-from torchvision_dddas.functional.soft.straight_through import through
-from torchvision_dddas.nn.motion_segmenter import Core, Differences, Regions, SoftMotion, Values
+from torchvision_dddas.functional.soft import straight_through
+from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.types import Registration, Scene
@@ -128,7 +128,7 @@ class Masks:
             if self.passing and softness > 0:
                 with torch.no_grad():
                     hard = masks_of(frames, parameters, 0.0)
-                mask = through(hard, mask)
+                mask = straight_through(hard, mask)
             for place, wrong in zip(places, self.wrong(mask, frames.truth, frames.known), strict=True):
                 losses[place] = wrong
         return torch.stack(losses)
@@ -136,7 +136,7 @@ class Masks:
 
 def masks_of(frames: Labelled, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
     """The soft masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
-    motion = SoftMotion(frames.settings)
+    motion = MotionSegmenter(frames.settings)
     core = motion(frames.differences, values, softness)
     reach = _REACH * softness * frames.settings.difference.threshold
     found = regions_of(core, frames.settings.morphology.hull, reach)

@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.metrics.boxes import SAME, areas, iou, judged
 from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.functional.threshold import step
+from torchvision_dddas.functional.soft import step
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import body_sides, log_odds, people_of
 from torchvision_dddas.people.scorer import WindowScorer

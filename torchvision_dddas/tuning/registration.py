@@ -24,9 +24,8 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.evaluation.studies.stages import opened
 from torchvision_dddas.functional import affine, homography
-from torchvision_dddas.functional.consensus import transfer_error
-from torchvision_dddas.functional.soft.inliers import Fit, fitted, weights
-from torchvision_dddas.functional.threshold import step
+from torchvision_dddas.functional.consensus import Fit, fit_to_inliers, inlier_weights, transfer_error
+from torchvision_dddas.functional.soft import step
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.types import Frame
@@ -186,10 +185,10 @@ def refitted(
     earlier, later = points.earlier_px[None], points.later_px[None]
     trusted = torch.ones_like(earlier[..., 0])
     if check_px is not None:
-        trusted = weights(points.missed_px[None], check_px, softness)
-    matrix, _ = fitted(earlier, later, trusted, guess[None], last_share * tolerance_px, fit, softness)
+        trusted = inlier_weights(points.missed_px[None], check_px, softness)
+    matrix, _ = fit_to_inliers(earlier, later, trusted, guess[None], last_share * tolerance_px, fit, softness)
     error_px = transfer_error(matrix, earlier, later)
-    agreeing = weights(error_px, tolerance_px, softness) * trusted
+    agreeing = inlier_weights(error_px, tolerance_px, softness) * trusted
     # Distances, not their squares: a point on background that was lost on the way has no more say than another.
     return Refitted(
         matrix[0],

@@ -14,9 +14,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.functional.soft.assignment import log_partition
-from torchvision_dddas.functional.soft.dispersion import dispersion
-from torchvision_dddas.functional.threshold import step
+from torchvision_dddas.functional.assignment import dispersion, log_partition
+from torchvision_dddas.functional.soft import step
 from torchvision_dddas.tracking.dispersion import dissimilarity, joined_at, speaking
 from torchvision_dddas.tracking.gating import alternatives, raised
 from torchvision_dddas.tracking.source_tracker import Look, affinity

@@ -15,7 +15,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.functional.soft.assignment import log_partition
+from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.appearance_score import blended, likeness, scores_of, visible_share

@@ -1,0 +1,94 @@
+"""Soft stand-ins for hard steps, so that gradients pass: each tends to its hard step as softness vanishes.
+
+Softness is a Python number, so that tracing keeps one branch; at 0 a function is the hard step itself.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int64, Shaped
+from torch import Tensor
+
+
+def step(x: Float[Tensor, "*any"], softness: float = 0.0) -> Float[Tensor, "*any"]:
+    """1 where x > 0 and 0 elsewhere; with softness above 0, in the unit of x, the sigmoid of x / softness."""
+    if softness == 0.0:
+        return (x > 0).to(x.dtype)
+    return torch.sigmoid(x / softness)
+
+
+def straight_through(hard: Shaped[Tensor, "*any"], soft: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """The hard value, bit for bit, with the gradient of the soft one (Bengio et al. 2013)."""
+    # `hard - soft + soft` would round.
+    return _StraightThrough.apply(hard, soft)
+
+
+def round_straight_through(x: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """The nearest whole numbers, halves to even, with the gradient of x itself."""
+    return straight_through(x.detach().round(), x)
+
+
+class _StraightThrough(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: object, hard: Tensor, soft: Tensor) -> Tensor:
+        return hard.to(soft.dtype, copy=True)
+
+    @staticmethod
+    def backward(ctx: object, *grads: Tensor) -> tuple[None, Tensor]:
+        return None, grads[0]
+
+
+def blend_sizes(size: float | Tensor, operation: Callable[[int], Tensor], lowest: int = 1, pitch: int = 1) -> Tensor:
+    """An operation at a fractional size: its results for the sizes on either side, blended by nearness.
+
+    size: one number, or a tensor without axes, to which the gradient goes. lowest, pitch: sizes are lowest, lowest +
+    pitch, ...: 1 and 2 for odd ones.
+    """
+    steps = (float(size.detach() if isinstance(size, Tensor) else size) - lowest) / pitch
+    below = max(math.floor(steps), 0)
+    first = operation(lowest + pitch * below)
+    if not isinstance(size, Tensor):
+        if steps == below:
+            return first
+        share: float | Tensor = steps - below
+    else:
+        share = (size - lowest) / pitch - below
+    if not isinstance(share, Tensor):
+        return torch.lerp(first, operation(lowest + pitch * (below + 1)), share)
+    return first + share.to(first) * (operation(lowest + pitch * (below + 1)) - first)
+
+
+def gate_regions(
+    mask: Float[Tensor, "B 1 H W"],
+    evidence: Float[Tensor, "B 1 H W"],
+    labels: Int64[Tensor, "B 1 H W"],
+    regions: int,
+    min_area_px: float | Tensor,
+    peak: float | Tensor,
+    softness: float = 0.0,
+) -> Float[Tensor, "B R"]:
+    """How far each region passes: the sum of its mask is min_area_px at least, and its highest evidence the peak.
+
+    Regions are labelled on the hard mask, which passes no gradient.
+    labels: 0 no region, else 1 to regions; pixels of one label are one region. Softness is a share of either bound, so
+    that large and small numbers soften alike. A label that no pixel has does not pass.
+    """
+    batch = mask.shape[0]
+    place = labels.reshape(batch, -1)
+    area = mask.new_zeros(batch, regions + 1).scatter_add(1, place, mask.reshape(batch, -1))
+    seen = evidence.reshape(batch, -1)
+    lowest = torch.full_like(area, -torch.inf)
+    highest = lowest.scatter_reduce(1, place, seen, "amax")[:, 1:]
+    there = highest.isfinite()
+    highest = torch.where(there, highest, torch.zeros_like(highest))
+    # What equals its bound passes: 1 - step of what is missing.
+    large = 1 - step(1 - area[:, 1:] / min_area_px, softness)
+    high = 1 - step((peak - highest) / torch.clamp(torch.as_tensor(peak), min=1.0), softness)
+    return large * high * there
+
+
+def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]) -> Float[Tensor, "B 1 H W"]:
+    """Each pixel's gate; 0 where its label is 0."""
+    none = gate.new_zeros(gate.shape[0], 1)  # there may be no region at all
+    return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
