@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.functional import difference, filters, morphology
+from torchvision_dddas.functional.soft import (
     blend_sizes,
     gate_regions,
     gates_of_pixels,

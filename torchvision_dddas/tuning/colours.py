@@ -105,7 +105,7 @@ class SoftColours(nn.Module):
     """
 
     def __init__(self, low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"]) -> None:
-        """low, high: as `ops.hsv.within` takes them; a lowest hue above the highest goes over 0."""
+        """low, high: as `color.within_ranges` takes them; a lowest hue above the highest goes over 0."""
         super().__init__()
         if low.shape != high.shape or low.ndim != 2 or low.shape[-1] != 3:
             raise InputError(
