@@ -300,7 +300,7 @@ def homography_difference_px(files: dict[str, bytes]) -> float:
             if not (found_valid.all() and valid.all()):
                 return float("inf")
             points = torch.from_numpy(held["ground"])
-            there = consensus.transfer(torch.from_numpy(matrix), points) - homography.transfer(wanted, points)
+            there = consensus.transfer(torch.from_numpy(matrix), points) - consensus.transfer(wanted, points)
             worst = max(worst, unit * there.abs().max().item())
     return worst
 
