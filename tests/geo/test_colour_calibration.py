@@ -75,10 +75,6 @@ def test_red_goes_over_zero():
     assert inside(mask_range(hsv, low[0], high[0]), boxes["red"]) > 0.95
 
 
-def test_ground_without_plates_has_no_colour_that_is_clear():
-    assert pool_samples([find_samples(to_hsv(painted({})[0]), LEAST)], None) == []
-
-
 def test_neighbouring_hues_share_the_gap_between_them():
     def sample(hue):
         return [ColourSample(hue, np.full((50, 3), (hue, 200, 200), np.uint8), 1.0, 0, (0, 0, 5, 5))]
@@ -111,7 +107,3 @@ def test_pictures_of_one_team_are_taken_together():
     pictures = [to_hsv(painted(PLATES, seed)[0]) for seed in (0, 1)]
     groups = pool_samples([find_samples(hsv, LEAST, n) for n, hsv in enumerate(pictures)], 4)
     assert sorted(tuple(sorted(one.picture for one in group)) for group in groups) == [(0, 1)] * 4
-
-
-def test_hues_of_one_name_are_numbered():
-    assert name_hues([0, 178, 60, 112]) == ["red-1", "red-2", "green", "blue"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.terrain import ground_height, surface_of
+from torchvision_dddas.geo.terrain import ground_height
 from torchvision_dddas.types import Elevation
 
 GRID = Elevation(np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]]), (100.0, 50.0), 2.0)
@@ -23,10 +23,3 @@ def test_beside_a_hole_nothing_is_known():
     holed = Elevation(np.array([[0.0, 1.0, np.nan], [10.0, 11.0, 12.0]]), (0.0, 0.0), 1.0)
     assert np.isfinite(ground_height(holed, np.array([[0.5, 0.5]]))).all()
     assert np.isnan(ground_height(holed, np.array([[1.5, 0.5]]))).all()
-
-
-def test_a_surface_is_the_look_up_of_one_elevation():
-    places = np.array([[101.0, 51.0]])
-    surface = surface_of(GRID)
-    assert surface is not None
-    assert surface(places) == ground_height(GRID, places)

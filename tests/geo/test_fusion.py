@@ -6,7 +6,7 @@ import pytest
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.geo import fusion
-from torchvision_dddas.geo.fusion import associate, crowd, estimate_places, fuse, gate_distance
+from torchvision_dddas.geo.fusion import associate, estimate_places, fuse, gate_distance
 from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.types import Sightings
 
@@ -56,12 +56,6 @@ def test_the_error_common_to_all_that_a_vehicle_sees_does_not_shrink_with_their_
     assert (found.covariance_m2[:, 0, 0] > 0.5).all()
 
 
-def test_people_far_apart_are_not_fused():
-    found = fuse([sightings([[0, 0]]), sightings([[2, 0]])])
-    assert len(found) == 2
-    assert sorted(found.members.tolist()) == [[-1, 0], [0, -1]]
-
-
 @pytest.mark.parametrize(("apart", "people"), [(0.95, 1), (1.05, 2)])
 def test_the_gate_is_that_of_three_sigmas(apart, people):
     limit = np.sqrt(gate_distance(3.0) * 0.02)
@@ -94,11 +88,6 @@ def test_each_sighting_is_of_exactly_one_person_whatever_the_order_of_the_vehicl
         members = associate([team[v] for v in way])
         for column, v in zip(members.T, way, strict=True):
             assert sorted(column[column >= 0].tolist()) == list(range(len(team[v])))
-
-
-def test_nobody_seen_is_nobody():
-    found = fuse([sightings(np.zeros((0, 2))), sightings(np.zeros((0, 2)))])
-    assert len(found) == 0 and found.members.shape == (0, 2) and found.covariance_m2.shape == (0, 2, 2)
 
 
 def test_four_vehicles_halve_the_error_of_one_and_say_how_large_it_is():
@@ -136,16 +125,3 @@ def test_four_vehicles_halve_the_error_of_one_and_say_how_large_it_is():
     assert np.mean(fused) < 0.5 * np.mean(alone)
     assert 0.92 < np.mean(inside) < 0.98
     assert wrong < 0.15 * 30
-
-
-def test_a_crowd_goes_on_as_its_people_went():
-    looks = np.array([[[0, 0], [2, 0]], [[1, 1], [3, 1]]])
-    assert np.allclose(crowd(looks), (3, 2))
-    assert np.allclose(crowd(looks[1:]), (2, 1))
-
-
-def test_who_joins_or_leaves_does_not_move_a_crowd():
-    gone = [np.nan, np.nan]
-    looks = np.array([[[0, 0], [2, 0], [50, 50]], [[1, 0], [3, 0], gone]])
-    assert np.allclose(crowd(looks), (3, 0))
-    assert np.isnan(crowd(np.array([[gone, gone]]))).all()

@@ -53,11 +53,3 @@ def test_of_a_vehicle_whose_middle_is_not_known_nothing_stays_and_of_others_all_
     left, numbered = cut_out_landmarks(found, mask, VEHICLES, NOWHERE, np.array([np.nan]), np.inf)
     assert left.score.tolist() == [0.5, 0.7]
     assert (numbered > 0).sum() == ((mask == 1) | (mask == 3)).sum()
-
-
-def test_a_scene_without_anything_stays_empty():
-    left, numbered = cut_out_landmarks(
-        Detections(), np.zeros((9, 9), np.uint16), np.zeros(0, bool), NOWHERE, np.ones(1), 1.0
-    )
-    assert len(left) == 0
-    assert not numbered.any()

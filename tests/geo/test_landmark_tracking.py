@@ -43,14 +43,6 @@ def test_greedy_goes_row_by_row_and_so_may_leave_a_landmark_without_a_blob():
     assert separate(colour, blob, EXACT).tolist() == [1, 0]
 
 
-@pytest.mark.parametrize("parameters", [EXACT, GREEDY])
-def test_a_colour_that_was_not_found_and_a_blob_out_of_reach_are_matched_with_nothing(parameters):
-    colour = np.array([[np.nan, np.nan], [0, 0], [50, 50]])
-    assert separate(colour, np.array([[1, 0.0], [80, 80]]), parameters).tolist() == [-1, 0, -1]
-    assert separate(colour, np.zeros((0, 2)), parameters).tolist() == [-1, -1, -1]
-    assert separate(np.zeros((0, 2)), np.zeros((3, 2)), parameters).tolist() == []
-
-
 def plates(*boxes):
     """(K, H, W) masks; a box or a list of boxes x, y, width, height for each colour."""
     masks = np.zeros((len(boxes), *SIZE), np.uint8)
@@ -84,15 +76,6 @@ def test_by_choice_it_is_at_its_colours_centre_and_so_it_is_without_a_blob():
     for found in (chosen, alone):
         assert found.image_px.tolist() == [[104.5, 54.5]] and found.by == ("colour",)
     assert chosen.rows.tolist() == [True]
-
-
-def test_the_centre_of_a_blobs_mass_counts_where_its_pixels_are_known():
-    foreground = np.zeros(SIZE, np.uint16)
-    foreground[48:62, 96:116] = 1
-    foreground[50, 116:126] = 1  # a limb that widens the box
-    found = follower().update(1, plates((100, 50, 10, 10)), blobs((96, 48, 30, 14)), foreground=foreground)
-    v, u = np.nonzero(foreground)
-    assert found.image_px[0] == pytest.approx([u.mean(), v.mean()])
 
 
 def test_a_person_near_a_vehicle_that_is_not_seen_to_move_stays_a_target():
@@ -165,13 +148,6 @@ def test_what_moves_over_the_ground_counts_not_what_moves_in_the_picture():
     assert found is not None and found.image_px[0] == pytest.approx([104.5, 54.5])
 
 
-def test_where_a_landmark_is_expected_tells_between_two_that_stand_still():
-    masks = plates([(100, 50, 10, 10), (300, 200, 10, 10)])
-    assert follower().update(1, masks, blobs()).by == ("",)
-    found = follower().update(1, masks, blobs(), expected_px=np.array([[290.0, 210.0]]))
-    assert found.image_px.tolist() == [[304.5, 204.5]]
-
-
 def test_between_differentiations_a_landmark_keeps_its_blob_though_a_nearer_one_comes():
     one = follower(interval_frames=50)
     for frame in range(1, 6):
@@ -190,12 +166,6 @@ def test_a_landmark_comes_back_after_it_was_hidden():
         found = one.update(frame, plates([] if hidden else plate), blobs())
         assert found.by == (("",) if hidden else ("colour",))
     assert found.image_px[0] == pytest.approx([104.5 + 2 * 39, 54.5])
-
-
-def test_a_plate_with_a_seam_is_one_patch_and_specks_are_none():
-    masks = plates([(100, 50, 10, 10), (112, 50, 8, 10), (300, 200, 2, 2)])
-    found = follower().update(1, masks, blobs())
-    assert found.colour_px[0] == pytest.approx([109.5, 54.5], abs=0.2)
 
 
 def test_a_jerk_of_the_camera_that_nobody_measured_does_not_lose_a_landmark():

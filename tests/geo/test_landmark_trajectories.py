@@ -33,19 +33,6 @@ def test_reports_once_a_second_give_a_straight_way_in_every_frame_and_no_jump_at
     assert all(course.at(frame).sigma_m[0] == pytest.approx(1.0) for frame in range(1, 77))
 
 
-def test_reports_at_broken_frames_are_met_between_the_pictures():
-    course = LandmarkTrajectories(landmarks([(0.5, 0, 0, 0), (1.5, 0, 1, 0), (2.5, 0, 4, 0)]), KNOBS, RATE)
-    assert course.at(1).east_north_m[0] == pytest.approx([0.5, 0])
-    assert course.at(2).east_north_m[0] == pytest.approx([2.5, 0])
-
-
-def test_what_is_known_of_a_landmark_stands_beside_it():
-    marks = LandmarkTrajectories(landmarks([(1, 0, 3, 4, 0, 0.2)]), KNOBS, RATE).at(1)
-    assert (marks.landmark.tolist(), marks.east_north_m.tolist()) == ([0], [[3, 4]])
-    assert (marks.sigma_m.tolist(), marks.pixel_sigma.tolist(), marks.up_m.tolist()) == ([0.2], [2.0], [1.5])
-    assert np.isnan(marks.image_px).all()
-
-
 def test_a_short_dropout_is_bridged_straight_and_less_sure_in_its_middle():
     course = LandmarkTrajectories(
         landmarks(once_a_second([0, 1, 2, 5, 6, 7], [(t, 0) for t in (0, 1, 2, 5, 6, 7)])), KNOBS, RATE
@@ -68,12 +55,6 @@ def test_a_long_dropout_goes_straight_on_for_gap_s_and_then_the_landmark_is_abse
     assert course.at(1 + 25 * 12).east_north_m[0].tolist() == [24, 0]
 
 
-def test_after_the_last_report_too():
-    course = LandmarkTrajectories(landmarks(once_a_second([0, 1, 2], [(0, 0), (0, 1), (0, 2)])), KNOBS, RATE)
-    assert course.at(1 + 25 * 4).east_north_m[0] == pytest.approx([0, 4])
-    assert len(course.at(1 + 25 * 7)) == 0
-
-
 def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_lay_from_it():
     corner = [(1 + 25 * t, 0, *place, 1) for t, place in ((0, (0, 0)), (10, (10, 0)), (20, (10, 10)))]
     reports = [(1 + 25 * t, 0, t, 0.5) for t in range(4)]
@@ -94,13 +75,6 @@ def test_a_dropout_between_reports_on_a_plan_begins_and_ends_without_a_jump():
     assert np.abs(np.diff(north)).max() < 0.02
 
 
-def test_a_plan_alone_will_do():
-    course = LandmarkTrajectories(landmarks([(1, 0, 0, 0, 1), (11, 0, 10, 0, 1, 0.3)]), KNOBS, RATE)
-    marks = course.at(6)
-    assert marks.east_north_m.tolist() == [[5, 0]]
-    assert marks.sigma_m[0] == pytest.approx((1.0 + 0.3) / 2)
-
-
 def test_a_table_with_places_in_pictures_gives_those_rows_and_no_others():
     rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (1, 1, 1, 1, 0, np.nan, 7, 8), (3, 0, 2, 0, 0, np.nan, 9, 9), (2, 1, 1, 1)]
     course = LandmarkTrajectories(landmarks(rows, ("a", "b")), KNOBS, RATE)
@@ -114,10 +88,6 @@ def test_a_row_with_a_picture_and_no_place_gets_the_place_between_its_reports():
     rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (2, 0, np.nan, np.nan, 0, np.nan, 5, 7), (3, 0, 2, 0, 0, np.nan, 5, 8)]
     marks = LandmarkTrajectories(landmarks(rows), KNOBS, RATE).at(2)
     assert marks.east_north_m.tolist() == [[1, 0]] and marks.image_px.tolist() == [[5, 7]]
-
-
-def test_a_landmark_without_any_place_is_absent():
-    assert len(LandmarkTrajectories(landmarks([(1, 0, np.nan, np.nan)]), KNOBS, RATE).at(1)) == 0
 
 
 def test_speeds_are_those_over_the_ground():

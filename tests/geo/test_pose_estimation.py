@@ -9,7 +9,6 @@ import pytest
 from tests.airborne import CAMERA, GPS_M, look, ring
 from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.pose_estimation import find_pose, focal_prior, independent_expectation, pose_prior
-from torchvision_dddas.types import Flight
 
 KNOBS = AerialParameters()
 NAN = float("nan")
@@ -122,22 +121,3 @@ def test_landmarks_that_no_camera_up_there_can_see_have_no_pose():
     seen = look(8, n=3)
     up = replace(seen.flight, pitch_rad=-1.5)
     assert solved(seen, up) is None
-
-
-def test_telemetry_that_says_nothing_of_the_pose_is_no_prior():
-    assert pose_prior(None, CAMERA, KNOBS) is None
-    assert pose_prior(Flight(NAN, speed_m_s=5.0), CAMERA, KNOBS) is None
-
-
-def test_a_tilt_that_is_only_guessed_tells_little():
-    sigma = [1 / np.sqrt(told(Flight(50.0, pitch_rad=p)).information[0, 0]) for p in (1.0, NAN)]
-    assert np.allclose(np.degrees(sigma), [1.0, 15.0])
-
-
-def test_a_field_of_view_in_the_telemetry_counts_as_the_focal_length():
-    wide = told(Flight(50.0, hfov_rad=np.radians(90))).pose.focal
-    assert np.isclose(wide * CAMERA.focal_px[0], 960)
-
-
-def test_altitudes_are_measured_from_the_ground_below():
-    assert told(Flight(50.0), ground_up_m=7.0).pose.place_m[2] == 57.0

@@ -19,7 +19,7 @@ from torchvision_dddas.geo.projection import (
     rays,
     undistort_pixels,
 )
-from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
+from torchvision_dddas.geometry import slope_of_turn, turn_of, turned
 from torchvision_dddas.types import CameraPose
 
 BENT = replace(CAMERA, k1=-0.2, k2=0.05, focal_px=(1400.0, 1380.0))
@@ -29,12 +29,6 @@ ABOVE = CameraPose(np.array([2.0, -3.0, 50.0]), axes_of(0.7, 1.3, 0.1), 1.02)
 
 def test_a_level_camera_that_looks_north_has_east_on_its_right_and_the_ground_below():
     assert np.allclose(axes_of(0, 0, 0), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T)
-
-
-def test_straight_down_the_heading_is_that_of_the_upper_edge():
-    pose = CameraPose(np.array([0.0, 0.0, 50.0]), axes_of(np.pi / 2, np.pi / 2, 0))
-    east = project(np.array([[10.0, 0.0, 0.0]]), pose, CAMERA)[0]
-    assert np.allclose(east, [CAMERA.centre_px[0], CAMERA.centre_px[1] - 10 / 50 * CAMERA.focal_px[1]])
 
 
 def test_roll_clockwise_turns_what_is_above_to_the_left():
@@ -47,12 +41,6 @@ def test_roll_clockwise_turns_what_is_above_to_the_left():
 def test_angles_come_back_from_axes(heading, pitch, roll):
     axes = axes_of(heading, pitch, roll)
     assert np.allclose(axes_of(*CameraPose(np.zeros(3), axes).angles_rad), axes, atol=1e-8)
-
-
-def test_straight_down_all_that_turns_is_the_heading():
-    heading, pitch, roll = CameraPose(np.zeros(3), axes_of(1.0, np.pi / 2, 0.25)).angles_rad
-    assert roll == 0 and np.isclose(pitch, np.pi / 2)
-    assert np.allclose(axes_of(heading, pitch, roll), axes_of(1.0, np.pi / 2, 0.25))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, BENT])
@@ -111,11 +99,6 @@ def test_the_slope_of_a_turn_is_its_differences():
     for axis, step in enumerate(1e-6 * np.eye(3)):
         there, back = (turn_of(turned(sign * step) @ turned(vector)) for sign in (1, -1))
         assert np.allclose((there - back) / 2e-6, slope_of_turn(vector)[:, axis], atol=1e-7)
-
-
-def test_what_turns_about_up_undone_leaves_a_tilt():
-    rotation = turned(np.array([0.3, -0.1, 0.0])) @ turned(np.array([0.0, 0.0, 2.5]))
-    assert np.allclose(about_up(rotation), turned(np.array([0.0, 0.0, 2.5])))
 
 
 def test_a_straight_lens_shows_points_at_unbent_pixels_and_bent_ones_are_the_lens_again():

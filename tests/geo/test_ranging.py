@@ -144,21 +144,6 @@ def test_95_percent_ellipses_hold_93_to_97_percent(use, distance, pitch):
     assert 0.93 < inside.mean() < 0.97
 
 
-def test_both_together_are_never_less_sure_than_either():
-    box = boxes(PEOPLE, 1.75, camera())
-    spread = {use: np.linalg.det(seen(box, camera(), use=use).covariance_m2) for use in ("both", "height", "feet")}
-    assert (spread["both"] <= spread["height"] * (1 + 1e-9)).all()
-    assert (spread["both"] <= spread["feet"] * (1 + 1e-9)).all()
-
-
-def test_feet_at_the_horizon_leave_the_height_alone():
-    box = np.array([[600.0, 300.0, 40.0, 180.0], [600.0, 200.0, 40.0, 180.0]])  # feet on row 479.5 and above
-    assert seen(box, camera()).by.tolist() == ["height", "height"]
-    by_feet = seen(box, camera(), use="feet")
-    assert by_feet.by.tolist() == ["bearing", "bearing"]
-    assert np.isnan(by_feet.east_north_m).all() and np.isfinite(by_feet.bearing_rad).all()
-
-
 def test_the_height_of_a_cut_person_is_not_used():
     cam = camera()
     box = boxes(PEOPLE, 1.75, cam)
@@ -207,8 +192,3 @@ def test_without_a_camera_height_there_is_the_body_height_alone():
     assert np.allclose(found.east_north_m, PEOPLE) and np.isfinite(found.covariance_m2).all()
     with pytest.raises(InputError, match=r"has no height_m; ground\.use = feet needs"):
         seen(boxes(PEOPLE, 1.75, camera()), cam, use="feet")
-
-
-def test_nobody_is_nowhere():
-    assert len(seen(np.zeros((0, 4)), camera())) == 0
-    assert seen(np.zeros((0, 4)), camera()).covariance_m2.shape == (0, 2, 2)

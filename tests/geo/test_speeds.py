@@ -33,26 +33,7 @@ def test_noisy_places_give_a_calmer_velocity_than_their_differences():
     assert np.abs(found - [1, 0]).mean() < 0.2 * np.abs(differences - [1, 0]).mean()
 
 
-def test_a_velocity_that_noise_hides_is_not_told():
-    found = fed([[0, 0], [0.5, 0]], [0.0, 0.1], 0.25 * np.eye(2)[None])
-    assert np.isnan(found).all()
-
-
-def test_a_target_without_identity_has_no_velocity():
-    times = np.arange(10) / 10
-    assert np.isnan(fed(np.outer(times, [1.0, 0.0]), times, identity=-1)).all()
-
-
 def test_a_target_that_comes_back_after_long_begins_anew():
     movers = TargetSpeeds()
     fed(np.outer(np.arange(10) / 10, [3.0, 0.0]), np.arange(10) / 10, movers=movers)
     assert np.isnan(fed([[500.0, 0.0]], [60.0], movers=movers)).all()
-
-
-def test_what_is_said_of_one_target_does_not_touch_another():
-    movers, alone = TargetSpeeds(), TargetSpeeds()
-    for k in range(10):
-        both = np.array([[0.1 * k, 0.0], [5.0, 0.3 * k]])
-        together = movers.update(k / 10, np.array([1, 2]), both, np.repeat(EXACT, 2, axis=0))
-        single = alone.update(k / 10, np.array([2]), both[1:], EXACT)
-    np.testing.assert_allclose(together[1], single[0])

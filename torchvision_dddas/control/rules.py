@@ -12,8 +12,8 @@ from torchvision_dddas.config import (
 )
 from torchvision_dddas.types import Adjustment
 
+# Of so many frames one is looked at: no parameter, but named like one in the record.
 SAMPLING = "sampling.every"
-"""Of so many frames one is looked at: no parameter, but named like one in the record."""
 
 # Between two looks a target moves by this share of its size at most.
 _MOVED_SHARE = 0.5

@@ -7,14 +7,14 @@ import numpy as np
 
 from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 
+# Who has said nothing for so long is silent, if reports came faster before.
 SILENT_S = 2.0
-"""Who has said nothing for so long is silent, if reports came faster before."""
+# So many times the usual time between its reports is silence where they come seldom.
 _SLOWER = 3.0
-"""So many times the usual time between its reports is silence where they come seldom."""
+# No vehicle's report is so much further from its last one than it could have driven.
 _LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
-"""No vehicle's report is so much further from its last one than it could have driven."""
+# The ground below the picture's middle does not move so much faster than it did, but for a gust.
 _JERK_M_S = 4.0
-"""The ground below the picture's middle does not move so much faster than it did, but for a gust."""
 _USUAL_S = 2.0
 
 

@@ -7,8 +7,8 @@ from torchvision_dddas.control.footprint import CameraMount
 from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 
+# Landmarks that a picture needs to lie on the ground.
 NEEDED = 4
-"""Landmarks that a picture needs to lie on the ground."""
 # How far within the picture what is followed should be, as a share of its half: at least; from where it climbs to; and
 # so that it may come down again.
 _LEAST, _AIMED, _EASY = 0.1, 0.2, 0.35

@@ -1,8 +1,8 @@
-"""Errors of telemetry and of the landmarks' receivers from frame to frame: they change slowly, so a clip tells them.
+"""Errors of telemetry and of the landmarks' receivers over a clip: they change slowly, so many frames estimate them.
 
-Each is an Ornstein-Uhlenbeck process and noise: together they have the standard deviation that the error is said to
-have, and the process forgets itself by a time constant. The first frame thus is like any single one; later ones gain
-by what is independent, pixels and motion, and no confidence grows beyond what slow errors allow.
+Each error is an Ornstein-Uhlenbeck process plus noise. Together they have the standard deviation that the error is said
+to have; the process decays by a time constant. So the first frame is like a single picture, later ones gain in what is
+independent, pixels and motion, and no confidence grows beyond what slow errors allow.
 """
 
 from dataclasses import dataclass, field, replace
@@ -15,11 +15,10 @@ from torchvision_dddas.geo.projection import project_with_slopes
 from torchvision_dddas.geometry import slope_of_turn
 from torchvision_dddas.types import Camera, LandmarkObservations
 
+# A landmark not seen for so many time constants is forgotten.
 FORGOTTEN = 4.0
-"""A landmark not seen for so many time constants is forgotten."""
-
+# A receiver whose standard deviation changes by more than this factor works another way: its error is another.
 ANOTHER = 1.5
-"""A receiver whose standard deviation changes by more than this factor works another way: its error is another."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class LinearizedImage:
 def linearize_image(
     marks: LandmarkObservations, camera: Camera, used: np.ndarray, solution: Solution
 ) -> LinearizedImage:
-    """The picture of one frame. The telemetry must tell all seven: a correction is then of what it says."""
+    """The picture of one frame, linear about its solution. The telemetry must give all seven of the pose."""
     points = np.column_stack([solution.places, marks.up_m])[used]
     seen, by_pose, by_point = project_with_slopes(points, solution.pose, camera)
     k = len(points)
@@ -54,11 +53,11 @@ def linearize_image(
 
 @dataclass(frozen=True)
 class ErrorPersistence:
-    """What of the errors lasts from frame to frame; the rest is new in every frame.
+    """Which share of the errors persists from frame to frame; the rest is new in every frame.
 
-    telemetry: share of the variance of its angles and place: a gimbal shakes, samples are older than the picture.
-    landmarks: share of that of their reports. pace: how many times faster than by aerial.correlation_s the rest is
-    forgotten; infinite where nothing is kept.
+    telemetry: share of the variance of its angles and place; a gimbal shakes, and samples are older than the picture.
+    landmarks: share of the variance of their reports. pace: how many times faster than aerial.correlation_s the
+    persistent part decays; infinite where nothing is kept.
     """
 
     telemetry: float = 0.9
@@ -68,10 +67,10 @@ class ErrorPersistence:
 
 @dataclass(frozen=True)
 class BiasFilter:
-    """What is known of the errors at a time: truth less report, telemetry's seven first, then two a landmark.
+    """Estimate of the errors at a time: truth less report, the seven of the pose first, then two a landmark.
 
-    covariance: with the mean, (7 + 2m,) of landmarks `ids` (m,), last seen at `seen_s`. sigma: (7 + 2m,) that they
-    have when nothing is known; NaN for what the telemetry has never told.
+    mean, covariance: (7 + 2m,) with the landmarks `ids` (m,), last seen at `seen_s`. sigma: (7 + 2m,) of each error
+    before any frame; NaN for what the telemetry has never given.
     """
 
     time_s: float = float("nan")
@@ -80,16 +79,16 @@ class BiasFilter:
     mean: np.ndarray = field(default_factory=lambda: np.zeros(7))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((7, 7)))
     sigma: np.ndarray = field(default_factory=lambda: np.full(7, np.nan))
-    lasting: ErrorPersistence = ErrorPersistence()
+    persistence: ErrorPersistence = ErrorPersistence()
 
     @property
-    def told(self) -> bool:
-        """Whether any frame has told anything."""
+    def is_updated(self) -> bool:
+        """Whether any frame has contributed."""
         return bool(self.mean.any())
 
     def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "BiasFilter":
-        """The same at a later time, with the landmarks that are new."""
-        correlation_s /= self.lasting.pace
+        """The filter at a later time, with new landmarks added."""
+        correlation_s /= self.persistence.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
         known, before = np.flatnonzero(prior.known), self._of(time_s, marks, FORGOTTEN * correlation_s)
@@ -99,18 +98,18 @@ class BiasFilter:
         sigma[error_rows(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
         with np.errstate(invalid="ignore"):
             grown = sigma / was
-        # The telemetry's may be a share of the altitude, and grow with it.
+        # The altitude's sigma may be a share of the altitude, and grows with it.
         grown[7:] = np.where((grown[7:] < ANOTHER) & (grown[7:] > 1 / ANOTHER), grown[7:], 0.0)
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
         filled = np.where(np.isfinite(sigma), sigma, 0.0) * self._slow(size)
         was = was * self._slow(size)
         covariance = before.covariance * np.outer(factor, factor)
-        # What is new of each: all that it has beyond what it keeps of its standard deviation.
+        # Process noise: what each error has beyond the kept part of its standard deviation.
         covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
         return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
 
     def _of(self, time_s: float, marks: LandmarkObservations, forgotten_s: float) -> "BiasFilter":
-        """The same with the landmarks that are new, and without those not seen for too long."""
+        """The filter with new landmarks added, and those removed that were not seen for too long."""
         seen, old = marks.landmark.tolist(), self.ids.tolist()
         staying = [
             row for row, identity in enumerate(old) if identity in seen or time_s - self.seen_s[row] <= forgotten_s
@@ -129,7 +128,7 @@ class BiasFilter:
         return replace(self, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
 
     def expected(self, prior: Prior, marks: LandmarkObservations) -> Expected:
-        """What it lets expect of a frame's pose and landmarks; it must be of that frame's time."""
+        """What to expect of a frame's pose and landmarks; call `at` with that frame's time before."""
         known, n = np.flatnonzero(prior.known), len(marks)
         ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
@@ -139,24 +138,24 @@ class BiasFilter:
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
-    def foretold(self, marks: LandmarkObservations, glimpse: LinearizedImage) -> tuple[float, "BiasFilter"]:
-        """How well it foretold a picture, the log of the density of where the landmarks were, and itself after it.
+    def predict(self, marks: LandmarkObservations, linear: LinearizedImage) -> tuple[float, "BiasFilter"]:
+        """Log density of a picture under the prediction, and the filter updated by it.
 
-        The telemetry must tell all seven.
+        The telemetry must give all seven of the pose.
         """
         ours = np.concatenate([np.arange(7), error_rows(self.ids, marks.landmark)])
-        crossed = self.covariance[:, ours] @ glimpse.slopes.T
-        expected = glimpse.slopes @ self._seen(ours) @ glimpse.slopes.T + np.diag(glimpse.variance_px2)
-        surprise = glimpse.shown_px - glimpse.slopes @ self.mean[ours]
+        crossed = self.covariance[:, ours] @ linear.slopes.T
+        expected = linear.slopes @ self._seen(ours) @ linear.slopes.T + np.diag(linear.variance_px2)
+        surprise = linear.shown_px - linear.slopes @ self.mean[ours]
         root = np.linalg.cholesky(expected)
         white = np.linalg.solve(root, np.column_stack([surprise, crossed.T]))
         density = -0.5 * float(white[:, 0] @ white[:, 0]) - float(np.log(np.diag(root)).sum())
         covariance = self.covariance - white[:, 1:].T @ white[:, 1:]
         mean = self.mean + white[:, 1:].T @ white[:, 0]
-        return density, self._with(mean, covariance, marks.landmark[glimpse.used])
+        return density, self._with(mean, covariance, marks.landmark[linear.used])
 
     def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "BiasFilter":
-        """With what a frame told: of errors that were not looked at too, as far as they go with those that were."""
+        """The filter updated by a frame's solution, including errors that are correlated with those observed."""
         known, n = np.flatnonzero(prior.known), len(marks)
         ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
         theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
@@ -172,8 +171,8 @@ class BiasFilter:
         seen_s = np.array([self.time_s if i in ids else t for i, t in zip(self.ids.tolist(), self.seen_s, strict=True)])
         return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
 
-    def anew(self, rows: np.ndarray) -> "BiasFilter":
-        """With some of its errors as if nothing were known of them."""
+    def forget(self, rows: np.ndarray) -> "BiasFilter":
+        """The filter with some of its errors as before any frame."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[rows] = 0
         covariance[rows] = 0
@@ -183,24 +182,24 @@ class BiasFilter:
         return replace(self, mean=mean, covariance=covariance)
 
     def _seen(self, rows: np.ndarray) -> np.ndarray:
-        """The covariance of errors as a single frame has them: what lasts, and what is new in every frame."""
+        """The covariance of errors in a single frame: the persistent part plus what is new in every frame."""
         sigma = self.sigma[rows]
         return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - self._slow(len(self.mean))[rows] ** 2))
 
     def _slow(self, size: int) -> np.ndarray:
-        return _slow(self.lasting, size)
+        return _slow(self.persistence, size)
 
 
 @lru_cache(maxsize=256)
-def _slow(lasting: ErrorPersistence, size: int) -> np.ndarray:
-    """Share of each standard deviation that lasts; a focal length does. It is shared, and not to be written to."""
-    share = np.full(size, np.sqrt(lasting.landmarks))
-    share[:6], share[6] = np.sqrt(lasting.telemetry), 1.0
+def _slow(persistence: ErrorPersistence, size: int) -> np.ndarray:
+    """Share of each standard deviation that persists; a focal length does. Cached and read-only."""
+    share = np.full(size, np.sqrt(persistence.landmarks))
+    share[:6], share[6] = np.sqrt(persistence.telemetry), 1.0
     share.flags.writeable = False
     return share
 
 
 def error_rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Where the two errors of each wanted landmark stand."""
+    """The rows of the two errors of each wanted landmark."""
     row = {identity: 7 + 2 * k for k, identity in enumerate(ids.tolist())}
     return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)

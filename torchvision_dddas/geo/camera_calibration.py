@@ -13,26 +13,20 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import level
 from torchvision_dddas.types import Bool, Camera, Float
 
+# Boxes that it takes.
 FEWEST = 20
-"""Boxes that it takes."""
-
+# The rows that hold the feet of all but a tenth on either side must be so many body heights at least.
 NARROW = 0.3
-"""The rows that hold the feet of all but a tenth on either side must be so many body heights at least."""
-
+# The boxes are left out in so many stretches of time in turn, to learn how much the answer hangs on single people.
 BLOCKS = 10
-"""The boxes are left out in so many stretches of time in turn, to learn how much the answer hangs on single people."""
-
+# Where the search begins, each with HEIGHTS.
 PITCHES = np.radians([0.0, 5.0, 15.0, 30.0, 50.0])
-"""Where the search begins, each with HEIGHTS."""
-
+# In typical people's heights.
 HEIGHTS = (0.5, 1.2, 2.5, 8.0)
-"""In typical people's heights."""
-
+# Where the typical body misses by so many of its heights, nothing was found.
 POOR = 0.5
-"""Where the typical body misses by so many of its heights, nothing was found."""
-
+# A standard deviation of the height that is a larger share of it is no answer.
 UNSURE = 0.2
-"""A standard deviation of the height that is a larger share of it is no answer."""
 
 
 @dataclass(frozen=True)
@@ -124,12 +118,11 @@ def with_pose(camera: Camera, found: MountedPose) -> Camera:
     )
 
 
+# A measurement is an outlier so many robust standard deviations from the median, or SURE of it where that is more.
 OUTLIER = 3.5
-"""A measurement is an outlier so many robust standard deviations from the median, or SURE of it where that is more."""
-
+# Shares of the focal length. A box is never read more surely than SURE; no calibration of people is finer than
+# FINEST, for all their boxes may be too tall or too low together.
 SURE, FINEST = 0.03, 0.01
-"""Shares of the focal length. A box is never read more surely than SURE; no calibration of people is finer than FINEST,
-for all their boxes may be too tall or too low together."""
 
 
 @dataclass(frozen=True)

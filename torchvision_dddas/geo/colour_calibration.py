@@ -8,8 +8,8 @@ import numpy as np
 
 from torchvision_dddas.geo.colours import Patches, find_patches
 
+# Names of hues, in OpenCV's units.
 HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
-"""Names of hues, in OpenCV's units."""
 
 # A patch is looked for in windows of hue of this half width and step, above these saturations and this value.
 _HALF, _STEP = 7, 4

@@ -16,14 +16,12 @@ import numpy as np
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Float, Int, Sightings
 
+# Each vehicle's sightings are matched anew to what the others see so many times at most.
 ROUNDS = 3
-"""Each vehicle's sightings are matched anew to what the others see so many times at most."""
-
+# So many pairs at most are tried as the one that tells how far a vehicle is off.
 BELIEFS = 60
-"""So many pairs at most are tried as the one that tells how far a vehicle is off."""
-
+# Beliefs times pairs that are worked out at once: a few megabytes.
 MATRICES = 20_000
-"""Beliefs times pairs that are worked out at once: a few megabytes."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +104,6 @@ def estimate_places(
     found = covariance @ right
     joint = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
     return found[: 2 * people].reshape(-1, 2), joint, found[3 * people :].reshape(-1, 6)
-
-
-def crowd(east_north_m: Float[np.ndarray, "T P 2"], ahead: float = 1.0) -> Float[np.ndarray, "2"]:
-    """Where a crowd will be `ahead` looks after the last: the average of its people, moved on as it moved at last.
-
-    east_north_m: its people at the last looks, NaN where one was not seen; one look alone predicts that it stays.
-    Source: appendix A, IV-C: individuals' locations are averaged to predict the crowd's next one.
-    """
-    places = np.asarray(east_north_m, float)
-    seen = np.isfinite(places).all(axis=2)
-    # Only people seen at both looks tell how the crowd moved: one who comes or goes moves the average too.
-    average = places[-1, seen[-1]].mean(axis=0) if seen[-1].any() else np.full(2, np.nan)
-    both = seen[-2] & seen[-1] if len(places) > 1 else np.zeros(0, bool)
-    step = (places[-1, both] - places[-2, both]).mean(axis=0) if both.any() else np.zeros(2)
-    return average + ahead * step
 
 
 def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_sigmas: float) -> np.ndarray:

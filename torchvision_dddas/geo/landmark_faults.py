@@ -24,19 +24,16 @@ from torchvision_dddas.types import Bool, Camera, Int, LandmarkObservations
 Hypothesis = tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]
 """Whose pixel each landmark has in truth, and which landmarks count."""
 
+# Of the changes that look best to first order so many are tried in full.
 FITTED = 6
-"""Of the changes that look best to first order so many are tried in full."""
-
+# Landmarks that may overrule the telemetry: fewer fit anything too easily.
 ENOUGH_ALONE = 5
-"""Landmarks that may overrule the telemetry: fewer fit anything too easily."""
-
+# Landmarks alone that fit no better than so many times their errors are not what they are said to be, and tell
+# nothing. Beside telemetry, which may be what is wrong, they still do.
 HOPELESS = 8.0
-"""Landmarks alone that fit no better than so many times their errors are not what they are said to be, and tell
-nothing. Beside telemetry, which may be what is wrong, they still do."""
-
+# They do so only where they lie this many standard deviations off their own best line, on the ground and in the
+# picture: a row of them agrees with poses of all kinds.
 APART = 3.0
-"""They do so only where they lie this many standard deviations off their own best line, on the ground and in the
-picture: a row of them agrees with poses of all kinds."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ import numpy as np
 from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.types import Adjustment, LandmarkObservations, Landmarks
 
+# Reports that are further apart than this many times their usual distance have a dropout between them.
 _SLACK = 1.5
-"""Reports that are further apart than this many times their usual distance have a dropout between them."""
-
+# The reports of this last time tell how fast a landmark goes.
 _PACE_S = 5.0
-"""The reports of this last time tell how fast a landmark goes."""
 
 
 @dataclass(frozen=True)

@@ -1,43 +1,30 @@
-"""Between the picture and the ground: the bare plane homography of the landmarks, and pixels laid on the ground.
+"""The plane homography from ground to picture by landmarks alone, and pixels to places on the ground.
 
-Bare homography (appendix A, IV-B, eq. 6 to 11): eight unknowns by landmarks alone, weighed by how well each is known.
-`paper` solves as the source does, normal equations of raw degrees. Eq. (11) prints 1 where the inverse's last element
-belongs; here it has its place. With a pose of the camera pixels are laid on the ground by rays.
+The homography (appendix A, IV-B, eq. 6 to 11) has eight unknowns; each landmark weighs as well as it is known. `paper`
+solves as the source does, by normal equations of raw degrees. Eq. (11) prints 1 where the last element of the inverse
+belongs; here it has its place. With a known pose of the camera, pixels go to the ground by rays instead.
 """
-
-from typing import Protocol
 
 import numpy as np
 
+from torchvision_dddas.geo.plane_solvers import PlaneSolver
 from torchvision_dddas.geo.projection import ground_from_rays, inverse_2x2, undistort_pixels
 from torchvision_dddas.geo.terrain import Surface
 from torchvision_dddas.geometry import lonlat, transfer
 from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 
+# Landmarks that a plane homography takes.
 LEAST = 4
-"""Landmarks that a plane homography takes."""
 
 
+# A homography is none whose depth at a landmark is no better known than this, as a share of it.
 VAGUE = 0.3
-"""A homography is none whose depth at a landmark is no better known than this, as a share of it."""
-
-
-class Solver(Protocol):
-    """What a back end offers to solve homographies with (engine.protocol.PlaneSolver)."""
-
-    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted least squares."""
-        ...
-
-    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations of the given coordinates."""
-        ...
 
 
 def fix_by_homography(
     frame: int,
     marks: LandmarkObservations,
-    solver: Solver,
+    solver: PlaneSolver,
     least_spread: float = 0.02,
     degrees: tuple[np.ndarray, tuple[float, float]] | None = None,
     paper: bool = False,
@@ -47,14 +34,12 @@ def fix_by_homography(
     marks: none may lack its pixel or its place. degrees, for `paper`: their longitudes and latitudes (n, 2), and the
     origin of the local metres; without them `paper` solves the local metres.
     """
-    ids, n = marks.landmark, len(marks)
-    if n < LEAST:
-        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=describe_too_few(frame, n))
-    cause = describe_one_line(frame, marks, least_spread)
+    n = len(marks)
+    cause = describe_too_few(frame, n) if n < LEAST else describe_one_line(frame, marks, least_spread)
     if cause:
-        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
+        return no_fix(frame, marks, cause)
     if paper:
-        return _as_printed(frame, marks, solver, degrees)
+        return _fix_as_printed(frame, marks, solver, degrees)
     # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
     middle = marks.east_north_m.mean(axis=0)
     ground, image = marks.east_north_m - middle, marks.image_px
@@ -64,7 +49,7 @@ def fix_by_homography(
     for again in (True, False):
         matrix, valid = solver.solve(ground[None], image[None], weight[None])
         if not valid[0] or not np.isfinite(matrix[0]).all():
-            return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=_no_homography(frame, n))
+            return no_fix(frame, marks, _no_homography(frame, n))
         depth, by_ground, by_matrix = _slopes(ground, matrix[0])
         seen = np.eye(2) * variance[:, None, None]
         seen += by_ground @ by_ground.swapaxes(1, 2) * (marks.sigma_m**2)[:, None, None]
@@ -74,7 +59,7 @@ def fix_by_homography(
             weight = 2 / (depth**2 * np.trace(seen, axis1=1, axis2=2))
             weight = weight / weight.max()
     if (depth <= 0).any() and (depth >= 0).any():
-        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=_no_homography(frame, n))
+        return no_fix(frame, marks, _no_homography(frame, n))
     information = np.einsum("n,nki,nkj->ij", ours, by_matrix, by_matrix)
     spread_out = np.einsum("n,nki,nkl,nlj->ij", ours**2, by_matrix, seen, by_matrix)
     inverse = np.linalg.pinv(information, rcond=1e-15, hermitian=True)
@@ -85,7 +70,7 @@ def fix_by_homography(
             f"the {n} landmarks of frame {frame} lie too near one line, three of them or all, for how well they are "
             "known: their homography would be no more than a guess; add a landmark off the line, or telemetry"
         )
-        return Fix(frame, "", landmark=ids, state=("excluded",) * n, cause=cause)
+        return no_fix(frame, marks, cause)
     far = _about(matrix[0], -middle)
     return Fix(
         frame,
@@ -93,19 +78,24 @@ def fix_by_homography(
         image_from_ground=far / far[2, 2],
         matrix_covariance=covariance,
         about_m=(float(middle[0]), float(middle[1])),
-        landmark=ids,
+        landmark=marks.landmark,
         state=("used",) * n,
     )
 
 
+def no_fix(frame: int, marks: LandmarkObservations, cause: str) -> Fix:
+    """A fix that concludes nothing, with its cause in words."""
+    return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * len(marks), cause=cause)
+
+
 def describe_too_few(frame: int, n: int, without: str = "") -> str:
-    """The cause of a refusal, in words: how many landmarks are missing in which frame."""
+    """How many landmarks are missing in which frame, in words."""
     has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
     return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that are needed"
 
 
 def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
-    """The cause of a refusal where landmarks stand on one line, or show in one spot; empty where they do not."""
+    """Why landmarks on one line, or shown in one spot, allow no fix, in words; empty where they are spread out."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
     wide = relative_width(marks)
@@ -118,15 +108,15 @@ def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: flo
 
 
 def relative_width(marks: LandmarkObservations) -> float:
-    """How wide landmarks lie, as a share of how long, on the ground or in the picture, whichever is less.
+    """Width of the landmarks as a share of their length, on the ground or in the picture, whichever is less.
 
-    Receivers' errors make a row on the ground wider than it is; a picture shows a row as one whatever they err.
+    Receiver errors make a row on the ground wider than it is; in the picture it is a row whatever the errors.
     """
     return min(spread(marks.east_north_m), spread(marks.image_px))
 
 
 def spread(points: Float[np.ndarray, "n 2"]) -> float:
-    """How wide points lie, as a share of how long."""
+    """Width of a set of points as a share of its length."""
     apart = points - points.mean(axis=0)
     length, width = np.linalg.svd(apart, compute_uv=False)[:2]
     return float(width / length) if length > 0 else 0.0
@@ -163,10 +153,6 @@ def absolute_covariance(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m:
     return relative_m2 + common_sigma_m**2 * np.eye(2)
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# The homography.
-
-
 def _slopes(ground: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth (n,) of eq. (6), and derivatives of the pixels by the ground (n, 2, 2) and by the matrix (n, 2, 8)."""
     n = len(ground)
@@ -194,15 +180,15 @@ def _no_homography(frame: int, n: int) -> str:
     )
 
 
-def _as_printed(
-    frame: int, marks: LandmarkObservations, solver: Solver, degrees: tuple[np.ndarray, tuple[float, float]] | None
+def _fix_as_printed(
+    frame: int, marks: LandmarkObservations, solver: PlaneSolver, degrees: tuple[np.ndarray, tuple[float, float]] | None
 ) -> Fix:
-    """The source's solution, of raw degrees where there are any, brought to local metres; nothing of its errors."""
+    """The source's solution, of raw degrees if given, in local metres; its errors are unknown."""
     n = len(marks)
     given = marks.east_north_m if degrees is None else np.asarray(degrees[0], float)
     matrix, valid = solver.solve_raw(given[None], marks.image_px[None])
     if not valid[0] or not np.isfinite(matrix[0]).all():
-        return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * n, cause=_no_homography(frame, n))
+        return no_fix(frame, marks, _no_homography(frame, n))
     ours = matrix[0]
     if degrees is not None:
         middle = marks.east_north_m.mean(axis=0)
@@ -217,7 +203,7 @@ def _as_printed(
 def _by_inverse(
     matrix: np.ndarray, covariance: np.ndarray | None, pixels: np.ndarray, sigma_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Eq. (11). Beyond the horizon is what a picture of the ground from above would show mirrored."""
+    """Eq. (11). A point that a picture from above would show mirrored lies beyond the horizon: NaN."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         try:
             found = transfer(np.linalg.inv(matrix), pixels)

@@ -6,7 +6,7 @@ weighs as much as it is known. What is expected of all of them comes as an infor
 of some. Levenberg and Marquardt's steps find the least sum of squares; its inverse curvature is the covariance.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,23 +15,21 @@ from torchvision_dddas.geo.projection import axes_of, normalize, project_with_sl
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
+# Which of the seven of a pose turns the heading.
 HEADING = 2
-"""Which of the seven of a pose turns the heading."""
-
+# A landmark is never known better than this: the curvature would be too steep to invert.
 EXACT_M = 1e-3
-"""A landmark is never known better than this: the curvature would be too steep to invert."""
 
 STEPS = 30
+# A step this small, squared and in standard deviations, is the last.
 ENOUGH = 1e-5
-"""A step this small, squared and in standard deviations, is the last."""
 
 
+# A step that lessens the sum of squares by a smaller share is the last, too.
 NO_BETTER = 1e-5
-"""A step that lessens the sum of squares by a smaller share is the last, too."""
-
+# Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
+# than places that the sum of squares lies in a bent valley, and straight steps along it would be short.
 SETTLING = 1
-"""Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
-than places that the sum of squares lies in a bent valley, and straight steps along it would be short."""
 
 
 @dataclass(frozen=True)
@@ -304,8 +302,8 @@ def _focal_of(hfov_rad: float, camera: Camera, parameters: AerialParameters, kno
     return 1.0, camera.focal_sigma if known else parameters.focal_guess_sigma
 
 
+# So many are tried where nothing else tells one.
 HEADINGS = 8
-"""So many are tried where nothing else tells one."""
 
 
 def find_pose(
@@ -321,7 +319,7 @@ def find_pose(
         first = fit_pose(marks, camera, expected, used=used)
         if first is not None:
             return first
-    seen = rows(marks, used)
+    seen = marks[used]
     starts = [] if known.all() else _turned_about_up(seen, camera, expected)
     if len(seen) >= 4 and not (starts and known[:2].all() and known[5]):
         starts += of_homography(_plain(seen, camera), camera, seen.east_north_m, seen.up_m)
@@ -329,11 +327,6 @@ def find_pose(
         starts = _all_headings(expected)
     found = [one for start in starts if (one := fit_pose(marks, camera, expected, start, used)) is not None]
     return min(found, key=lambda one: one.cost) if found else None
-
-
-def rows(marks: LandmarkObservations, which: np.ndarray) -> LandmarkObservations:
-    """Some of the landmarks of a frame: by their numbers or a (n,) bool."""
-    return replace(marks, **{column.name: getattr(marks, column.name)[which] for column in fields(marks)})
 
 
 def _turned_about_up(marks: LandmarkObservations, camera: Camera, expected: Expected) -> list[CameraPose]:

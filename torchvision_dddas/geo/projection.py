@@ -12,8 +12,8 @@ from torchvision_dddas.geo.terrain import Surface, intersect_surface
 from torchvision_dddas.geometry import cross
 from torchvision_dddas.types import Camera, CameraPose, Float
 
+# A point whose depth is a smaller share of its distance is beside or behind the camera.
 NEAREST = 1e-6
-"""A point whose depth is a smaller share of its distance is beside or behind the camera."""
 
 
 def axes_of(heading_rad: float, pitch_rad: float, roll_rad: float) -> Float[np.ndarray, "3 3"]:

@@ -23,17 +23,14 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import undistort
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
+# However large a box is, its edges are no better known than this, in pixels.
 PIXEL_SIGMA = 0.5
-"""However large a box is, its edges are no better known than this, in pixels."""
-
+# What a box cut at its side misses the body's middle by, in box heights.
 SIDE_SIGMA = 0.15
-"""What a box cut at its side misses the body's middle by, in box heights."""
-
+# A box whose edge is this near the picture's border touches it.
 BORDER_PX = 1.0
-"""A box whose edge is this near the picture's border touches it."""
-
+# A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors.
 COARSEST = 0.5
-"""A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors."""
 
 
 def range_people(

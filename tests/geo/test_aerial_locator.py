@@ -9,7 +9,7 @@ from tests.overflight import COLOURS_TOML, Overflight, pictures
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
-from torchvision_dddas.geo.aerial_targets import Targets, point_sigma_px, reference_points
+from torchvision_dddas.geo.aerial_targets import Targets, reference_points
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geo.pose_estimation import focal_prior
@@ -72,15 +72,6 @@ def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(p
     known = errors(flight, locator.locate_table(table))
     assert np.median(level) > 1.0
     assert np.median(known) < 0.3
-
-
-def test_a_level_raster_changes_nothing(prepared):
-    flight = Overflight(pitch_deg=60, geographic=False)
-    locator, table = prepared(flight)
-    bare = [g.positions.east_north_m for g in locator.locate_table(table)]
-    locator, table = prepared(flight, raster(lambda places: np.zeros(len(places))))
-    for g, before in zip(locator.locate_table(table), bare, strict=True):
-        np.testing.assert_allclose(g.positions.east_north_m, before, atol=1e-6)
 
 
 def test_the_vehicle_is_above_the_ground_below_it_not_above_the_origins(prepared):
@@ -156,27 +147,6 @@ def test_frames_between_with_landmarks_are_located_too(prepared):
     assert [len(g.positions) for g in found] == [4, 0, 0] * 3 + [4]
 
 
-def test_landmarks_that_are_absent_for_a_while_leave_gaps_without_positions(prepared):
-    flight = Overflight(geographic=False)
-    locator, table = prepared(flight, telemetry=False)
-    marks = locator.landmarks_at
-    locator.landmarks_at = lambda frame: (
-        marks(frame) if frame != 5 else replace(marks(5), image_px=np.full((4, 2), np.nan))
-    )
-    found = {g.frame: g for g in locator.locate_table(table)}
-    assert len(found[5].positions) == 0
-    assert found[5].fix.cause
-    assert all(len(found[frame].positions) == 4 for frame in (4, 6))
-
-
-def test_a_found_box_is_known_less_well_the_larger_it_is():
-    boxes = np.array([[0, 0, 10, 10], [0, 0, 40, 40.0]])
-    targets = Targets(boxes, np.array([1, 2]), np.ones(2, bool), np.ones(2))
-    parameters = Settings().aerial
-    assert point_sigma_px(targets, parameters) == pytest.approx([1, 1])
-    assert point_sigma_px(replace(targets, bodies=True), parameters) == pytest.approx(np.hypot(1, [1.3, 5.2]))
-
-
 def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
     feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
     targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
@@ -200,20 +170,6 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert not known
     assert "using 70 degrees" in note
     assert camera.centre_px == (499.5, 299.5)
-
-
-def test_a_height_in_the_cameras_file_is_said_to_be_of_no_use():
-    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), height_m=50.0)
-    _, known, (note,) = resolve_camera(camera, None, None, Settings())
-    assert known
-    assert "give --telemetry" in note
-
-
-def test_paper_mode_says_that_it_leaves_a_bent_lens_aside():
-    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), k1=-0.1)
-    _, _, (note,) = resolve_camera(camera, None, None, with_parameters(Settings(), {"aerial.mode": "paper"}))
-    assert "takes the lens of camera mine for straight" in note
-    assert resolve_camera(camera, None, None, Settings())[2] == []
 
 
 def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():

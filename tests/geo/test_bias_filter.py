@@ -55,6 +55,7 @@ def flights(alike_s: tuple[float, float], told_s: float = 20.0) -> tuple[float, 
     return off, inside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alike_s", [(4.0, 4.0), (1.0, 1.0), (1e-3, 1e-3)])
 def test_errors_that_change_faster_than_told_do_no_harm_and_ellipses_still_hold(alike_s: tuple[float, float]) -> None:
     off, inside = flights(alike_s)
@@ -62,6 +63,7 @@ def test_errors_that_change_faster_than_told_do_no_harm_and_ellipses_still_hold(
     assert inside > 0.85
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alike_s", [(1e-3, 20.0), (20.0, 1e-3)])
 def test_where_one_errs_anew_in_every_frame_and_the_other_alike_a_flight_averages_it_out(
     alike_s: tuple[float, float],

@@ -9,7 +9,7 @@ from tests.upright import boxes, camera
 from torchvision_dddas.config import load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ground_locator import GroundLocator
-from torchvision_dddas.geometry import east_north, lonlat
+from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import DetectionTable
 
 SETTINGS = load_config()
@@ -51,14 +51,6 @@ def test_one_camera_keeps_the_identities_of_its_table():
         assert look.positions.origin_deg is None and look.positions.lonlat_deg is None
 
 
-def test_rows_without_identity_are_numbered_after_those_that_have_one():
-    cam = camera()
-    alone = replace(table(cam), identity=None)
-    assert found([alone], [cam])[1].positions.target.tolist() == [1, 2]
-    mixed = replace(table(cam), identity=np.array([-1, 9, -1, 9, -1, -1]))
-    assert [look.positions.target.tolist() for look in found([mixed], [cam])] == [[10, 9], [10, 9], [10, 11]]
-
-
 def test_an_identity_twice_in_a_frame_is_said_with_its_line():
     twice = replace(table(camera()), identity=np.array([5, 9, 5, 5, 5, 9]))
     with pytest.raises(InputError, match=r"line 4: identity 5 is there already in frame 2; wanted each once"):
@@ -89,14 +81,6 @@ def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
         assert look.vehicle.tolist() == [0, 0, 1, 1]
 
 
-def test_a_person_whom_one_camera_loses_keeps_the_number():
-    south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
-    tables = [table(south, frames=(1, 3)), table(west, west.place)]
-    looks = found(tables, [south, west])
-    assert [sorted(look.positions.target.tolist()) for look in looks] == [[1, 2]] * 3
-    assert [(look.members >= 0).sum() for look in looks] == [4, 2, 4]
-
-
 def test_frames_that_lie_near_are_one_look_where_asked_for():
     south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
     tables = [table(south, frames=(1, 11)), table(west, west.place, frames=(3, 13))]
@@ -105,15 +89,6 @@ def test_frames_that_lie_near_are_one_look_where_asked_for():
     looks = found(tables, [south, west], settings=near)
     assert [look.frame for look in looks] == [1, 11]
     assert all((look.members >= 0).all() for look in looks)
-
-
-def test_degrees_begin_where_the_first_camera_stood():
-    cam = camera(place=ORIGIN, geographic=True)
-    (look, *_) = found([table(cam)], [cam])
-    assert look.positions.origin_deg == ORIGIN
-    assert look.positions.lonlat_deg is not None
-    assert np.allclose(look.positions.east_north_m, walked(1), atol=1e-6)
-    assert np.allclose(east_north(look.positions.lonlat_deg, ORIGIN), walked(1), atol=1e-4)
 
 
 def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first():
@@ -161,9 +136,3 @@ def test_cameras_in_degrees_and_in_metres_do_not_mix():
     cam = camera()
     with pytest.raises(InputError, match="give all in one kind"):
         found([table(cam), table(cam)], [cam, replace(cam, geographic=True, place=ORIGIN)])
-
-
-def test_tables_without_rows_have_no_looks():
-    cam = camera()
-    empty = table(cam, frames=())
-    assert found([empty], [cam]) == [] and found([empty, empty], [cam, cam]) == []
