@@ -27,8 +27,7 @@ from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
 from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.tracking.camera_motion import Camera
-from torchvision_dddas.tracking.sequence import Follower
+from torchvision_dddas.tracking import CameraMotion, FrameTracker
 from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 SAME = 0.9
@@ -94,8 +93,8 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
     last, source = int(truth.frame.max()), open_source(str(clip)) if clip else None
     size = source.size if source else tuple((truth.box_px[:, :2] + truth.box_px[:, 2:]).max(axis=0).tolist())
     engine = load_engine("onboard", settings) if source else None
-    followers = [Follower(settings, interval, size) for _ in range(interval)]
-    cameras = [Camera(engine) for _ in range(interval)] if engine else []
+    followers = [FrameTracker(settings, interval, size) for _ in range(interval)]
+    cameras = [CameraMotion(engine) for _ in range(interval)] if engine else []
     looked = 0
 
     def counted(look: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable:
@@ -117,9 +116,9 @@ def followed(truth: TrackTable, clip: Path | None, interval: int, settings: Sett
         picture = None if isinstance(frame, int) else frame
         step = cameras[phase].step(picture.image)[0] if picture else None
         given = TrackedFrame(number, picture, boxes(truth, number), Tracks(number), step)
-        settled[phase] += [f.tracks for f in followers[phase].take(given)]
+        settled[phase] += [f.tracks for f in followers[phase].update(given)]
     for phase, follower in enumerate(followers):
-        settled[phase] += [f.tracks for f in follower.end()]
+        settled[phase] += [f.tracks for f in follower.flush()]
     return [table(tracks) for tracks in settled], looked / last
 
 

@@ -13,9 +13,9 @@ from footage import frames_of, truth_of
 
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.functional import affinity
-from torchvision_dddas.tracking import jaccard
-from torchvision_dddas.tracking.dispersion import dispersion
-from torchvision_dddas.tracking.histograms import rgb_histograms
+from torchvision_dddas.tracking import source_affinity
+from torchvision_dddas.tracking.appearance import rgb_histograms
+from torchvision_dddas.tracking.source_affinity import dispersion
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def read(place: Path, pictures: str, histograms: str = "channel", ignored: bool 
         histogram[rows] = rgb_histograms(image, table.box_px[rows] - (1, 1, 0, 0))
         seen.add(number)
     if histograms == "channel":
-        histogram = jaccard.per_channel(histogram)
+        histogram = source_affinity.normalize_channels(histogram)
     return Truth(place.name, table.frame, table.identity, table.box_px, histogram, frozenset(seen))
 
 
@@ -86,7 +86,7 @@ def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float], 
     ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
     whole = [f for f in ends if truth.seen.issuperset(f) and any(len(rows[t]) for t in f)]
     frames = np.array(whole[::every], int).reshape(-1, count)
-    centre, shares = jaccard.centres(truth.box_px), truth.histogram
+    centre, shares = source_affinity.centres(truth.box_px), truth.histogram
     most = max(len(r) for r in rows.values())
     valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
     parts = []
@@ -108,7 +108,7 @@ def windows(truth: Truth, count: int, interval: int, cuts: tuple[float, float], 
 
 def dispersions(truth: Truth, frames: np.ndarray, cuts: tuple[float, float]) -> np.ndarray:
     """(W, K, 2) of the locations and of the histograms of each frame of the windows, at these cuts."""
-    centre, shares = jaccard.centres(truth.box_px), truth.histogram
+    centre, shares = source_affinity.centres(truth.box_px), truth.histogram
     rows = {number: truth.rows(number) for number in np.unique(frames).tolist()}
     found = {t: (dispersion(centre[rows[t]], cuts[0]), dispersion(shares[rows[t]], cuts[1])) for t in rows}
     return np.array([[found[t] for t in f] for f in frames.tolist()]).reshape(*frames.shape, 2)

@@ -33,8 +33,8 @@ import footage
 
 from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
-from torchvision_dddas.tracking import jaccard
-from torchvision_dddas.tracking.dispersion import location_weight, of_window
+from torchvision_dddas.tracking import source_affinity
+from torchvision_dddas.tracking.source_affinity import frames_considered, location_weight
 from torchvision_dddas.tracking.source_tracker import assign
 
 # An earlier measurement at an interval of 5; None is the weight by the dispersions. Its pictures of PETS09-S2L1 cannot
@@ -116,7 +116,9 @@ def weights(windows: data.Windows, parameters: PaperParameters) -> np.ndarray:
     found = []
     for of_frames, known in zip(windows.dispersions.tolist(), windows.identities, strict=True):
         counts = [len(k) for k in known]
-        location, appearance = (of_window([frame[n] for frame in of_frames], counts, parameters) for n in (0, 1))
+        location, appearance = (
+            min([frame[n] for frame in of_frames][: frames_considered(counts, parameters)]) for n in (0, 1)
+        )
         found.append(location_weight(location, lambda a=appearance: a, parameters.lowest_dispersion)[0])
     return np.array(found)
 
@@ -284,9 +286,12 @@ def by_readings(place: Path, interval: int, every: int) -> Figures:
 def _by_formula(place: Path, windows: data.Windows) -> data.Windows:
     """The same windows with eq. 4 and 5 on a dummy of zeros."""
     truth = data.read(place, "video")
-    centre, shares = jaccard.centres(truth.box_px), truth.histogram
+    centre, shares = source_affinity.centres(truth.box_px), truth.histogram
     location, appearance = (
-        [jaccard.triplets(*(feature[truth.rows(t)] for t in f), dummy="formula") for f in windows.frames.tolist()]
+        [
+            affinity.triplet_affinity(*(feature[truth.rows(t)] for t in f), dummy="formula")
+            for f in windows.frames.tolist()
+        ]
         for feature in (centre, shares)
     )
     return data.Windows(windows.frames, windows.identities, location, appearance, windows.dispersions)

@@ -31,7 +31,7 @@ from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.matching import LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.tracking import ONE_TARGET_LEAST
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.tracking.sequence import Follower, follow_clip, follow_scenes
+from torchvision_dddas.tracking import FrameTracker, track_clip, track_scenes
 from torchvision_dddas.types import DetectionTable, Frame, Scene, TrackedFrame, Tracks
 
 Step = np.ndarray | None
@@ -87,15 +87,15 @@ def of_sequences(folder: Path) -> list[str]:
 
 
 def _told(table: DetectionTable, maps: np.ndarray, told: Told, size: tuple[int, int]) -> Iterator[TrackedFrame]:
-    follower = Follower(_NO_LOOKS, INTERVAL, size)
+    follower = FrameTracker(_NO_LOOKS, INTERVAL, size)
     for number in range(1, table.last + 1, INTERVAL):
         step = maps[number - 1] @ np.linalg.inv(maps[number - 1 - INTERVAL]) if number > 1 else None
-        yield from follower.take(TrackedFrame(number, None, table.at(number), Tracks(number), told(step, size)))
-    yield from follower.end()
+        yield from follower.update(TrackedFrame(number, None, table.at(number), Tracks(number), told(step, size)))
+    yield from follower.flush()
 
 
 def _measured(table: DetectionTable, source: Filmed) -> Iterator[TrackedFrame]:
-    return follow_clip(source, table, load_engine("onboard", _NO_LOOKS), _NO_LOOKS, INTERVAL)
+    return track_clip(source, table, load_engine("onboard", _NO_LOOKS), _NO_LOOKS, INTERVAL)
 
 
 def _detections(truth: TrackTable) -> DetectionTable:
@@ -131,7 +131,7 @@ def of_clips(folder: Path) -> list[str]:
 
 
 def _own(found: list[Scene], truth: TrackTable, told: Told, interval: int, size: tuple[int, int]) -> str:
-    tracks = _table(follow_scenes((_less(scene, told, size) for scene in found), load_config(), interval, size))
+    tracks = _table(track_scenes((_less(scene, told, size) for scene in found), load_config(), interval, size))
     # Elsewhere nothing is labelled, so that nothing there is wrong.
     both = pair(truth, tracks.at(np.isin(tracks.frame, truth.frame)))
     switches = tracking.count_clear(both, ONE_TARGET_LEAST).switches

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.tracking.kalman import carried_boxes
+from torchvision_dddas.tracking.kalman import transform_boxes
 from torchvision_dddas.types import Frame
 
 CAMERAS = {
@@ -49,7 +49,7 @@ def seen(truth: TrackTable, maps: np.ndarray) -> TrackTable:
     box_px = truth.box_px.copy()
     for number in np.unique(truth.frame):
         here = truth.frame == number
-        box_px[here] = carried_boxes(truth.box_px[here], maps[number - 1])
+        box_px[here] = transform_boxes(truth.box_px[here], maps[number - 1])
     return truth._replace(box_px=box_px)
 
 

@@ -26,8 +26,8 @@ from footage import sequences, truth_of
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
-from torchvision_dddas.tracking.lagrangian import triplets
-from torchvision_dddas.tracking.triplets import best_columns
+from torchvision_dddas.tracking.assignment import choose_triplets
+from torchvision_dddas.tracking.dual_ascent import assign_triplets
 
 INTERVAL = 5
 THRESHOLD = 0.4
@@ -190,7 +190,7 @@ def row(kind: str, targets: float, solver: str, times: list, **more: float) -> d
 def measure_sparse(kind: str, targets: float, windows: list[Window], beside: bool) -> list[dict]:
     ours, theirs, wrong = [], [], 0.0
     for window in windows:
-        *spent, chosen = timed(lambda window=window: best_columns(*window))
+        *spent, chosen = timed(lambda window=window: choose_triplets(*window)[0])
         ours.append(spent)
         if beside:
             *spent, best = timed(lambda window=window: alone(window))
@@ -204,7 +204,7 @@ def measure_sparse(kind: str, targets: float, windows: list[Window], beside: boo
 def measure_dense(kind: str, targets: float, windows: list[np.ndarray], gap: float) -> list[dict]:
     times, gaps, exact = [], [], 0
     for window in windows:
-        *spent, solved = timed(lambda window=window: triplets(window, gap=gap))
+        *spent, solved = timed(lambda window=window: assign_triplets(window, gap=gap))
         times.append(spent)
         gaps.append(100 * solved.gap)
         exact += solved.exact
@@ -255,7 +255,7 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path)
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
-    best_columns(*sparse_window(10, 0))
+    choose_triplets(*sparse_window(10, 0))
     rows = []
     for targets in options.sparse:
         windows = [sparse_window(targets, seed) for seed in range(options.windows)]

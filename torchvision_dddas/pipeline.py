@@ -11,8 +11,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import Engine, Retune, detect_motion
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, group_crowds
 from torchvision_dddas.geo.aerial_locator import tracked_targets
-from torchvision_dddas.tracking import sequence as following
-from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
+from torchvision_dddas.tracking import CrowdIdentities, track_scenes, without_picture
 from torchvision_dddas.types import Fix, FrameResult, Scene, Telemetry, TrackedFrame
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def survey(
 
     Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
     target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
-    retune: as in detect_motion. pictures: as `following.Follower` has it.
+    retune: as in detect_motion. pictures: as `tracking.FrameTracker` has it.
     """
     waiting: dict[int, WatchedScene] = {}
     crowds = CrowdIdentities() if settings.crowds.join_m else None
@@ -64,7 +63,7 @@ def survey(
                 seen(watched.scene)
             yield watched.scene
 
-    for followed in following.follow_scenes(scenes(), settings, interval, source.size, pictures):
+    for followed in track_scenes(scenes(), settings, interval, source.size, pictures):
         if watch is None:
             yield FrameResult(followed)
             continue
@@ -88,7 +87,7 @@ def _with_crowd_identities(
 
 
 def _unpictured(watched: WatchedScene) -> WatchedScene:
-    return replace(watched, scene=replace(watched.scene, frame=following.without_picture(watched.scene.frame)))
+    return replace(watched, scene=replace(watched.scene, frame=without_picture(watched.scene.frame)))
 
 
 def _located(followed: TrackedFrame, past: Sequence[WatchedScene], locator: AerialLocator) -> FrameResult:

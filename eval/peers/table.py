@@ -308,12 +308,12 @@ def our_seconds(sequence: Sequence) -> float:
         "import sys, time\n"
         "from torchvision_dddas.config import load_config\n"
         "from torchvision_dddas.io.detection_tables import read_detections\n"
-        "from torchvision_dddas.tracking.tracker import Tracker\n"
-        "table, tracker = read_detections(sys.argv[1]), Tracker(load_config(), 1)\n"
+        "from torchvision_dddas.tracking import Tracker\n"
+        "table, tracker = read_detections(sys.argv[1]), Tracker(load_config())\n"
         "given = [table.at(f) for f in range(1, int(sys.argv[2]) + 1)]\n"
         "begun = time.perf_counter()\n"
-        "for f, detections in enumerate(given, 1): tracker.feed(f, detections)\n"
-        "tracker.end()\n"
+        "for f, detections in enumerate(given, 1): tracker.update(detections)\n"
+        "tracker.flush()\n"
         "print(time.perf_counter() - begun)"
     )
     words = [sys.executable, "-c", program, str(sequence.detections), str(sequence.length)]

@@ -193,9 +193,9 @@ def test_positions_of_someone_else_are_neither_replaced_nor_removed(dddas, clip,
 
 
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
-    from torchvision_dddas.tracking import sequence as following
+    from torchvision_dddas.tracking import track_scenes
 
-    whole_of = following.follow_scenes
+    whole_of = track_scenes
 
     def stopped(*how):
         for count, followed in enumerate(whole_of(*how)):
@@ -203,7 +203,7 @@ def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             yield followed
 
-    monkeypatch.setattr(following, "follow_scenes", stopped)
+    monkeypatch.setattr("torchvision_dddas.pipeline.track_scenes", stopped)
     result = dddas(*given(flown), *FLAT, "--save", "none", "--out", tmp_path / "out")
     assert result.exit_code == 130
     record = json.loads((tmp_path / "out" / "run.json").read_text())

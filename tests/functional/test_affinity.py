@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.functional import affinity
-from torchvision_dddas.tracking import jaccard
+from torchvision_dddas.tracking import source_affinity
 
 Features = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -51,8 +51,10 @@ def test_the_torch_free_twin_agrees(size):
     pairs, triplets = affinity.pairs(a, b, *masks(a, b)), affinity.triplets(a, b, c, *masks(a, b, c))
     for w in range(2):
         first, second, third = (t[w].double().numpy() for t in (a, b, c))
-        np.testing.assert_allclose(jaccard.pairs(first, second)[1:, 1:], pairs[w], atol=2e-6)
-        np.testing.assert_allclose(jaccard.triplets(first, second, third)[1:, 1:, 1:], triplets[w], atol=2e-6)
+        np.testing.assert_allclose(source_affinity.pair_affinity(first, second)[1:, 1:], pairs[w], atol=2e-6)
+        np.testing.assert_allclose(
+            source_affinity.triplet_affinity(first, second, third)[1:, 1:, 1:], triplets[w], atol=2e-6
+        )
 
 
 def test_padding_changes_no_affinity_and_has_none():
@@ -70,14 +72,14 @@ def test_padding_changes_no_affinity_and_has_none():
 def test_two_empty_boxes_resemble_nothing():
     nothing = torch.zeros(1, 2, 768)
     assert not affinity.pairs(nothing, nothing, *masks(nothing, nothing)).any()
-    assert not jaccard.similarity(np.zeros((2, 768)), np.zeros((2, 768))).any()
+    assert not source_affinity.similarity(np.zeros((2, 768)), np.zeros((2, 768))).any()
 
 
 def test_frames_without_targets_give_empty_tensors():
     a, b, c = features()
     assert affinity.pairs(a[:, :0], b, *masks(a[:, :0], b)).shape == (2, 0, 3)
     assert affinity.triplets(a, b[:, :0], c, *masks(a, b[:, :0], c)).shape == (2, 4, 0, 5)
-    assert jaccard.triplets(np.zeros((0, 2)), np.ones((3, 2)), np.zeros((0, 2))).shape == (1, 4, 1)
+    assert source_affinity.triplet_affinity(np.zeros((0, 2)), np.ones((3, 2)), np.zeros((0, 2))).shape == (1, 4, 1)
 
 
 def test_gradients_are_those_of_finite_differences():
@@ -115,14 +117,16 @@ vectors = st.lists(st.lists(st.floats(0, 1e3), min_size=3, max_size=3), min_size
 @settings(max_examples=60, deadline=None)
 def test_similarity_is_symmetric_between_0_and_1_and_1_with_itself(first, second):
     a, b = np.array(first), np.array(second)
-    found = jaccard.similarity(a, b)
+    found = source_affinity.similarity(a, b)
     assert ((found >= 0) & (found <= 1)).all()
-    np.testing.assert_allclose(found, jaccard.similarity(b, a).T)
-    np.testing.assert_allclose(np.diag(jaccard.similarity(a, a)), (a.sum(axis=1) > 0).astype(float))
+    np.testing.assert_allclose(found, source_affinity.similarity(b, a).T)
+    np.testing.assert_allclose(np.diag(source_affinity.similarity(a, a)), (a.sum(axis=1) > 0).astype(float))
 
 
 @given(vectors, vectors, st.floats(1e-2, 1e2))
 @settings(max_examples=40, deadline=None)
 def test_similarity_does_not_depend_on_the_unit(first, second, unit):
     a, b = np.array(first) + 1, np.array(second) + 1
-    np.testing.assert_allclose(jaccard.similarity(a * unit, b * unit), jaccard.similarity(a, b), atol=1e-9)
+    np.testing.assert_allclose(
+        source_affinity.similarity(a * unit, b * unit), source_affinity.similarity(a, b), atol=1e-9
+    )

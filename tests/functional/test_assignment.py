@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchvision_dddas.functional.assignment import dispersion, log_partition, shares
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking.dispersion import clusters, normalized_entropy
+from torchvision_dddas.tracking.source_affinity import clusters, normalized_entropy
 
 
 def scores(*shape: int, spread: float = 3.0, seed: int = 0) -> Tensor:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.functional import color
-from torchvision_dddas.tracking.histograms import rgb_histograms
+from torchvision_dddas.tracking.appearance import rgb_histograms
 
 
 def every_colour(step: int = 5) -> np.ndarray:

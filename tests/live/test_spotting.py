@@ -53,7 +53,7 @@ def test_what_is_not_settled_is_not_told_before_the_end():
 
 
 def test_people_settle_with_the_frames_of_what_moves():
-    from torchvision_dddas.tracking.sequence import follow_scenes
+    from torchvision_dddas.tracking import track_scenes
 
     spotter = Spotter(Sure(), SETTINGS, 1, SIZE)
 
@@ -63,7 +63,7 @@ def test_people_settle_with_the_frames_of_what_moves():
             yield scene
 
     settled = []
-    for followed in follow_scenes(seen(), SETTINGS, 1, SIZE):
+    for followed in track_scenes(seen(), SETTINGS, 1, SIZE):
         people = spotter.of(followed.number, False)
         settled.append(people is not None)
     # Only the frames that the end itself settles wait for it.

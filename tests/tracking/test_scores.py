@@ -1,4 +1,4 @@
-"""Scores of links: what they fall with, and what they do not depend on."""
+"""Association scores, the speed prior, and how long tracks are remembered."""
 
 from dataclasses import replace
 
@@ -12,27 +12,29 @@ from numpy.typing import ArrayLike
 from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import SEEN, VX, VY
-from torchvision_dddas.tracking.scores import Sight, link_scores, near_border
+from torchvision_dddas.tracking.scores import SceneState, SpeedPrior, association_scores, is_near_border
 
 KNOBS = Settings().track
-SIGHT = Sight(frame=11, interval=5, speed=0.07, size=(1000.0, 800.0))
+SIGHT = SceneState(frame=11, interval=5, speed=0.07, size=(1000.0, 800.0))
 BOX = np.array([500.0, 300, 32, 80])
 HERE = np.zeros(1, bool)
 
 
 def track(box: np.ndarray = BOX, seen: int = 6, velocity: tuple[float, float] = (0, 0)) -> np.ndarray:
     """(1, COLUMNS) a target seen several times, last at a frame."""
-    state = kalman.started(box[None], 1, KNOBS.scatter, 0.07)
-    state = kalman.updated(kalman.predicted(state, 6, KNOBS.agility), box[None], 6, KNOBS.scatter)
+    state = kalman.start(box[None], 1, KNOBS.scatter, 0.07)
+    state = kalman.update(kalman.predict(state, 6, KNOBS.agility), box[None], 6, KNOBS.scatter)
     state[:, [VX, VY]] = velocity
     state[:, SEEN] = seen
     return state
 
 
-def scored(boxes: ArrayLike, state: np.ndarray | None = None, sight: Sight = SIGHT, left: bool = False) -> list[float]:
+def scored(
+    boxes: ArrayLike, state: np.ndarray | None = None, sight: SceneState = SIGHT, left: bool = False
+) -> list[float]:
     """The scores of one track's links."""
     state = track() if state is None else state
-    return link_scores(state, np.full(len(state), left), np.asarray(boxes), sight, KNOBS)[0].tolist()
+    return association_scores(state, np.full(len(state), left), np.asarray(boxes), sight, KNOBS)[0].tolist()
 
 
 def moved(*steps: tuple[float, float]) -> np.ndarray:
@@ -57,11 +59,6 @@ def test_a_score_falls_with_the_difference_in_size_either_way_but_not_for_ever()
         assert score[0] > score[1] > score[2] > score[3] == pytest.approx(score[4])
 
 
-def test_it_is_the_predicted_place_that_counts_not_the_last():
-    score = scored(moved((0, 0), (40, 0), (80, 0)), track(velocity=(8, 0)))
-    assert score[1] > max(score[0], score[2])
-
-
 def test_standing_people_move_less_up_and_down_than_across_and_lying_boxes_do_not_care():
     across, along = scored(moved((30, 0), (0, 30)))
     assert across > along
@@ -77,26 +74,20 @@ def test_the_scale_of_the_scene_and_its_place_do_not_matter(seed, scale, x, y, s
     similar = np.array([[scale, 0, x], [0, scale, y], [0, 0, 1]])
     boxes = BOX + random.normal(0, 30, (5, 4)) * [2, 2, 0.2, 0.5]
     state, sight = track(seen=seen, velocity=(6, -3)), replace(SIGHT, size=None)
-    expected = link_scores(state, HERE, boxes, sight, KNOBS)
-    there = link_scores(kalman.carried(state, similar), HERE, kalman.carried_boxes(boxes, similar), sight, KNOBS)
+    expected = association_scores(state, HERE, boxes, sight, KNOBS)
+    there = association_scores(
+        kalman.transform(state, similar), HERE, kalman.transform_boxes(boxes, similar), sight, KNOBS
+    )
     np.testing.assert_allclose(there, expected, rtol=1e-6, atol=1e-6)
-
-
-def test_each_pair_is_scored_by_itself():
-    random = np.random.default_rng(3)
-    state = np.concatenate([track(BOX + random.normal(0, 5, 4), seen, (1, 2)) for seen in (6, 1, 6, 3)])
-    boxes, left = BOX + random.normal(0, 8, (3, 4)), np.array([True, True, False, False])
-    together = link_scores(state, left, boxes, SIGHT, KNOBS)
-    for i in range(4):
-        for j in range(3):
-            alone = link_scores(state[i : i + 1], left[i : i + 1], boxes[j : j + 1], SIGHT, KNOBS)
-            assert together[i, j] == pytest.approx(alone[0, 0])
 
 
 @pytest.mark.parametrize(("tracks", "boxes"), [(0, 0), (0, 2), (2, 0)])
 def test_nobody_or_nothing_gives_an_empty_table(tracks, boxes):
     state = np.repeat(track(), tracks, axis=0)
-    assert link_scores(state, np.zeros(tracks, bool), np.tile(BOX, (boxes, 1)), SIGHT, KNOBS).shape == (tracks, boxes)
+    assert association_scores(state, np.zeros(tracks, bool), np.tile(BOX, (boxes, 1)), SIGHT, KNOBS).shape == (
+        tracks,
+        boxes,
+    )
 
 
 def test_the_longer_a_target_was_missed_the_less_its_return_is_worth():
@@ -128,40 +119,67 @@ def test_the_border_counts_only_for_those_that_were_missed():
 def test_births_count_only_for_those_that_were_missed_and_only_where_there_are_many():
     for seen, matters in ((6, False), (1, True)):
         score = [
-            scored([BOX], track(seen=seen), replace(SIGHT, births=births))[0] for births in (0.0, 1e-4, 0.005, 0.02)
+            scored([BOX], track(seen=seen), replace(SIGHT, birth_rate=births))[0] for births in (0.0, 1e-4, 0.005, 0.02)
         ]
         assert score[0] == score[1]
         assert (score[1] > score[2] > score[3]) == matters
         assert (score[1] == score[3]) != matters
 
 
-def test_a_missed_track_does_not_change_the_scores_of_others():
-    both = np.concatenate([track(), track(seen=1)])
-    sight = replace(SIGHT, births=0.5)
-    together = link_scores(both, np.array([True, True]), BOX[None], sight, KNOBS)
-    assert together[0, 0] == scored([BOX])[0]
-
-
-def test_doubtful_detections_may_differ_more_in_size():
-    taller = BOX * [1, 1, 1, 1.4]
-    certain, doubtful = (scored([taller, BOX], sight=replace(SIGHT, doubt=doubt)) for doubt in (0.0, 1.0))
-    assert doubtful[0] - doubtful[1] > certain[0] - certain[1]
-
-
-def test_who_is_fast_turns_fast():
-    slow, fast = (replace(SIGHT, speed=speed).agility(KNOBS) for speed in (0.07, 0.14))
-    assert fast == pytest.approx(2 * slow) == pytest.approx(2 * KNOBS.agility)
-    turned = moved((60, 0))
-    assert scored(turned, sight=replace(SIGHT, speed=0.3)) > scored(turned)
-
-
 def test_boxes_at_each_side_of_the_picture_are_near_its_border_and_none_is_without_a_picture():
     boxes = np.array([[0, 300, 20, 50], [300, 0, 20, 50], [980, 300, 20, 50], [300, 750, 20, 50], [300, 300, 20, 50]])
-    assert near_border(boxes.astype(float), (1000, 800)).tolist() == [True, True, True, True, False]
-    assert not near_border(boxes.astype(float), None).any()
+    assert is_near_border(boxes.astype(float), (1000, 800)).tolist() == [True, True, True, True, False]
+    assert not is_near_border(boxes.astype(float), None).any()
 
 
-def test_large_targets_are_near_the_border_from_further_away():
-    distance = 12.0
-    assert near_border(np.array([[distance, 300, 80, 200]]), (1000, 800))[0]
-    assert not near_border(np.array([[distance, 300, 8, 20]]), (1000, 800))[0]
+def walkers(frame: int, speed: float, count: int = 6) -> np.ndarray:
+    """(N, 4) boxes 40 px high, far apart, that walk to the right at so many heights a frame."""
+    x = 300.0 * np.arange(count) + 40 * speed * frame
+    return np.stack([x, np.full(count, 50.0), np.full(count, 16.0), np.full(count, 40.0)], axis=1)
+
+
+def learned(speed: float, interval: int = 5, looks: int = 40, start: float = 0.07) -> float:
+    pace = SpeedPrior(start)
+    for look in range(looks):
+        pace.add(walkers(interval * look, speed), walkers(interval * (look + 1), speed), interval)
+    return pace.speed
+
+
+def test_it_starts_as_told_and_learns_nothing_from_nothing():
+    pace = SpeedPrior(0.2)
+    for before, now in ((np.zeros((0, 4)), walkers(0, 0.1)), (walkers(0, 0.1), np.zeros((0, 4)))):
+        pace.add(before, now, 5)
+    pace.add(walkers(0, 0.1, 2), walkers(1, 0.1, 2), 1)
+    assert pace.speed == 0.2
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])
+def test_it_ends_near_the_true_speed(speed):
+    assert speed / 1.6 < learned(speed) < 1.6 * speed
+
+
+def test_faster_scenes_give_more_and_the_start_tells_less_and_less():
+    assert learned(0.03) < learned(0.1) < learned(0.3)
+    far = [abs(np.log(learned(0.1, looks=looks, start=1.0) / learned(0.1))) for looks in (1, 2, 10)]
+    assert far[0] > far[1] > far[2]
+
+
+@pytest.mark.parametrize("scale", [0.1, 25.0])
+def test_neither_does_the_scale_of_the_picture_nor_where_its_origin_is(scale):
+    pace, other = SpeedPrior(0.07), SpeedPrior(0.07)
+    before, now = walkers(0, 0.1), walkers(5, 0.1)
+    shift = np.array([1e4, -1e4, 0, 0])
+    pace.add(before, now, 5)
+    other.add(scale * before + shift, scale * now + shift, 5)
+    assert other.speed == pytest.approx(pace.speed)
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_targets_without_a_partner_are_no_steps(left):
+    """Those that left are nobody's nearest, those that came are nearest to none: their distances are no speeds."""
+    pace, other = SpeedPrior(0.07), SpeedPrior(0.07)
+    before, now = walkers(0, 0.1), walkers(5, 0.1)
+    strangers = walkers(0, 0.1) - np.array([5000, 0, 0, 0])
+    pace.add(before, now, 5)
+    other.add(np.concatenate([strangers, before]) if left else before, now if left else np.r_[now, strangers], 5)
+    assert other.speed == pytest.approx(pace.speed)

@@ -1,4 +1,4 @@
-"""The source's association on small scenes, its identities, and where it fails."""
+"""The source's three-frame tracker, what fails in it included."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.config import PaperParameters, Settings, load_config, with_parameters
+from torchvision_dddas.config import PaperParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio
-from torchvision_dddas.tracking import jaccard
-from torchvision_dddas.tracking.gating import gate
-from torchvision_dddas.tracking.source_tracker import Look, PaperTracker, assign, associate, inherited
+from torchvision_dddas.tracking.source_affinity import gate
+from torchvision_dddas.tracking.source_tracker import Features, SourceTracker, assign, associate, inherit_identities
 from torchvision_dddas.types import Detections
 
 SIZE = (20.0, 40.0)
@@ -42,7 +41,7 @@ def parameters(**values: object) -> PaperParameters:
 
 def tracked(frames: Sequence[Detections], appearance: Sequence | None = None, **values: object) -> list[list[int]]:
     """The identities of each frame's targets."""
-    tracker = PaperTracker(with_parameters(Settings(), {f"paper.{k}": v for k, v in values.items()}), 5)
+    tracker = SourceTracker(with_parameters(Settings(), {f"paper.{k}": v for k, v in values.items()}), 5)
     found = []
     for number, detections in enumerate(frames):
         (tracks,) = tracker.feed(1 + 5 * number, detections, None, appearance[number] if appearance else None)
@@ -57,11 +56,6 @@ def tracked(frames: Sequence[Detections], appearance: Sequence | None = None, **
 def test_targets_keep_their_identities_whatever_order_they_come_in(window):
     frames = [at((100, 100), (400, 300)), at((410, 300), (105, 100)), at((110, 100), (420, 300))]
     assert tracked(frames, window=window) == [[1, 2], [2, 1], [1, 2]]
-
-
-def test_a_newcomer_gets_a_new_identity_and_a_lost_one_is_never_given_again():
-    frames = [at((100, 100)), at((100, 100), (600, 500)), at((600, 500)), at((600, 500), (20, 20))]
-    assert tracked(frames, window=2) == [[1], [1, 2], [2], [2, 3]]
 
 
 @pytest.mark.parametrize(("window", "back"), [(2, 3), (3, 1)])
@@ -87,7 +81,7 @@ def test_histograms_are_not_made_while_targets_are_scattered_and_once_when_they_
 
 
 def test_without_pictures_location_alone_decides():
-    frames = [Look(at((400, 300), (404, 300)).box_px, None), Look(at((404, 300), (400, 300)).box_px, None)]
+    frames = [Features(at((400, 300), (404, 300)).box_px, None), Features(at((404, 300), (400, 300)).box_px, None)]
     for rule in ("dispersion", "fixed"):
         found = associate(frames, parameters(window=2, rule=rule, weight=0.0))
         assert (found.weight, found.appearance_dispersion) == (1.0, None)
@@ -95,24 +89,14 @@ def test_without_pictures_location_alone_decides():
 
 
 def test_appearance_tells_apart_who_changed_places():
-    frames = [Look(at((400, 300), (404, 300)).box_px, coloured(*c)) for c in ((10, 200), (200, 10))]
+    frames = [Features(at((400, 300), (404, 300)).box_px, coloured(*c)) for c in ((10, 200), (200, 10))]
     found = associate(frames, parameters(window=2))
     assert (found.weight, found.location_dispersion, found.appearance_dispersion) == (0.0, 0.0, 1.0)
     assert found.rows.tolist() == [[1, 2], [2, 1]]
 
 
-def test_counts_tell_a_large_box_from_a_small_one_and_shares_do_not():
-    small, large = coloured(10)(), 3 * coloured(10)()
-    close = at((400, 300), (404, 300)).box_px
-    looks = [Look(close, partial(np.concatenate, both)) for both in ((small, large), (large, small))]
-    by_count = associate(looks, parameters(window=2, rule="fixed", weight=0.0, histogram="count"))
-    assert by_count.rows.tolist() == [[1, 2], [2, 1]]
-    shares = [look.histogram("channel") for look in looks]
-    np.testing.assert_array_equal(jaccard.similarity(*shares), np.ones((2, 2)))
-
-
 def test_histograms_of_another_shape_are_refused_in_one_line():
-    look = Look(at((400, 300), (404, 300)).box_px, lambda: np.zeros((2, 240)))
+    look = Features(at((400, 300), (404, 300)).box_px, lambda: np.zeros((2, 240)))
     with pytest.raises(InputError, match=r"\(2, 768\).*got \(2, 240\)"):
         look.histogram("channel")
 
@@ -163,8 +147,8 @@ def test_empty_frames_one_target_for_ever_and_two_identical_boxes(frames, window
 
 def test_the_newest_link_names_a_target_before_a_bridge_does():
     """1 → 1 → 1 holds the identity that the bridge of 2 would take as well."""
-    assert inherited(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([5]), np.array([5])]).tolist() == [5, 0]
-    assert inherited(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([6]), np.array([5])]).tolist() == [6, 5]
+    assert inherit_identities(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([5]), np.array([5])]).tolist() == [5, 0]
+    assert inherit_identities(np.array([[1, 1, 0], [2, 0, 1]]), 2, [np.array([6]), np.array([5])]).tolist() == [6, 5]
 
 
 def test_larger_windows_are_solved_by_relaxation_to_the_same_end():
@@ -172,13 +156,6 @@ def test_larger_windows_are_solved_by_relaxation_to_the_same_end():
     centres = [tuple(c) for c in random.random((14, 2)) * (3000, 2000) + 50]
     frames = [at(*centres)] * 3
     assert tracked(frames, exact_targets=12) == tracked(frames, exact_targets=20) == [list(range(1, 15))] * 3
-
-
-def test_the_configuration_of_the_source_chooses_it():
-    assert load_config("paper").track.mode == "paper"
-
-
-# -- what fails in the source ----------------------------------------------------------------------------------------
 
 
 def test_the_weight_rule_loses_to_a_fixed_weight_where_looks_change():
@@ -196,7 +173,7 @@ def test_the_weight_rule_loses_to_a_fixed_weight_where_looks_change():
             counts[target, :, 10 * target + 1 + number] = 1.0
         return counts.reshape(4, 768)
 
-    window = [Look(at(*((u + 2 * n, v) for u, v in centres)).box_px, partial(looks, n)) for n in (1, 0)]
+    window = [Features(at(*((u + 2 * n, v) for u, v in centres)).box_px, partial(looks, n)) for n in (1, 0)]
     known = [np.arange(4)] * 2
     ruled = associate(window, parameters(window=2))
     fixed = associate(window, parameters(window=2, rule="fixed", weight=0.7))

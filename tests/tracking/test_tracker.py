@@ -1,559 +1,386 @@
-"""Identities in worlds that are known, and what the tracker promises to whoever feeds it."""
+"""Identities along a clip, a clip with a table, a table alone, and through the public class."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import cast
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings as given_settings
-from hypothesis import strategies as st
-
-from torchvision_dddas.config import Settings, TrackParameters, with_parameters
-from torchvision_dddas.tracking import tracker as tracks
-from torchvision_dddas.tracking.kalman import carried_boxes
-from torchvision_dddas.tracking.scores import Sight, link_scores
-from torchvision_dddas.tracking.tracker import Tracker
-from torchvision_dddas.types import Detections, Tracks
-
-SIZE = (1200.0, 800.0)
-HEIGHT = 80.0
-DOUBTFUL = (1 + Settings().track.birth_score) / 2  # may begin a track, but is not certain
-
-
-def boxes(*centres: Sequence[float]) -> np.ndarray:
-    """People 80 px high; a third number is the height of another one."""
-    centre = np.array([c[:2] for c in centres], float).reshape(-1, 2)
-    height = np.array([c[2] if len(c) > 2 else HEIGHT for c in centres])
-    size = np.stack([0.4 * height, height], axis=1)
-    return np.concatenate([centre - size / 2, size], axis=1)
-
-
-def seen(*centres: Sequence[float], score: float | Sequence[float] = 1.0) -> Detections:
-    return Detections(boxes(*centres), np.broadcast_to(np.asarray(score, float), len(centres)).copy())
-
-
-def tracker(interval: int = 5, size: tuple[float, float] | None = SIZE, **parameters: Any) -> Tracker:
-    return Tracker(
-        with_parameters(Settings(), {f"track.{name}": value for name, value in parameters.items()}), interval, size
-    )
-
-
-def tracked(
-    frames: Sequence[Detections],
-    interval: int = 5,
-    size: tuple[float, float] | None = SIZE,
-    steps: Sequence[np.ndarray | None] | None = None,
-    pictures: Sequence[Callable[[], np.ndarray]] | None = None,
-    **parameters: Any,
-) -> list[Tracks]:
-    """All frames' tracks, frames 1, 1 + interval, ..."""
-    run, found = tracker(interval, size, **parameters), []
-    for n, detections in enumerate(frames):
-        step, look = steps[n] if steps else None, pictures[n] if pictures else None
-        found += run.feed(1 + interval * n, detections, step, look)
-    return found + run.end()
-
-
-def names(found: Sequence[Tracks]) -> list[dict[int, int]]:
-    """{row: identity} of each frame, filled gaps left out."""
-    return [
-        {row: who for row, who in zip(page.row.tolist(), page.identity.tolist(), strict=True) if row >= 0}
-        for page in found
-    ]
-
-
-def switches(found: Sequence[Tracks], people: Sequence[Sequence[int]]) -> int:
-    """How often a person's identity is not the one before; -1 never counts. people: (frames, rows) who is who."""
-    last: dict[int, int] = {}
-    wrong = 0
-    for page, here in zip(names(found), people, strict=True):
-        for row, person in enumerate(here):
-            if (who := page.get(row)) is not None:
-                wrong += last.setdefault(person, who) != who
-                last[person] = who
-    return wrong
-
-
-def walks(count: int, looks: int, interval: int, seed: int, speed: float = 4.0) -> np.ndarray:
-    """(looks, count, 2) centres of people who walk straight on in all directions and cross each other's ways."""
-    random = np.random.default_rng(seed)
-    middle = random.uniform((300, 200), (900, 600), (count, 2))
-    angle = random.uniform(0, 2 * np.pi, count)
-    velocity = speed * random.uniform(0.4, 1, count)[:, None] * np.stack([np.cos(angle), 0.5 * np.sin(angle)], axis=1)
-    time = interval * (np.arange(looks) - looks / 2)
-    return middle + time[:, None, None] * velocity
-
-
-def shuffled(centres: np.ndarray, seed: int = 0) -> tuple[list[Detections], list[list[int]]]:
-    """The frames with their rows in disorder, and whose row each is."""
-    random = np.random.default_rng(seed)
-    order = [random.permutation(centres.shape[1]) for _ in centres]
-    return [seen(*c[o]) for c, o in zip(centres, order, strict=True)], [o.tolist() for o in order]
-
-
-@pytest.mark.parametrize("look_ahead", [True, False])
-@pytest.mark.parametrize("hits", [1, 3, 5])
-def test_each_frame_comes_out_once_in_order_no_later_than_promised(hits, look_ahead):
-    """Within `hits` + 2 looks, empty ones too."""
-    run, found = tracker(hits=hits, look_ahead=look_ahead), []
-    for n in range(30):
-        found += run.feed(1 + 5 * n, seen(*[(100 + 10 * n, 300)] * (n % 7 != 3)))
-        assert [page.frame for page in found] == [1 + 5 * k for k in range(len(found))]
-        assert n - len(found) < hits + 2
-    found += run.end()
-    assert [page.frame for page in found] == [1 + 5 * k for k in range(30)]
-    assert run.end() == []
-
-
-@given_settings(max_examples=8, deadline=None)
-@given(st.integers(0, 1000), st.integers(2, 14))
-def test_what_has_come_out_is_the_same_whatever_comes_later(seed, stop):
-    """So a run online and a batch run agree: nothing is taken back, and nothing depends on what is to come."""
-    frames, _ = shuffled(walks(5, 16, 5, seed), seed)
-    rest = [seen(*np.random.default_rng(seed).uniform(100, 700, (4, 2)), score=DOUBTFUL) for _ in range(16 - stop)]
-    one, other = tracker(), tracker()
-    for n, (first, second) in enumerate(zip(frames, frames[:stop] + rest, strict=True)):
-        out, again = one.feed(1 + 5 * n, first), other.feed(1 + 5 * n, second)
-        if n < stop:
-            assert_same(out, again)
-
-
-def assert_same(one: Sequence[Tracks], other: Sequence[Tracks]) -> None:
-    assert len(one) == len(other)
-    for page, again in zip(one, other, strict=True):
-        assert page.frame == again.frame
-        for name in ("identity", "box_px", "score", "row"):
-            np.testing.assert_array_equal(getattr(page, name), getattr(again, name))
-
-
-def test_runs_side_by_side_know_nothing_of_each_other():
-    first, second = shuffled(walks(4, 12, 5, 1))[0], shuffled(walks(6, 12, 5, 2))[0]
-    one, other, found = tracker(), tracker(), []
-    for n in range(12):
-        found += one.feed(1 + 5 * n, first[n])
-        other.feed(1 + 5 * n, second[n])
-    assert_same(found + one.end(), tracked(first))
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("interval", [5, 8])
-def test_people_whose_ways_cross_keep_their_identities_at_a_low_frame_rate(seed, interval):
-    frames, people = shuffled(walks(6, 24, interval, seed, speed=3.0), seed)
-    found = tracked(frames, interval, None)
-    assert switches(found, people) == 0
-    assert {who for page in found for who in page.identity.tolist()} == set(range(1, 7))
-    assert all(len(page) == 6 for page in found)
-
-
-@pytest.mark.parametrize("score", [1.0, DOUBTFUL])
-def test_the_order_of_the_rows_only_renames_the_tracks(score):
-    centres = walks(7, 20, 5, 3)
-    plain = names(tracked([seen(*c, score=score) for c in centres]))
-    frames, order = shuffled(centres, 8)
-    again = names(tracked([Detections(f.box_px, np.full(len(f), score)) for f in frames]))
-    new_name: dict[int, int] = {}
-    for page, other, here in zip(plain, again, order, strict=True):
-        assert len(page) == len(other)
-        for row, who in other.items():
-            assert new_name.setdefault(page[here[row]], who) == who
-    assert len(set(new_name.values())) == len(new_name)
-
-
-@pytest.mark.parametrize("look_ahead", [True, False])
-def test_a_third_look_tells_two_people_apart_whom_two_looks_confuse(look_ahead):
-    """They walk past each other, so far between the first two looks that each is then next to where the other was."""
-    frames = [seen((80 * n, 300), (120 - 80 * n, 308)) for n in range(4)]
-    kept = all(page == {0: 1, 1: 2} for page in names(tracked(frames, size=None, look_ahead=look_ahead)))
-    assert kept == look_ahead
-
-
-def test_identities_begin_at_one_leave_none_out_and_are_per_run():
-    for _ in range(2):
-        frames = [seen((200, 300))] * 4 + [seen((200, 300), (600, 500, 90), (900, 300))] * 4
-        found = tracked([seen((900, 700), score=DOUBTFUL), *frames])
-        assert [sorted(page.identity.tolist()) for page in found] == [[], *[[1]] * 4, *[[1, 2, 3]] * 4]
-
-
-def test_only_a_good_detection_begins_a_track_but_a_fair_one_may_go_on_with_it():
-    parameters = with_parameters(Settings(), {}).track
-    fair = (parameters.min_score + parameters.birth_score) / 2
-    assert not any(names(tracked([seen((300, 300), score=fair)] * 9)))
-    good_then_fair = [seen((300, 300), score=parameters.birth_score)] + [seen((300, 300), score=fair)] * 8
-    assert names(tracked(good_then_fair)) == [{0: 1}] * 9
-
-
-def test_a_poor_detection_is_never_used():
-    """It neither goes on with a track nor moves its row numbers, and does not stand in the way of a good one."""
-    poor = Settings().track.min_score - 0.01
-    frames = [seen((300, 300), (700, 300), score=[poor, 1.0])] * 6
-    assert names(tracked(frames)) == [{1: 1}] * 6
-    gone = [seen((300, 300))] * 3 + [seen((300, 300), score=poor)] * 6
-    assert names(tracked(gone)) == [{0: 1}] * 3 + [{}] * 6
-
-
-@pytest.mark.parametrize(("score", "looks", "shown"), [(DOUBTFUL, 2, 0), (DOUBTFUL, 3, 3), (1.0, 1, 1)])
-def test_three_detections_confirm_a_track_and_a_certain_one_alone(score, looks, shown):
-    frames = [seen()] * 2 + [seen((300, 300), score=score)] * looks + [seen()] * 5
-    assert sum(map(len, names(tracked(frames)))) == shown
-
-
-def test_detections_far_apart_in_time_confirm_nothing():
-    """Three false alarms at one place, each after a longer gap than is bridged for who is not confirmed."""
-    frames = ([seen((300, 300), score=DOUBTFUL)] + [seen()] * 4) * 3
-    assert not any(names(tracked(frames)))
-
-
-@pytest.mark.parametrize("gap", [1, 2, 3, 4])
-def test_short_gaps_are_filled_longer_ones_are_not_and_both_are_bridged(gap):
-    def here(n: int) -> tuple[float, float]:
-        return 200 + 15.0 * n, 300
-
-    frames = [seen(here(n)) if not 8 <= n < 8 + gap else seen() for n in range(20)]
-    for n, page in enumerate(tracked(frames)):
-        missed = 8 <= n < 8 + gap
-        assert page.identity.tolist() == ([] if missed and gap > 2 else [1])
-        assert page.row.tolist() == ([] if missed and gap > 2 else [-1] if missed else [0])
-        if len(page):
-            np.testing.assert_allclose(page.box_px, boxes(here(n)), atol=1e-9)
-
-
-def test_who_stands_still_behind_something_comes_back_as_the_same():
-    """Others walk past it meanwhile, and it had been walking."""
-    frames, people = [], []
-    for n in range(30):
-        stands = 150 + 12.0 * min(n, 8), 300
-        others = [(100 + 25.0 * n, 330), (1000 - 25.0 * n, 360)]
-        hidden = 9 <= n < 17
-        frames.append(seen(*others) if hidden else seen(*others, stands))
-        people.append([0, 1] if hidden else [0, 1, 2])
-    found = tracked(frames)
-    assert switches(found, people) == 0
-    assert names(found)[-1] == names(found)[0] == {0: 1, 1: 2, 2: 3}
-
-
-def test_who_is_gone_too_long_is_forgotten():
-    for gap, same in ((10, True), (30, False)):
-        frames = [seen((300, 300))] * 6 + [seen()] * gap + [seen((300, 300))] * 3
-        assert (names(tracked(frames, memory_frames=100))[-1] == {0: 1}) == same
-
-
-def test_who_walked_out_of_the_picture_is_forgotten_sooner():
-    """What appears at the border afterwards is somebody else; without a picture's size nobody can tell."""
-    frames = [seen((1060 + 25.0 * n, 300)) for n in range(6)] + [seen()] * 4 + [seen((1150, 300))] * 3
-    assert names(tracked(frames))[-1] == {0: 2}
-
-
-def test_who_left_the_picture_is_remembered_for_less_long_than_who_was_lost_inside():
-    """One walks out at the side; one walks there too, but is lost so early that it may as well have turned."""
-    for start, size, remembered in ((1060, SIZE, 0), (700, SIZE, 1), (1060, None, 1)):
-        run = tracker(size=size)
-        for n in range(26):
-            run.feed(1 + 5 * n, seen((start + 25.0 * n, 300)) if n < 6 else seen())
-        assert len(run.roster) == remembered
-
-
-def test_who_was_never_confirmed_is_soon_dropped():
-    run = tracker()
-    for n in range(24):
-        alarm = [(80 + 45 * n, 100)] * (n % 3 == 0)
-        run.feed(1 + 5 * n, seen((600, 600), *alarm, score=[1.0, DOUBTFUL][: 1 + len(alarm)]))
-        assert len(run.roster) <= 3
-        assert len(run.ledger.counts) <= 3
-
-
-def test_one_target_for_ever_keeps_its_identity_and_the_tracker_its_size():
-    run, found = tracker(), []
-    for n in range(600):
-        found += run.feed(1 + 5 * n, seen((600 + 200 * np.sin(n / 20), 400)))
-        assert len(run.roster) <= 1
-    found += run.end()
-    assert all(page.identity.tolist() == [1] for page in found)
-
-
-def test_two_identical_boxes_are_two_targets():
-    frames = [seen((300 + 8 * n, 300), (300 + 8 * n, 300)) for n in range(8)]
-    for page in tracked(frames):
-        assert sorted(page.identity.tolist()) == [1, 2]
-        assert sorted(page.row.tolist()) == [0, 1]
-
-
-def test_no_targets_at_all_and_no_frames_at_all():
-    assert [len(page) for page in tracked([seen()] * 5)] == [0] * 5
-    assert tracked([]) == []
-
-
-@pytest.mark.parametrize("empty", [1, 2])
-def test_empty_frames_between_do_no_harm(empty):
-    frames = [seen((200 + 10 * n, 300)) if n % (empty + 1) == 0 else seen() for n in range(24)]
-    found = tracked(frames)
-    assert {who for page in found for who in page.identity.tolist()} == {1}
-    assert all(len(page) == 1 for page in found[: -empty or None])
-
-
-def filmed(looks: int, seed: int, roughness: float) -> tuple[list[np.ndarray | None], list[np.ndarray]]:
-    """Steps of a camera that pans, turns a little and zooms, and where the first picture is in each."""
-    random = np.random.default_rng(seed)
-    steps: list[np.ndarray | None] = [None]
-    now_from_first = [np.eye(3)]
-    for _ in range(looks - 1):
-        zoom, turn = np.exp(random.normal(0, 0.08 * roughness)), random.normal(0, 0.03 * roughness)
-        cos, sin = zoom * np.cos(turn), zoom * np.sin(turn)
-        pan = random.normal(0, 90 * roughness, 2)
-        step = np.array([[cos, -sin, pan[0]], [sin, cos, pan[1]], [0, 0, 1]])
-        step = (
-            np.array([[1, 0, 600], [0, 1, 400], [0, 0, 1]]) @ step @ np.array([[1, 0, -600], [0, 1, -400], [0, 0, 1]])
+
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection import load_engine
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.tracking import Tracker, track_clip, track_scenes, track_table
+from torchvision_dddas.tracking.score_tracker import ScoreTracker
+from torchvision_dddas.tracking.source_tracker import SourceTracker
+from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene, Source
+
+SETTINGS = load_config()
+SIZE = (320, 240)
+"""Of the clip that is made here; a walker in it is 12 by 40."""
+
+
+def walkers(frames, lanes=(60, 140), speed=2.0):
+    """(frame, box) rows: one walker a lane, who walks to the right; in odd frames the other way round."""
+    rows = []
+    for frame in frames:
+        boxes = [(20 + speed * (frame - 1), y, 12.0, 40.0) for y in lanes]
+        rows += [(frame, box) for box in boxes[:: -1 if frame % 2 else 1]]
+    return rows
+
+
+def table_of(rows, score=1.0):
+    frames = np.array([frame for frame, _ in rows], int)
+    boxes = np.array([box for _, box in rows], float).reshape(-1, 4)
+    return DetectionTable("det.txt", frames, boxes, np.full(len(rows), score), np.arange(len(rows)) + 1)
+
+
+class Clip:
+    """Pictures of walkers before a textured wall; counts what it has given. lost: frames that cannot be read."""
+
+    def __init__(self, count=40, lost=(), shake=0.0):
+        self.name, self.count, self.exact, self.rate_hz, self.size = "wall", count, True, 10.0, SIZE
+        self.last, self.problems, self.lost, self.given, self.shake = 0, [], lost, 0, shake
+        wall = np.random.default_rng(0).integers(0, 255, (35, 50, 3), np.uint8)
+        self.wall = cv2.resize(wall, (500, 350), interpolation=cv2.INTER_CUBIC)
+
+    def __iter__(self):
+        return self.every(1)
+
+    def every(self, interval):
+        for number in range(1, self.count + 1):
+            self.last = number
+            if (number - 1) % interval or number in self.lost:
+                continue
+            left = round(40 + self.shake * number)
+            image = self.wall[50:290, left : left + 320].copy()
+            for _, (x, y, w, h) in walkers([number]):
+                image[int(y) : int(y + h), int(x) : int(x + w)] = (40, 40, 200) if y == 60 else (200, 60, 40)
+            self.given += 1
+            yield Frame(number, number / 10, image)
+
+
+def all_of(followed):
+    """What a run came to: frame -> {box: identity}."""
+    return {
+        f.number: dict(zip(map(tuple, f.tracks.box_px.tolist()), f.tracks.identity.tolist(), strict=True))
+        for f in followed
+    }
+
+
+def identities(followed, lane):
+    return {i for found in all_of(followed).values() for box, i in found.items() if box[1] == lane}
+
+
+def test_a_table_alone_gives_each_walker_one_identity_and_keeps_every_row():
+    rows = walkers(range(1, 31))
+    followed = list(track_table(table_of(rows), SETTINGS, 1))
+    assert [f.number for f in followed] == list(range(1, 31))
+    assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
+    assert identities(followed, 60) != identities(followed, 140)
+    assert [(f.number, tuple(box)) for f in followed for box in f.detections.box_px] == rows
+    assert [line for f in followed for line in f.lines] == list(range(1, 61))
+
+
+@pytest.mark.parametrize("interval", [1, 3, 7])
+def test_only_the_frames_of_the_interval_are_looked_at(interval):
+    wanted = list(range(1, 41, interval))
+    table = table_of(walkers(range(1, 41)))
+    clip = Clip()
+    for followed in (
+        list(track_table(table, SETTINGS, interval)),
+        list(track_clip(clip, table, load_engine("onboard", SETTINGS), SETTINGS, interval)),
+    ):
+        assert [f.number for f in followed if len(f.detections)] == wanted
+        assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
+    assert clip.given == len(wanted)
+
+
+def test_a_clip_goes_on_before_and_after_its_table():
+    table = table_of(walkers(range(10, 20)))
+    followed = list(track_clip(Clip(30), table, load_engine("onboard", SETTINGS), SETTINGS, 1))
+    assert [f.number for f in followed] == list(range(1, 31))
+    assert all(f.frame is not None and f.frame.number == f.number for f in followed)
+    assert sum(len(f.detections) for f in followed) == len(table)
+
+
+@pytest.mark.parametrize("lost", [(1,), (2, 3), (7, 8, 9), (29, 30), tuple(range(1, 31))])
+@pytest.mark.parametrize("interval", [1, 4])
+def test_rows_on_frames_that_cannot_be_read_or_lie_after_the_end_are_tracked_all_the_same(lost, interval):
+    table = table_of(walkers(range(1, 36)))
+    clip = Clip(30, lost)
+    followed = list(track_clip(clip, table, load_engine("onboard", SETTINGS), SETTINGS, interval))
+    assert [f.number for f in followed] == list(range(1, 36, interval))
+    blind = [f.number for f in followed if f.frame is None]
+    assert blind == [n for n in range(1, 36, interval) if n in lost or n > 30]
+    assert all((f.cause == "the frame could not be read") == (f.frame is None) for f in followed)
+    assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
+
+
+def test_what_is_settled_while_a_clip_runs_is_what_the_whole_run_gives():
+    table = table_of(walkers(range(1, 41), lanes=(60, 64, 140)))
+    engine = load_engine("onboard", SETTINGS)
+    whole = all_of(track_clip(Clip(40), table, engine, SETTINGS, 1))
+    for end in (3, 11, 25):
+        clip = Clip(40)
+        early: dict[int, dict] = {}
+        for followed in track_clip(clip, table, engine, SETTINGS, 1):
+            if clip.given > end:
+                break
+            early |= all_of([followed])
+        assert len(early) >= end - 8  # a handful of frames wait for the next ones
+        assert early == {number: whole[number] for number in early}
+
+
+def test_scores_that_are_no_probabilities_are_certain_to_the_tracker_and_written_as_given():
+    followed = list(track_table(table_of(walkers(range(1, 21)), score=-0.8), SETTINGS, 1))
+    assert all(f.tracks.score.tolist() == [-0.8, -0.8] for f in followed)
+    assert all(f.untracked == [] for f in followed)
+
+
+ODD = {
+    "zero targets in every frame": [],
+    "zero targets in a frame": walkers([1, 2, 3, 5, 6, 7]),
+    "one target in one frame": walkers([3], lanes=(60,)),
+    "one target for ever": walkers(range(1, 400), lanes=(60,), speed=0.0),
+    "two identical boxes": [(n, (20.0 + n, 60.0, 12.0, 40.0)) for n in range(1, 21) for _ in "ab"],
+    "boxes outside the picture": [(n, (900.0 + n, -500.0, 12.0, 40.0)) for n in range(1, 21)],
+    "huge and tiny boxes": [(n, box) for n in range(1, 21) for box in ((-1e6, -1e6, 2e6, 2e6), (5, 5, 1e-3, 1e-3))],
+    "far away": [(n, (1e9, 1e9, 12.0, 40.0)) for n in range(1, 21)],
+    "far apart in time": walkers([1, 2, 3, 600, 601, 602], speed=0.01),
+}
+
+
+def scenes_of(count, step=None, adjustments=None, bad=()):
+    for number in range(1, count + 1):
+        boxes = np.array([box for _, box in walkers([number])])
+        n = len(boxes)
+        found = Detections(boxes, np.full(n, 0.55), np.full(n, 480.0), np.full(n, np.nan), np.full(n, np.nan))
+        frame = Frame(number, number / 10, np.full((240, 320, 3), 90, np.uint8))
+        registration = step and Registration(step, 100, 90, 0.1, 3.0, number not in bad)
+        yield Scene(
+            *(frame, np.zeros((240, 320), np.uint16), found, 3),
+            adjustments=adjustments or (),
+            seconds={"foreground": 0.5},
+            step=None if number == 1 else registration,
         )
-        steps.append(step)
-        now_from_first.append(step @ now_from_first[-1])
-    return steps, now_from_first
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_moving_camera_known_by_its_homographies_gives_the_identities_of_one_that_stands(seed):
-    """And without them the same boxes are confused, so the test is hard enough to show what the registration is for."""
-    centres = walks(6, 20, 5, seed, speed=3.0)
-    frames, people = shuffled(centres, seed)
-    steps, now_from_first = filmed(20, seed, roughness=1.0)
-    moved = [Detections(carried_boxes(f.box_px, h), f.score) for f, h in zip(frames, now_from_first, strict=True)]
-    standing = tracked(frames, size=None)
-    assert switches(standing, people) == 0
-    assert names(tracked(moved, size=None, steps=steps)) == names(standing)
-    assert switches(tracked(moved, size=None), people) > 5
+def test_own_boxes_that_lose_their_legs_or_grow_a_shadow_keep_their_identity():
+    """What is seen to move of a walker: now all, now the trunk or the legs alone, now the shadow as well."""
+    random, shown = np.random.default_rng(0), [(0, 0, 1, 1), (0, 0, 1, 0.65), (0, 0.35, 1, 0.65), (0, 0, 2, 1)]
+    scenes = []
+    for scene in scenes_of(60):
+        parts = np.array([shown[k] for k in random.integers(0, 4, 2)])
+        whole = scene.detections.box_px
+        boxes = np.concatenate([whole[:, :2] + parts[:, :2] * whole[:, 2:], parts[:, 2:] * whole[:, 2:]], axis=1)
+        scenes.append(replace(scene, detections=replace(scene.detections, box_px=boxes)))
+    tracks = [f.tracks for f in track_scenes(scenes, SETTINGS, 1, SIZE)]
+    assert all(sorted(t.identity.tolist()) == [1, 2] for t in tracks)
+    assert len({bool(t.box_px[t.identity == 1, 1] < 120) for t in tracks}) == 1
 
 
-def test_the_third_look_is_compared_from_where_the_camera_was():
-    """What only three looks tell apart, with a camera that pans and zooms between them."""
-    frames = [seen((80 * n, 300), (120 - 80 * n, 308)) for n in range(4)]
-    for seed in range(5):
-        steps, now_from_first = filmed(4, seed, roughness=1.0)
-        moved = [Detections(carried_boxes(f.box_px, h), f.score) for f, h in zip(frames, now_from_first, strict=True)]
-        assert names(tracked(moved, size=None, steps=steps)) == [{0: 1, 1: 2}] * 4
+def test_own_detections_count_as_certain_whatever_their_contrast():
+    followed = list(track_scenes(scenes_of(20), SETTINGS, 1, SIZE))
+    assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
+    assert followed[0].tracks.score.tolist() == [0.55, 0.55]
 
 
-def test_a_camera_that_moves_does_not_pass_for_people_that_run():
-    frames, _ = shuffled(walks(6, 20, 5, 1, speed=3.0))
-    steps, now_from_first = filmed(20, 1, roughness=1.0)
-    standing, moving = tracker(size=None), tracker(size=None)
-    for n, (frame, step, h) in enumerate(zip(frames, steps, now_from_first, strict=True)):
-        standing.feed(1 + 5 * n, frame)
-        moving.feed(1 + 5 * n, Detections(carried_boxes(frame.box_px, h), frame.score), step)
-    assert standing.pace.speed != standing.pace.start
-    assert moving.pace.speed == pytest.approx(standing.pace.speed, rel=1e-6)
+def test_steps_times_and_adjustments_between_the_frames_looked_at_are_kept():
+    class Step(np.ndarray):
+        __bool__ = lambda self: True  # noqa: E731
+
+    step = np.array([[1, 0, -2.0], [0, 1, 0.5], [0, 0, 1]]).view(Step)
+    moved = Adjustment(1, "interval.frames", 3, 4, "flow")
+    followed = list(track_scenes(scenes_of(13, step, (moved,), bad=(6,)), SETTINGS, 4, SIZE))
+    assert [f.number for f in followed] == [1, 5, 9, 13]
+    moves = [None if f.now_from_before is None else f.now_from_before[:2, 2].tolist() for f in followed]
+    assert moves == [None, [-8, 2], [-6, 1.5], [-8, 2]]  # the step that is not known counts as none
+    assert [len(f.adjustments) for f in followed] == [1, 4, 4, 4]
+    assert [f.seconds["foreground"] for f in followed] == [0.5, 2, 2, 2]
 
 
-@pytest.mark.parametrize("factor", [1.25, 0.8])
-def test_a_zoom_alone_is_taken_out_scale_included(factor):
-    """Five looks of zooming make people three times as large, or as small; they also walk and are missed once."""
-    centres = walks(5, 12, 5, 2, speed=3.0)
-    frames = [seen(*c) for c in centres]
-    frames[5] = seen(*centres[5][:3])
-    step = np.array([[1, 0, 600], [0, 1, 400], [0, 0, 1]]) @ np.diag([factor, factor, 1])
-    step = step @ np.array([[1, 0, -600], [0, 1, -400], [0, 0, 1]])
-    zooming = [3 <= n < 8 for n in range(12)]
-    now, moved, steps = np.eye(3), [], []
-    for frame, zooms in zip(frames, zooming, strict=True):
-        now = step @ now if zooms else now
-        steps.append(step if zooms else None)
-        moved.append(Detections(carried_boxes(frame.box_px, now), frame.score))
-    expected = [dict.fromkeys(range(3)) if n == 5 else dict.fromkeys(range(5)) for n in range(12)]
-    with_steps = names(tracked(moved, size=None, steps=steps))
-    assert with_steps == [{row: row + 1 for row in page} for page in expected]
-    assert names(tracked(moved, size=None)) != with_steps
+def test_doubtful_boxes_come_out_smoothed_and_certain_ones_to_the_digit():
+    random = np.random.default_rng(0)
+    rows = [(n, (100 + 5 * n + random.normal(0, 3), 200 + random.normal(0, 3), 40, 100)) for n in range(1, 31)]
+    for score, moved in ((0.97, True), (1.0, False)):
+        followed = list(track_table(table_of(rows, score), SETTINGS, 1))
+        apart = np.concatenate([f.tracks.box_px - f.detections.box_px[f.tracks.row] for f in followed if len(f.tracks)])
+        assert len(apart) == 30
+        assert (np.abs(apart).max() > 0.5) == moved
+        assert np.concatenate([f.tracks.score for f in followed]).tolist() == [score] * 30
 
 
-def test_certain_boxes_come_out_exactly_as_given_also_between_doubtful_ones():
-    random, centres = np.random.default_rng(0), walks(3, 20, 5, 1)
-    frames = [
-        seen(*(c + random.normal(0, 4, c.shape)), score=[1.0, DOUBTFUL, DOUBTFUL if n % 2 else 1.0])
-        for n, c in enumerate(centres)
-    ]
-    found = tracked(frames, size=None)
-    assert all(len(page) == 3 for page in found)
-    for page, frame in zip(found, frames, strict=True):
-        given_ = frame.box_px[page.row]
-        np.testing.assert_array_equal(page.score, frame.score[page.row])
-        certain = page.score == 1
-        assert certain.any()
-        np.testing.assert_array_equal(page.box_px[certain], given_[certain])
-    assert any((page.box_px != frame.box_px[page.row]).any() for page, frame in zip(found, frames, strict=True))
+def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
+    followed = [list(track_scenes(scenes_of(12), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)]
+    for with_picture, without in zip(*followed, strict=True):
+        assert with_picture.frame.image.any()
+        assert without.frame.image.shape == with_picture.frame.image.shape
+        assert without.frame.image.strides == (0, 0, 0) and without.frame.number == with_picture.frame.number
+        np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
+        np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
+    assert any(len(f.tracks) for f in followed[1])
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_doubtful_boxes_come_out_nearer_to_the_truth(moving):
-    random, centres = np.random.default_rng(6), walks(5, 40, 1, 4)
-    steps, now_from_first = filmed(40, 3, 0.2) if moving else ([None] * 40, [np.eye(3)] * 40)
-    truth = [carried_boxes(boxes(*c), h) for c, h in zip(centres, now_from_first, strict=True)]
-    noisy = [Detections(t + random.normal(0, 0.04 * t[:, 3:], t.shape), np.full(len(t), DOUBTFUL)) for t in truth]
-    for smooth, better in ((True, True), (False, False)):
-        found = tracked(noisy, 1, None, steps=steps, smooth=smooth)
-        assert sum(map(len, found)) > 190
-        out = np.concatenate([np.abs(p.box_px - t[p.row]) for p, t in zip(found, truth, strict=True)]).mean()
-        given_ = np.concatenate([np.abs(n.box_px - t) for n, t in zip(noisy, truth, strict=True)]).mean()
-        assert (out < 0.8 * given_) == better
+SETTINGS = load_config()
+SIZE = (320, 240)
 
 
-def coloured(*bins: int) -> Callable[[], np.ndarray]:
-    """Each target in a colour of its own; -1 is unknown."""
-    return lambda: np.array([np.eye(12, dtype=np.float32)[b] if b >= 0 else np.zeros(12, np.float32) for b in bins])
+def crowd_table(frames, seed=0, score=1.0, people=4):
+    """People who walk about, each seen in nine of ten of these frames, and now and then a false alarm."""
+    random = np.random.default_rng(seed)
+    start, velocity = random.uniform(40, 200, (people, 2)), random.normal(0, 1, (people, 2))
+    rows = []
+    for k, frame in enumerate(frames):
+        seen = np.flatnonzero(random.random(people) < 0.9)
+        rows += [(frame, *(start[at] + velocity[at] * k + random.normal(0, 0.5, 2)), 12, 40) for at in seen]
+        if random.random() < 0.1:
+            rows.append((frame, *random.uniform(0, 300, 2), 12, 40))
+    table = np.array(rows)
+    n = len(table)
+    return DetectionTable("det.txt", table[:, 0].astype(int), table[:, 1:], np.full(n, score), np.arange(n) + 1)
 
 
-def never() -> np.ndarray:
-    raise AssertionError("pictures of targets were compared")
-
-
-def test_pictures_are_not_compared_where_told_so_or_where_there_is_nobody():
-    frames = [seen((300, 300), (340, 300))] * 4
-    assert names(tracked(frames, pictures=[never] * 4, appearance="never")) == [{0: 1, 1: 2}] * 4
-    with pytest.raises(AssertionError):
-        tracked(frames, pictures=[never] * 4)
-    always = tracker()
-    for n in range(4):
-        always.feed(1 + 5 * n, seen(), None, never)
-        always.feed(3 + 5 * n, seen((300, 300), score=0.1), None, never)
-
-
-@pytest.mark.parametrize("look_ahead", [True, False])
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_colours_tell_apart_whom_places_confuse(order, look_ahead):
-    """Two people meet: each is as near to where the one was as to where the other was."""
-    frames = [seen((300, 300), (340, 300))] * 4 + [seen((320, 292), (320, 308))] * 4
-    colours = [coloured(3, 7)] * 4 + [coloured(*(np.array([3, 7])[[*order]]))] * 4
-    found = names(tracked(frames, pictures=colours, look_ahead=look_ahead))
-    assert found == [{0: 1, 1: 2}] * 4 + [{0: 1 + order[0], 1: 1 + order[1]}] * 4
+def found(tracks):
+    """Frame -> (identity, box, row) of those that have any."""
+    return {
+        t.frame: list(zip(t.identity.tolist(), map(tuple, t.box_px.tolist()), t.row.tolist(), strict=True))
+        for t in tracks
+        if len(t)
+    }
 
 
 @pytest.mark.parametrize(
-    ("order", "appearance"),
-    [((0, 1), "always"), ((1, 0), "always"), ((0, 1), "ambiguous"), ((1, 0), "ambiguous")],
+    ("interval", "mode", "score", "memory", "hits"),
+    [(1, "default", 1.0, 1, 1), (4, "default", 0.97, 9, 3), (1, "default", 0.97, 20, 6), (4, "paper", 1.0, 9, 3)],
 )
-def test_colours_that_are_seen_only_in_the_next_look_decide_too(order, appearance):
-    """Where they meet neither can be told; then they part, and each went on from the nearer place."""
-    frames = [seen((300, 300), (340, 300))] * 4 + [seen((320, 290), (320, 310))] + [seen((320, 275), (320, 325))] * 4
-    colours = [coloured(3, 7)] * 4 + [coloured(-1, -1)] + [coloured(*(np.array([3, 7])[[*order]]))] * 4
-    found = names(tracked(frames, pictures=colours, appearance=appearance))
-    assert found[4:] == [{0: 1 + order[0], 1: 1 + order[1]}] * 5
+def test_a_long_stretch_without_rows_is_left_out_and_changes_no_track(interval, mode, score, memory, hits):
+    parameters = {"memory_frames": memory, "hits": hits, "mode": mode, "look_ahead": "true" if hits > 1 else "false"}
+    settings = load_config(overrides=[f"track.{name}={value}" for name, value in parameters.items()])
+    table = crowd_table(
+        [*range(1, 60), *range(200, 260), *range(262, 280), *range(400, 440), *range(450, 460)], score=score
+    )
+    tracker = (SourceTracker if mode == "paper" else ScoreTracker)(settings, interval, table.extent)
+    numbers = range(1, table.last + 1, interval)
+    whole = [t for n in numbers for t in tracker.feed(n, table.at(n))] + tracker.end()
+    followed = list(track_table(table, settings, interval))
+    assert found(f.tracks for f in followed) == found(whole)
+    fed = [f.number for f in followed]
+    rows = sorted({n for n in table.frame.tolist() if (n - 1) % interval == 0})
+    assert set(rows) <= set(fed) <= set(numbers) and fed == sorted(set(fed))
+    assert {n - interval for n in rows[1:]} <= set(fed)
+    assert {n for n in numbers if 0 < n - max((r for r in rows if r <= n), default=n) <= memory} <= set(fed)
+    # Two stretches, of 140 and 120 frames, of which little more than the memory is looked at.
+    assert len(numbers) - len(fed) >= (260 - 2 * (memory + (hits + 5) * interval)) // interval > 20
 
 
-def test_pictures_are_looked_at_where_places_leave_a_doubt_and_once_at_most():
-    """Two who walk alone until they meet: what the doubts ask for is asked once, and is enough."""
-    asked = [0] * 16
-
-    def looked(n: int) -> Callable[[], np.ndarray]:
-        def look() -> np.ndarray:
-            asked[n] += 1
-            return coloured(3, 7)()
-
-        return look
-
-    frames = [seen((200 + 25 * min(n, 8), 300), (1000 - 72 * min(n, 8), 300)) for n in range(16)]
-    doubts = names(tracked(frames, pictures=[looked(n) for n in range(16)], appearance="ambiguous"))
-    assert max(asked) == 1
-    assert sum(asked[4:6]) == 0 < sum(asked[8:])
-    asked[:] = [0] * 16
-    assert names(tracked(frames, pictures=[looked(n) for n in range(16)], appearance="always")) == doubts
-    assert asked == [1] * 16
+def test_a_row_on_the_last_frame_that_may_be_costs_a_few_looks():
+    table = crowd_table([1, 2, 3, 10_000_000])
+    for interval in (1, 3):
+        fed = [f.number for f in track_table(table, SETTINGS, interval)]
+        assert fed[0] == 1 and fed[-2:] == [10_000_000 - interval, 10_000_000]
+        assert len(fed) < 200
 
 
-def test_unknown_colours_say_nothing():
-    frames = [seen((300, 300), (340, 300))] * 8
-    for colours in ([coloured(-1, -1)] * 8, [coloured(1, 2)] * 4 + [coloured(-1, -1)] * 4):
-        assert names(tracked(frames, pictures=colours)) == names(tracked(frames))
+def own(frames=40):
+    """Targets of faint contrast of whom now all is seen, now the trunk or the legs alone, now the shadow as well."""
+    random, shown = np.random.default_rng(0), [(0, 0, 1, 1), (0, 0, 1, 0.65), (0, 0.35, 1, 0.65), (0, 0, 2, 1)]
+    boxes = []
+    for n in range(frames):
+        whole = np.array([[20 + 2 * n, 60, 12, 40], [20 + 2 * n, 140, 12, 40.0]])
+        parts = np.array([shown[k] for k in random.integers(0, 4, 2)])
+        boxes.append(np.concatenate([whole[:, :2] + parts[:, :2] * whole[:, 2:], parts[:, 2:] * whole[:, 2:]], axis=1))
+    n = 2 * frames
+    return DetectionTable(
+        *("detections.csv", np.repeat(np.arange(frames) + 1, 2), np.concatenate(boxes), np.full(n, 0.55)),
+        *(np.arange(n) + 2, True),
+    )
 
 
-def test_pictures_may_be_missing_for_some_frames():
-    """A frame that could not be read has no picture; those before and after it have."""
-    run, found = tracker(), []
-    for n in range(9):
-        found += run.feed(1 + 5 * n, seen((300, 300), (340, 300)), None, None if n in (0, 4) else coloured(1, 2))
-    assert names(found + run.end()) == [{0: 1, 1: 2}] * 9
+class Blank:
+    """A clip without anything in it."""
+
+    size, count, exact, rate_hz, problems, name = SIZE, 40, True, 10.0, (), "blank"
+    last = 40
+
+    def every(self, interval):
+        for n in range(1, 41, interval):
+            yield Frame(n, n / 10, np.full((240, 320, 3), 90, np.uint8))
 
 
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_colours_belong_to_rows_also_where_some_rows_are_not_used(order):
-    score = [0.1, 1, 1]
-    frames = [seen((600, 300), (300, 300), (340, 300), score=score)] * 4
-    frames += [seen((600, 300), (320, 292), (320, 308), score=score)] * 4
-    colours = [coloured(3, 3, 7)] * 4 + [coloured(7, *(np.array([3, 7])[[*order]]))] * 4
-    assert names(tracked(frames, pictures=colours))[-1] == {1: 1 + order[0], 2: 1 + order[1]}
+def test_the_table_of_a_clip_s_own_detections_is_followed_as_these_are_with_and_without_the_clip():
+    table = own()
+    scenes = []
+    for frame in Blank().every(1):
+        here = table.at(frame.number)
+        detections = Detections(here.box_px, here.score, here.area_px, here.heading_rad, here.speed_px)
+        scenes.append(Scene(frame, np.zeros((240, 320), np.uint16), detections, 3))
+    wanted = found(f.tracks for f in track_scenes(scenes, SETTINGS, 1, SIZE))
+    engine = load_engine("onboard", SETTINGS)
+    assert found(f.tracks for f in track_clip(cast(Source, Blank()), table, engine, SETTINGS, 1)) == wanted
+    alone = list(track_table(table, SETTINGS, 1))
+    assert all(sorted(f.tracks.identity.tolist()) == [1, 2] for f in alone)
+    assert all(f.tracks.score.tolist() == [0.55, 0.55] for f in alone)
+    assert not found(f.tracks for f in track_table(replace(table, own=False), SETTINGS, 1))
 
 
-def test_the_first_looks_of_a_target_are_averaged_and_hidden_ones_do_not_count():
-    def speckled(*bins: int) -> Callable[[], np.ndarray]:
-        return lambda: np.array([0.95 * np.eye(12)[0] + 0.05 * np.eye(12)[b] for b in bins], np.float32)
-
-    run = tracker(look_ahead=False, appearance="always")
-    for n, speckle in enumerate((2, 5, 8)):
-        run.feed(1 + 5 * n, seen((300, 300)), None, speckled(speckle))
-    np.testing.assert_allclose(run.roster.signature[0, [2, 5, 8]], 0.05 / 3, rtol=1e-5)
-    before = run.roster.signature[0]
-    for n in range(3, 6):
-        run.feed(1 + 5 * n, seen((300, 300), (300, 330, 140)), None, speckled(11, 4))
-    np.testing.assert_allclose(run.roster.signature[run.roster.number == 0][0], before, atol=1e-6)
-
-
-def spied(monkeypatch: pytest.MonkeyPatch) -> list[tuple[np.ndarray, Sight]]:
-    """What is told to `link_scores` from now on: who was last seen at the border, and the sight."""
-    told = []
-
-    def spy(
-        state: np.ndarray, left: np.ndarray, box_px: np.ndarray, sight: Sight, parameters: TrackParameters
-    ) -> np.ndarray:
-        told.append((left, sight))
-        return link_scores(state, left, box_px, sight, parameters)
-
-    monkeypatch.setattr(tracks, "link_scores", spy)
-    return told
+def test_the_public_tracker_gives_boxes_and_scores_the_identities_of_the_same_table():
+    rows = walkers(range(1, 31))
+    wanted = [f.tracks for f in track_table(table_of(rows), SETTINGS, 1)]
+    tracker = Tracker(size=table_of(rows).extent)
+    found = []
+    for number in range(1, 31):
+        boxes = np.array([box for frame, box in rows if frame == number])
+        found += tracker.update((boxes, np.ones(len(boxes))))
+    found += tracker.flush()
+    assert [(t.frame, t.identity.tolist()) for t in found] == [(t.frame, t.identity.tolist()) for t in wanted]
+    assert all(np.array_equal(one.box_px, other.box_px) for one, other in zip(found, wanted, strict=True))
 
 
-@pytest.mark.parametrize("doubtful", [0.0, 0.5, 1.0])
-def test_the_share_of_doubtful_detections_is_known_to_the_scores(monkeypatch, doubtful):
-    told = spied(monkeypatch)
-    tracked([seen((300, 300), (600, 300), score=[DOUBTFUL if doubtful else 1, DOUBTFUL if doubtful > 0.5 else 1])] * 6)
-    assert told[-1][1].doubt == doubtful
-    assert (told[-1][1].interval, told[-1][1].size, told[-1][1].frame) == (5, SIZE, 26)
+def test_detections_of_the_motion_detector_count_as_certain_and_keep_their_scores():
+    one = np.ones(1)
+    faint = [Detections(np.array([[10.0 + k, 20, 12, 40]]), 0.01 * one, one, one, one) for k in range(5)]
+    tracker = Tracker()
+    found = [tracks for detections in faint for tracks in tracker.update(detections)] + tracker.flush()
+    assert [t.identity.tolist() for t in found] == [[1]] * 5 and {float(t.score[0]) for t in found} == {0.01}
+    assert not any(len(t) for t in Tracker(motion=False).update(faint[0]) + Tracker(motion=False).flush())
 
 
-@pytest.mark.parametrize(("x", "size", "births"), [(600, SIZE, True), (20, SIZE, False), (20, None, True)])
-def test_only_targets_that_begin_inside_the_picture_after_the_first_look_count_as_births(monkeypatch, x, size, births):
-    """For those that a look shows at its border it is no wonder, nor for those that were there from the start."""
-    told = spied(monkeypatch)
-    frames = [seen((300, 600), (600, 600)), *[seen((300, 600), (600, 600), (x, 40 + 90 * n)) for n in range(5)]]
-    tracked(frames * 8, size=size)
-    assert (told[-1][1].births > 0) == births
-    assert told[2][1].births == 0, "so few detections tell no rate"
+@pytest.mark.parametrize("mode", ["default", "paper"])
+def test_both_modes_follow_a_walker_with_pictures_and_settle_every_frame_once(mode):
+    settings = load_config(overrides=[f"track.mode={mode}"])
+    tracker, found = Tracker(settings, interval=2, size=SIZE), []
+    for frame in Clip(11).every(2):
+        boxes = np.array([box for _, box in walkers([frame.number], lanes=(60,))])
+        found += tracker.update(boxes, np.eye(3), frame.image, frame.number)
+    found += tracker.flush()
+    assert [t.frame for t in found] == [1, 3, 5, 7, 9, 11]
+    assert {int(i) for t in found for i in t.identity} == {1}
 
 
-def test_who_was_last_seen_at_the_border_is_known_to_the_scores(monkeypatch):
-    told = spied(monkeypatch)
-    for walk in (np.linspace(500, 20, 13), np.linspace(20, 500, 13), [20.0]):
-        told.clear()
-        tracked([*[seen((x, 300)) for x in walk], seen((900, 300))], look_ahead=False)
-        assert told[-1][0].tolist() == [walk[-1] == 20]
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"detections": np.zeros((2, 3))}, r"boxes must be \(N, 4\)"),
+        ({"detections": (np.ones((2, 4)), np.ones(3))}, r"one a box, \(2,\); got \(3,\)"),
+        ({"detections": np.full((1, 4), np.nan)}, "finite"),
+        ({"detections": np.array([[0, 0, 0, 5.0]])}, "above 0 px, got 0 x 5 in box 0"),
+        ({"detections": "boxes"}, "Detections record"),
+        ({"detections": np.ones((1, 4)), "camera_motion": np.eye(2)}, r"\(3, 3\) homography"),
+        ({"detections": np.ones((1, 4)), "image": np.zeros((4, 4))}, "uint8, got"),
+        ({"detections": np.ones((1, 4)), "frame": 3}, "frame 3 follows frame 3"),
+    ],
+)
+def test_bad_input_of_the_public_tracker_is_refused_in_one_line(given, message):
+    tracker = Tracker()
+    tracker.update(np.zeros((0, 4)), frame=3)
+    with pytest.raises(InputError, match=message):
+        tracker.update(**given)
 
 
-def test_frames_at_uneven_distances_are_linked_by_their_numbers():
-    """A walker is found again where it must be after so many frames, though another stands nearer to its last place."""
-    run, found = tracker(), []
-    for frame in (1, 6, 11, 16, 36, 41):
-        found += run.feed(frame, seen((100 + 6.0 * frame, 300), (330, 310)))
-    assert names(found + run.end()) == [{0: 1, 1: 2}] * 6
-
-
-def test_a_gap_between_uneven_frames_is_filled_where_the_target_was_then():
-    run, found = tracker(1), []
-    for frame in (1, 2, 3, 4, 12, 13):
-        found += run.feed(frame, seen() if frame == 4 else seen((100 + 4.0 * frame, 300)))
-    np.testing.assert_allclose((found + run.end())[3].box_px, boxes((116, 300)), atol=0.5)
-
-
-@pytest.mark.parametrize("every", [2, 5])
-def test_false_alarms_elsewhere_do_not_cost_a_still_target_its_identity(every):
-    """It is missed for a single look now and then, and comes back exactly where it was; nobody else is near."""
-    random, frames = np.random.default_rng(0), []
-    for n in range(150):
-        alarm = [tuple(random.uniform((100, 100), (1100, 400)))] * (n % 3 == 0)
-        still = [(600, 600)] * (n % every != 1)
-        frames.append(seen(*still, *alarm, score=[1.0] * len(still) + [DOUBTFUL] * len(alarm)))
-    found = names(tracked(frames, 1))
-    assert len({page[0] for n, page in enumerate(found) if n % every != 1}) == 1
+@pytest.mark.parametrize(
+    ("given", "message"), [({"interval": 0}, "interval must be"), ({"size": (3, -1)}, "size must")]
+)
+def test_a_tracker_of_bad_settings_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        Tracker(**given)

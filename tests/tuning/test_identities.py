@@ -13,8 +13,8 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.tracking.sequence import follow_table
-from torchvision_dddas.tracking.tracker import Tracker
+from torchvision_dddas.tracking import track_table
+from torchvision_dddas.tracking.score_tracker import ScoreTracker
 from torchvision_dddas.tuning import tracking
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Timed, family_of
@@ -69,18 +69,18 @@ def test_a_clip_becomes_stretches_of_its_looks_in_order_each_with_a_loss():
 def test_what_the_tracker_knows_of_a_look_is_what_the_tracker_itself_knows(monkeypatch: pytest.MonkeyPatch):
     """Pace and births, where it links as is true."""
     clip, settings, seen = walk(people=6, frames=100), Settings(), []
-    plain = Tracker._sight
+    plain = ScoreTracker._scene
 
     def sight(self, look):
-        seen.append((look.frame, self.pace.speed, plain(self, look).births))
+        seen.append((look.frame, self.speed_prior.speed, plain(self, look).birth_rate))
         return plain(self, look)
 
-    monkeypatch.setattr(Tracker, "_sight", sight)
+    monkeypatch.setattr(ScoreTracker, "_scene", sight)
     assert clip.truth is not None
     assert clip.truth.tracks is not None
     (example,) = Identities(interval=5).examples([clip], settings)
     width, height = example.content.looks["size"].tolist()
-    tracker = Tracker(settings, 5, (width, height))
+    tracker = ScoreTracker(settings, 5, (width, height))
     for number in range(1, 101, 5):
         box = clip.truth.boxes[number]
         one = np.ones(len(box))
@@ -89,9 +89,9 @@ def test_what_the_tracker_knows_of_a_look_is_what_the_tracker_itself_knows(monke
     looks = example.content.looks
     speeds = {frame: speed for frame, speed, _ in seen}
     births = {frame: rate for frame, _, rate in seen}
-    from torchvision_dddas.tracking.speed_prior import speed_of
+    from torchvision_dddas.tracking.scores import blend_speed
 
-    found = [speed_of(settings.track.speed, *pair) for pair in zip(looks["usual"], looks["known"], strict=True)]
+    found = [blend_speed(settings.track.speed, *pair) for pair in zip(looks["usual"], looks["known"], strict=True)]
     assert found == pytest.approx([speeds[int(frame)] for frame in looks["frame"]])
     assert looks["births"].tolist() == pytest.approx([births[int(frame)] for frame in looks["frame"]])
 
@@ -142,23 +142,23 @@ def test_the_task_says_whether_true_boxes_or_detections_are_learned_from(tmp_pat
 def test_births_and_doubt_of_detections_are_those_of_the_tracker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Doubt is; births are where false alarms have no part in it."""
     clip, settings, told = seen(walk(people=6, frames=100), tmp_path, false=0), Settings(), []
-    plain = Tracker._sight
+    plain = ScoreTracker._scene
 
     def sight(self, look):
         told.append((look.frame, plain(self, look)))
         return plain(self, look)
 
-    monkeypatch.setattr(Tracker, "_sight", sight)
+    monkeypatch.setattr(ScoreTracker, "_scene", sight)
     (example,) = Identities().at(5, "tracking").examples([clip], settings)
     assert clip.given is not None
-    for _ in follow_table(read_detections(clip.given), settings, 5):
+    for _ in track_table(read_detections(clip.given), settings, 5):
         pass
     # Of a look ahead less is counted: the last of each look is its own.
     of = dict(told)
     looks = example.content.looks
     frames = looks["frame"].astype(int).tolist()
     assert looks["doubt"].tolist() == pytest.approx([of[frame].doubt for frame in frames])
-    assert looks["births"].tolist() == pytest.approx([of[frame].births for frame in frames])
+    assert looks["births"].tolist() == pytest.approx([of[frame].birth_rate for frame in frames])
 
 
 def test_detections_are_wanted_by_name_where_there_are_none(tmp_path: Path):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking.source_tracker import Look, associate
+from torchvision_dddas.tracking.source_tracker import Features, associate
 from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.source_association import (
     Windows,
@@ -28,7 +28,7 @@ ALL = ("threshold", "lowest_dispersion", "location_cut", "appearance_cut")
 
 def looks_of(
     count: int, seed: int, pictured: bool = True, leaving: int = 1, hues: int = 256, walk: float = 6.0
-) -> tuple[tuple[Look, Look], tuple[np.ndarray, np.ndarray]]:
+) -> tuple[tuple[Features, Features], tuple[np.ndarray, np.ndarray]]:
     """Two frames, newer first: people who walk a little, of whom some leave and as many of whom come; identities."""
     draw = np.random.default_rng(seed)
     place = draw.uniform(60, 600, (count + leaving, 2))
@@ -40,7 +40,7 @@ def looks_of(
         counts = draw.poisson(2.0, (count, 3, 256)).astype(float)
         counts[np.arange(count), :, level[who]] += 300
         box = np.column_stack([centre - (10, 20), np.tile((20.0, 40.0), (count, 1))])
-        found.append((Look(box, partial(counts.reshape, count, 768) if pictured else None), who))
+        found.append((Features(box, partial(counts.reshape, count, 768) if pictured else None), who))
     (now, who_now), (before, who_before) = found
     return (now, before), (who_now, who_before)
 

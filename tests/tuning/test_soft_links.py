@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.scores import Sight, link_scores
+from torchvision_dddas.tracking.scores import SceneState, association_scores
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.tracking import Looks, unlikeliness
 
@@ -69,16 +69,16 @@ def track(values: dict[str, Tensor]) -> TrackParameters:
 def test_tensors_are_scored_as_arrays_are():
     parameters, looks = Settings().track, walkers()
     box = looks.box_px[0].numpy()
-    state = kalman.started(box[0], 1, parameters.scatter, 0.07)
-    state = kalman.updated(kalman.predicted(state, 6, 0.009), box[1], 6, parameters.scatter)
+    state = kalman.start(box[0], 1, parameters.scatter, 0.07)
+    state = kalman.update(kalman.predict(state, 6, 0.009), box[1], 6, parameters.scatter)
     state[::2, kalman.SEEN] = 1
-    left, sight = np.arange(6) % 3 == 0, Sight(11, 5, 0.07, 0.02, 0.1, (500.0, 500.0))
-    wanted = link_scores(state, left, box[2], sight, parameters)
+    left, sight = np.arange(6) % 3 == 0, SceneState(11, 5, 0.07, 0.02, 0.1, (500.0, 500.0))
+    wanted = association_scores(state, left, box[2], sight, parameters)
     there: Any = torch.as_tensor(state)
     at_border: Any = torch.as_tensor(left)
     last: Any = looks.box_px[0, 2]
     births: Any = torch.tensor(0.02, dtype=torch.float64)
-    found: Any = link_scores(there, at_border, last, replace(sight, births=births), parameters)
+    found: Any = association_scores(there, at_border, last, replace(sight, birth_rate=births), parameters)
     np.testing.assert_allclose(found.numpy(), wanted, rtol=0, atol=1e-9)
 
 

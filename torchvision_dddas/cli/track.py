@@ -130,16 +130,16 @@ def _followed(
     settings: "Settings",
     interval: int,
 ) -> "Iterator[TrackedFrame]":
-    from torchvision_dddas.tracking.sequence import follow_clip, follow_scenes, follow_table
+    from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 
     if source is None or engine is None:
         assert table is not None
-        return follow_table(table, settings, interval)
+        return track_table(table, settings, interval)
     if table is not None:
-        return follow_clip(source, table, engine, settings, interval)
+        return track_clip(source, table, engine, settings, interval)
     from torchvision_dddas.detection import detect_motion
 
-    return follow_scenes(detect_motion(source, settings, engine), settings, interval, source.size)
+    return track_scenes(detect_motion(source, settings, engine), settings, interval, source.size)
 
 
 def looks(table: "DetectionTable | None", source: "Source | None", interval: int) -> int | None:

@@ -11,7 +11,7 @@ from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import UNREAD, checked
 from torchvision_dddas.people.scorer import WindowScorer
 from torchvision_dddas.people.search_regions import Search
-from torchvision_dddas.tracking.sequence import Follower
+from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Detections, Scene, TrackedFrame, Tracks, is_sampled
 
 KIND = "person"
@@ -28,7 +28,7 @@ class Spotter:
         self._recognizer, self._interval, self._size = recognizer, interval, size
         self._box_px = np.zeros((0, 4))
         self._search = Search(settings.people, lambda number: self._box_px)
-        self._follower = Follower(settings, interval, size, pictures=False)
+        self._follower = FrameTracker(settings, interval, size, pictures=False)
         self._steps: list[np.ndarray] = []
         self._settled: dict[int, TrackedFrame] = {}
         scan.everywhere(size, settings.people)
@@ -55,7 +55,7 @@ class Spotter:
             seconds=seconds,
         )
         self._steps = []
-        for settled in self._follower.take(followed):
+        for settled in self._follower.update(followed):
             self._settled[settled.number] = settled
 
     def of(self, number: int, ended: bool) -> TrackedFrame | None:
@@ -64,7 +64,7 @@ class Spotter:
         ended: whether no scene follows.
         """
         if ended and number not in self._settled:
-            self._settled |= {settled.number: settled for settled in self._follower.end()}
+            self._settled |= {settled.number: settled for settled in self._follower.flush()}
         self._settled = {other: settled for other, settled in self._settled.items() if other >= number}
         return self._settled.pop(number, None)
 

@@ -1,1 +1,23 @@
-"""Targets over time: detections to identities."""
+"""Tracking: from detections to identities. `Tracker` is the public class; the other names serve other rooms."""
+
+from torchvision_dddas.tracking.camera_motion import CameraMotion
+from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
+from torchvision_dddas.tracking.tracker import (
+    FrameTracker,
+    Tracker,
+    track_clip,
+    track_scenes,
+    track_table,
+    without_picture,
+)
+
+__all__ = [
+    "CameraMotion",
+    "CrowdIdentities",
+    "FrameTracker",
+    "Tracker",
+    "track_clip",
+    "track_scenes",
+    "track_table",
+    "without_picture",
+]

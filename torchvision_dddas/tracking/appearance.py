@@ -1,53 +1,136 @@
-"""What targets look like: histograms of colour over three strips of a box."""
+"""Appearance of targets: colour histograms of boxes, their similarity, and the association score that follows."""
 
 import cv2
 import numpy as np
 
-_STRIPS = (0.2, 0.55)  # where one ends and the next begins: head, trunk, legs of a person; roof, body, wheels of a car
+from torchvision_dddas.config import TrackParameters
+from torchvision_dddas.geometry import namespace, shared_px
+
+# Lower ends of the first two of three strips of a box: head, trunk, legs of a person; roof, body, wheels of a car.
+_STRIP_ENDS = (0.2, 0.55)
 _BINS = np.array([16, 32, 32])  # of L, a and b
-_CHANNEL = np.array([0, 16, 48])  # where each channel's bins begin
-_STRIP = 80  # bins of a strip
-SIGNATURE = 3 * _STRIP
+_FIRST_BIN = np.array([0, 16, 48])
+_STRIP_BINS = 80
+SIGNATURE = 3 * _STRIP_BINS
+"""Bins of a histogram of three strips."""
 _COLUMNS, _ROWS = 24, 48  # samples of a box
-_MIDDLE = 0.3  # widths from the middle at which a column counts 1/e: the rest of a box is mostly background
+_MIDDLE = 0.3  # widths from the middle at which a column weighs 1/e: the rest of a box is mostly background
+
+# Association scores below the first are not worth a histogram; differences above the second exceed what appearance
+# can change.
+_LEAST_SCORE, _CLEAR_LEAD = -8.0, 7.0
+_WORST = -1.0  # light, shadow and turning change the appearance at once: it counts only so much against a link
 
 
-def strips(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N, SIGNATURE) float32 histograms of Lab colour, weighted to the middle columns of each box.
+def strip_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """(N, SIGNATURE) float32 histograms of Lab colour over three strips, weighted to the middle columns of each box.
 
-    image: (H, W, 3) uint8 BGR or (H, W) grey. box_px: (N, 4) x, y, width, height; what lies outside does not count. All
-    histograms of a box sum to 1 together, so that sum(sqrt(a b)) is their mean Bhattacharyya coefficient. A box wholly
-    outside has zeros.
+    image: (H, W, 3) uint8 BGR or (H, W) grey. box_px: (N, 4) x, y, width, height; the part outside the image does not
+    count. Each row sums to 1, so that sum(sqrt(a b)) is the mean Bhattacharyya coefficient; a box wholly outside has
+    zeros.
     """
-    samples = np.zeros((len(box_px), _ROWS, _COLUMNS, 3), np.uint8)
-    seen = np.zeros((len(box_px), 4))  # the part of each box inside the image, in pixels
+    count = len(box_px)
+    samples = np.zeros((count, _ROWS, _COLUMNS, 3), np.uint8)
+    visible = np.zeros((count, 4))  # the part of each box inside the image, in pixels
     height, width = image.shape[:2]
     for n, (x, y, w, h) in enumerate(box_px.tolist()):
         left, right = max(int(np.floor(x)), 0), min(int(np.ceil(x + w)), width)
         top, bottom = max(int(np.floor(y)), 0), min(int(np.ceil(y + h)), height)
         if right > left and bottom > top:
             crop = image[top:bottom, left:right]
-            shrinks = crop.shape[0] >= _ROWS and crop.shape[1] >= _COLUMNS
-            sampled = cv2.resize(crop, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+            is_larger = crop.shape[0] >= _ROWS and crop.shape[1] >= _COLUMNS
+            sampled = cv2.resize(
+                crop, (_COLUMNS, _ROWS), interpolation=cv2.INTER_AREA if is_larger else cv2.INTER_LINEAR
+            )
             samples[n] = sampled if image.ndim == 3 else sampled[..., None]
-            seen[n] = left, top, right - left, bottom - top
-    inside = seen[:, 2] > 0
+            visible[n] = left, top, right - left, bottom - top
+    inside = visible[:, 2] > 0
     if not inside.any():
-        return np.zeros((len(box_px), SIGNATURE), np.float32)
+        return np.zeros((count, SIGNATURE), np.float32)
     lab = cv2.cvtColor(samples.reshape(-1, _COLUMNS, 3), cv2.COLOR_BGR2LAB).reshape(samples.shape)
     # Where each sample lies in the whole box, of which the image's border may have cut off a part.
-    down = (seen[:, 1:2] - box_px[:, 1:2] + (np.arange(_ROWS) + 0.5) / _ROWS * seen[:, 3:]) / box_px[:, 3:]
-    across = (seen[:, :1] - box_px[:, :1] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * seen[:, 2:3]) / box_px[:, 2:3]
+    down = (visible[:, 1:2] - box_px[:, 1:2] + (np.arange(_ROWS) + 0.5) / _ROWS * visible[:, 3:]) / box_px[:, 3:]
+    across = (visible[:, :1] - box_px[:, :1] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * visible[:, 2:3]) / box_px[
+        :, 2:3
+    ]
     weight = np.exp(-(((across - 0.5) / _MIDDLE) ** 2)) * inside[:, None]
-    start = (
-        np.arange(len(box_px))[:, None] * SIGNATURE
-        + np.searchsorted(_STRIPS, down.ravel()).reshape(down.shape) * _STRIP
-    )
-    place = start[:, :, None, None] + _CHANNEL + (lab * _BINS >> 8)
+    strip = np.searchsorted(_STRIP_ENDS, down.ravel()).reshape(down.shape)
+    start = np.arange(count)[:, None] * SIGNATURE + strip * _STRIP_BINS
+    place = start[:, :, None, None] + _FIRST_BIN + (lab * _BINS >> 8)
     weights = np.broadcast_to(weight[:, None, :, None], place.shape)
-    counts = np.bincount(place.ravel(), weights.ravel(), len(box_px) * SIGNATURE).reshape(len(box_px), 3, _STRIP)
-    # A strip counts the same however much of it is seen.
-    total = counts.sum(axis=2, keepdims=True)
-    shares = np.divide(counts, total, out=np.zeros_like(counts), where=total > 0).reshape(len(box_px), SIGNATURE)
-    whole = shares.sum(axis=1, keepdims=True)
-    return np.divide(shares, whole, out=np.zeros_like(shares), where=whole > 0).astype(np.float32)
+    counts = np.bincount(place.ravel(), weights.ravel(), count * SIGNATURE).reshape(count, 3, _STRIP_BINS)
+    # A strip counts the same however much of it is visible.
+    return _normalize(_normalize(counts).reshape(count, SIGNATURE)).astype(np.float32)
+
+
+def _normalize(counts: np.ndarray) -> np.ndarray:
+    total = counts.sum(axis=-1, keepdims=True)
+    return np.divide(counts, total, out=np.zeros_like(counts), where=total > 0)
+
+
+def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """(N, 768) float32 counts of pixels: 256 levels of red, of green, of blue. Source: appendix C, eq. 3.
+
+    image: (H, W, 3) uint8 BGR, or (H, W) grey, counted three times. box_px: (N, 4) x, y, width, height; edges are
+    rounded to whole pixels and clipped to the image. A box without a pixel inside has zeros.
+    """
+    bgr = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    boxes = np.array(box_px, float).reshape(-1, 4)
+    boxes[~np.isfinite(boxes).all(axis=1)] = 0.0
+    limit = np.array(bgr.shape[1::-1])
+    low = np.clip(np.rint(boxes[:, :2]), 0, limit).astype(int)
+    high = np.clip(np.rint(boxes[:, :2] + boxes[:, 2:]), 0, limit).astype(int)
+    counts = np.zeros((len(boxes), 3, 256), np.float32)
+    for row, (left, top), (right, bottom) in zip(counts, low, high, strict=True):
+        if right > left and bottom > top:
+            for place, channel in enumerate((2, 1, 0)):
+                row[place] = cv2.calcHist([bgr[top:bottom, left:right]], [channel], None, [256], [0, 256])[:, 0]
+    return counts.reshape(len(boxes), 768)
+
+
+def similarity(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN where either is unknown (zeros)."""
+    is_known = np.any(signature, axis=1).reshape(-1, 1) & np.any(other, axis=1)
+    return np.where(is_known, np.sqrt(signature) @ np.sqrt(other).T, np.nan)
+
+
+def appearance_scores(similarity: np.ndarray, visible: np.ndarray, parameters: TrackParameters) -> np.ndarray:
+    """(N, M) association scores of similarities, 0 for NaN. visible: (M,) shares of the boxes. Arrays or tensors."""
+    functions = namespace(similarity)
+    is_known = similarity == similarity
+    score = parameters.appearance_weight * (functions.where(is_known, similarity, 1.0) - parameters.appearance_offset)
+    return functions.where(is_known, functions.clip(score, _WORST, None) * functions.sqrt(visible)[..., None, :], 0.0)
+
+
+def is_ambiguous(score: np.ndarray, signature: np.ndarray) -> bool:
+    """Whether appearance may decide, from scores (N, M) without it and histograms (N, D) of the tracks.
+
+    It may where a track or a detection has two likely links, and where a likely link is of a track without histogram.
+    """
+    if not score.size:
+        return False
+    likely = score > _LEAST_SCORE
+    for axis in (1, 0):
+        rivals = likely & (score > score.max(axis=axis, keepdims=True) - _CLEAR_LEAD)
+        if (rivals.sum(axis=axis) > 1).any():
+            return True
+    unknown = ~np.any(signature, axis=1) if signature.shape[1] else np.ones(len(score), bool)
+    return bool(likely[unknown].any())
+
+
+def blend_histograms(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:
+    """(N, D) histograms of tracks after a detection each, weighted by the share of it that was visible.
+
+    hits: (N,) detections so far, this one included: the first few are averaged, then older ones fade.
+    """
+    gain = np.maximum(0.2, 1 / hits) * visible**2
+    gain = np.where(np.any(signature, axis=1), np.where(np.any(seen, axis=1), gain, 0.0), 1.0)[:, None]
+    return (1 - gain) * signature + gain * seen
+
+
+def visible_shares(box_px: np.ndarray) -> np.ndarray:
+    """(N,) share of each box (N, 4) that no nearer box covers; a box is nearer if its bottom is lower in the image."""
+    bottom = box_px[:, 1] + box_px[:, 3]
+    nearer = bottom > bottom[:, None]
+    covered = (shared_px(box_px[:, None], box_px) * nearer).sum(axis=1) / (box_px[:, 2] * box_px[:, 3])
+    return np.clip(1 - covered, 0.0, 1.0)

@@ -1,22 +1,275 @@
-"""Who is who between two or three frames: one-to-one assignment of the largest total score (appendix C, eq. 1-3).
+"""Assignment over the triplets that a gate left: track, detection now, detection in the next frame.
 
-Two frames: see `matching`. Three frames in which a gate left few triplets: see `columns`. Three frames with the
-source's dummy targets and any triplet possible: exactly here, to within a gap in `relaxation`.
+A column (i, j, k) names a node of each of three layers, -1 for none. Columns that share no node, not even through
+others, fall into groups that are solved one by one: small ones by branch and bound; all large ones at once by linear
+programming, and where that leaves fractions by integer programming (HiGHS).
 """
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchvision_dddas.tracking.lagrangian import triplets
-from torchvision_dddas.types import Float, Int
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Bool, Float, Int
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+_LEAST_SCORE = -2.0  # a link of a lower score is not made even if the next frame supports it
+_NEXT_WEIGHT = 0.8  # of the next frame's scores: at 1, a sharp turn is taken for an exchange of identities
+_RIVALS = 6  # links of a track or a detection that are weighed against each other: only stacked boxes have more
+_TIE_BREAK = 1e-6
+_MOST_BRANCHES = 50  # of HiGHS; only stacked boxes need more, and there one choice is as good as another
+# A group with no more columns is searched first, and given to HiGHS after so many steps: with fewer, HiGHS, whose call
+# alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
+_SEARCH_COLUMNS, _SEARCH_STEPS = 200, 1000
+# Tight prices bound the search; for fewer columns they take longer to find than they save.
+_PRICE_ROUNDS, _EASY_COLUMNS = 6, 30
 
 
-def triplets_exact(score: Float[np.ndarray, "N1 M1 L1"]) -> Int[np.ndarray, "Z 3"]:
-    """The triplets (i, j, k) with the largest sum of scores, every real target of each frame in exactly one.
+def plausible_links(score: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+    """Tracks and detections (P,) of the links worth following into the next frame, from association scores."""
+    distinct = _without_ties(score)
+    tracks, now = np.nonzero((score > _LEAST_SCORE) & (_is_leading(distinct) | _is_leading(distinct.T).T))
+    return tracks, now
 
-    score: (N + 1, M + 1, L + 1); index 0 of each axis is the dummy, used any number of times; (0, 0, 0) never is, and
-    its score is not read. Scores may be zero or negative. Rows are sorted by i, then j, then k.
-    Exact (to 1e-9 of the largest gain), so it may take for ever where many targets are alike: `relaxation.triplets`
-    stops at a gap.
-    Raises InputError if the score is no 3-D tensor with a dummy on each axis, or holds what is not finite.
+
+def choose_links(
+    value: Float[np.ndarray, "P"],
+    tracks: Int[np.ndarray, "P"],
+    now: Int[np.ndarray, "P"],
+    onward: Float[np.ndarray, "P L"],
+    born: Float[np.ndarray, "M L"],
+    bridging: Float[np.ndarray, "N L"],
+) -> Bool[np.ndarray, "P"]:
+    """Which links belong to the disjoint triplets with the largest sum of scores (K = 3, one frame of delay).
+
+    value, tracks, now: scores, tracks and detections of the plausible links of this frame. Scores to the L detections
+    of the next frame: onward, of the tracks after these links; born, of tracks that would begin with each of the M
+    detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
+    leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
-    return triplets(score, gap=0.0, most_exact=None).triplets
+    onward, born, bridging = _without_ties(onward), _without_ties(born), _without_ties(bridging)
+    p, k = np.nonzero((onward > 0) & _is_leading(onward))
+    j, m = np.nonzero((born > 0) & _is_leading(born))
+    i, n = np.nonzero((bridging > 0) & _is_leading(bridging))
+    ends = np.cumsum([len(value), len(p), len(j), len(i)]).tolist()
+    columns, score = np.full((ends[3], 3), -1), np.empty(ends[3])
+    pair, triplet, late, bridge = (slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
+    columns[pair, 0], columns[pair, 1], score[pair] = tracks, now, value
+    columns[triplet, 0], columns[triplet, 1], columns[triplet, 2] = tracks[p], now[p], k
+    score[triplet] = value[p] + _NEXT_WEIGHT * onward[p, k]
+    columns[late, 1], columns[late, 2], score[late] = j, m, _NEXT_WEIGHT * born[j, m]
+    columns[bridge, 0], columns[bridge, 2], score[bridge] = i, n, _NEXT_WEIGHT * bridging[i, n]
+    best, _ = choose_triplets(columns, score, _MOST_BRANCHES)
+    chosen = np.zeros(len(value), bool)
+    chosen[best[best < ends[0]]] = True
+    chosen[p[best[(best >= ends[0]) & (best < ends[1])] - ends[0]]] = True
+    return chosen
+
+
+def _without_ties(score: np.ndarray) -> np.ndarray:
+    """Scores (N, M) without ties: boxes that lie on each other have equal ones, and searching them all never ends."""
+    rows, columns = score.shape
+    return score - _TIE_BREAK * ((np.arange(columns) - np.arange(rows)[:, None]) % max(columns, 1))
+
+
+def _is_leading(score: np.ndarray) -> np.ndarray:
+    """(N, M) whether a score is among the largest _RIVALS of its row."""
+    if score.shape[1] <= _RIVALS:
+        return np.ones(score.shape, bool)
+    return score >= -np.partition(-score, _RIVALS - 1, axis=1)[:, _RIVALS - 1 : _RIVALS]
+
+
+def choose_triplets(
+    columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"], most_branches: int | None = None
+) -> tuple[Int[np.ndarray, "Z"], bool]:
+    """The rows of the columns with the largest sum of scores that share no node, ascending; and whether it is certain.
+
+    A column that scores zero or less is never chosen; -inf forbids one. Exact, to rounding and HiGHS's 1e-7 of the
+    largest score, unless HiGHS would need more than `most_branches`. Among choices of the same sum the nodes' numbers
+    decide, not the order of the columns; of two equal columns the first is chosen.
+    Raises InputError if the shapes do not fit, an index is below -1, a column has no node, or a score is NaN or +inf.
+    """
+    columns, score = _check(columns, score)
+    order = np.lexsort((-score, columns[:, 2], columns[:, 1], columns[:, 0]))
+    order = order[score[order] > 0]
+    if not len(order):
+        return np.zeros(0, np.int64), True
+    kept = columns[order]
+    gain = score[order] / score[order].max()
+    held = [[3 * node + layer for layer, node in enumerate(column) if node >= 0] for column in kept.tolist()]
+    gains = gain.tolist()
+    chosen, unsolved = np.zeros(len(gain), bool), np.full(len(gain), -1)
+    for name, members in enumerate(_connected_groups(held)):
+        found = _search([held[column] for column in members], [gains[column] for column in members])
+        if found is None:
+            unsolved[members] = name
+        else:
+            chosen[[members[place] for place in found]] = True
+    certain, hard = True, unsolved >= 0
+    if hard.any():
+        chosen[hard], certain = _optimize(_incidence(kept[hard]), gain[hard], unsolved[hard], most_branches)
+    return np.sort(order[chosen]), certain
+
+
+def relaxed_shares(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
+    """(C,) share of each column in the best choice that may take parts of columns: 0 or 1 in most windows."""
+    return _solve(_incidence(columns), score)[0] if len(score) else np.zeros(0)
+
+
+def _optimize(
+    incidence: "csc_array", gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"], most_branches: int | None
+) -> tuple[Bool[np.ndarray, "C"], bool]:
+    """Linear first: it is integral in most windows; integer programming only for the groups where it is not."""
+    solution, certain = _solve(incidence, gain)
+    broken = np.unique(group[np.abs(solution - solution.round()) > 1e-6])
+    if len(broken):
+        again = np.isin(group, broken)
+        options = {} if most_branches is None else {"node_limit": most_branches}
+        solution[again], certain = _solve(incidence[:, again], gain[again], integral=True, **options)
+    return solution > 0.5, certain
+
+
+def _solve(
+    incidence: "csc_array", gain: Float[np.ndarray, "C"], integral: bool = False, **options: int
+) -> tuple[Float[np.ndarray, "C"], bool]:
+    """(C,) share of each column in the best choice, 0 or 1 if `integral`; and whether it is certainly the best."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # here, as it takes half a second and 45 MB
+
+    # Presolving costs more than it saves where the linear programme is the whole work.
+    settings: Any = {"mip_rel_gap": 0.0, "presolve": integral, **options}
+    solved = milp(
+        -gain,
+        constraints=LinearConstraint(incidence, ub=1.0),
+        integrality=np.full(len(gain), int(integral)),
+        bounds=Bounds(0.0, 1.0),
+        options=settings,
+    )
+    if solved.x is None and not options:
+        raise RuntimeError(f"HiGHS chose none of {len(gain)} columns: {solved.message}")
+    return (np.zeros(len(gain)) if solved.x is None else solved.x), bool(solved.success)
+
+
+def _connected_groups(held: list[list[int]]) -> list[list[int]]:
+    """The groups of columns that share nodes, by their places. held: the nodes of each column."""
+    home: dict[int, tuple[list[int], list[int]]] = {}  # of each node: its group's columns and nodes
+    for column, nodes in enumerate(held):
+        mine = home.get(nodes[0])
+        if mine is None:
+            mine = home[nodes[0]] = ([], [nodes[0]])
+        for node in nodes[1:]:
+            other = home.get(node)
+            if other is None:
+                home[node] = mine
+                mine[1].append(node)
+            elif other is not mine:
+                mine[0].extend(other[0])
+                mine[1].extend(other[1])
+                for moved in other[1]:
+                    home[moved] = mine
+        mine[0].append(column)
+    return list({id(group): sorted(group[0]) for group in home.values()}.values())
+
+
+def _search(held: list[list[int]], gain: list[float]) -> list[int] | None:
+    """The best choice in one group, as places in its list; None if the search takes too long."""
+    if len(held) > _SEARCH_COLUMNS:
+        return None
+    price = _prices(held, gain)
+    # With one node a layer any two columns share one, unless a column is a single node: the best column wins.
+    if len({node % 3 for node in price}) == len(price) and min(map(len, held)) > 1:
+        return [gain.index(max(gain))]
+    return least_loss(held, gain, price, _SEARCH_STEPS)
+
+
+def least_loss(
+    held: list[list[int]],
+    gain: list[float],
+    price: list[float] | dict[int, float],
+    steps: int,
+    limit: float = float("inf"),
+) -> list[int] | None:
+    """The best choice of columns that loses less than `limit`, as places in their list; empty if there is none.
+
+    held: the nodes of each column. price: of every node by its number. None if it takes more than so many steps.
+    The sum of all prices bounds any gain. A node that stays alone loses its price; a chosen column loses what its
+    nodes' prices exceed its gain by. Depth-first search, node by node, finds the least loss.
+    """
+    dearest_first = sorted({node for nodes in held for node in nodes}, key=lambda node: (-price[node], node))
+    bit = {node: 1 << place for place, node in enumerate(dearest_first)}
+    options: dict[int, list[tuple[float, int, int]]] = {mask: [] for mask in bit.values()}
+    for column, nodes in enumerate(held):
+        masks = [bit[node] for node in nodes]
+        loss = max(sum(price[node] for node in nodes) - gain[column], 0.0)
+        options[min(masks)].append((loss, sum(masks), column))
+    for node, mask in bit.items():
+        options[mask].append((price[node], mask, -1))
+        options[mask].sort()
+    full, least, best = (1 << len(bit)) - 1, limit, list[int]()
+    stack: list[tuple[float, int, tuple[int, ...]]] = [(0.0, 0, ())]
+    while stack:
+        lost, used, taken = stack.pop()
+        if lost >= least * (1 - 1e-12):
+            continue
+        if used == full:
+            least, best = lost, list(taken)
+            continue
+        steps -= 1
+        if steps < 0:
+            return None
+        first = ~used & (used + 1)
+        for loss, mask, column in reversed(options[first]):
+            if not mask & used and lost + loss < least:
+                stack.append((lost + loss, used | mask, taken if column < 0 else (*taken, column)))
+    return best
+
+
+def _prices(held: list[list[int]], gain: list[float]) -> dict[int, float]:
+    """Prices of the nodes that pay for every column: gains shared evenly, then lowered where they exceed."""
+    price: dict[int, float] = {}
+    for nodes, worth in zip(held, gain, strict=True):
+        share = worth / len(nodes)
+        for node in nodes:
+            if price.get(node, 0.0) < share:
+                price[node] = share
+    if len(held) <= _EASY_COLUMNS:
+        return price
+    place = {node: k for k, node in enumerate(price)}
+    at, count = np.array([place[node] for nodes in held for node in nodes]), np.array([len(nodes) for nodes in held])
+    start, level = np.cumsum(count) - count, np.array(list(price.values()))
+    for _ in range(_PRICE_ROUNDS):
+        least = level * 3
+        np.minimum.at(least, at, np.repeat(np.add.reduceat(level[at], start) - gain, count))
+        # A column holds up to three nodes: a third each keeps it paid for.
+        level -= np.maximum(least, 0.0) / 3
+    return dict(zip(price, level.tolist(), strict=True))
+
+
+def _incidence(columns: Int[np.ndarray, "C 3"]) -> "csc_array":
+    """(nodes, C) which nodes of all layers each column holds."""
+    from scipy.sparse import csc_array
+
+    there = columns >= 0
+    names = (columns * 3 + np.arange(3))[there]
+    known, nodes = np.unique(names, return_inverse=True)
+    start = np.concatenate([[0], np.cumsum(there.sum(axis=1))])
+    return csc_array((np.ones(len(nodes)), nodes, start), shape=(len(known), len(columns)))
+
+
+def _check(
+    columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]
+) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:
+    columns, score = np.asarray(columns), np.asarray(score, float)
+    if columns.ndim != 2 or columns.shape[1] != 3 or score.shape != columns.shape[:1]:
+        raise InputError(
+            f"triplets need (C, 3) indices and (C,) scores; got {columns.shape} and {score.shape}. "
+            "Give one score a column."
+        )
+    if len(columns) and not np.issubdtype(columns.dtype, np.integer):
+        raise InputError(f"triplets need integer indices; got {columns.dtype}. Convert them, with -1 for none.")
+    if len(columns) and (columns.min() < -1 or columns.max(axis=1).min() < 0):
+        raise InputError("triplets need a node of some layer, -1 for none; got an index below -1 or a column of none.")
+    if np.isnan(score).any() or np.isposinf(score).any():
+        raise InputError("triplets need scores below infinity; got NaN or +inf. Forbid a column with -inf.")
+    return columns.astype(np.int64), score

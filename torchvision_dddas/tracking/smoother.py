@@ -1,59 +1,63 @@
-"""What the tracker has decided, held back while the next looks may confirm a track in it, fill a gap or move a box."""
+"""Fixed-lag smoothing: decisions are held back while later frames may confirm a track, fill a gap or move a box."""
 
 from collections import deque
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
-from torchvision_dddas.tracking.box_smoothing import between, seen_from, smoothed
+from torchvision_dddas.tracking.kalman import transform_boxes
 from torchvision_dddas.types import Tracks
 
 FILLED = 2
-"""Looks that a gap may last to be filled."""
-_BEFORE = 8  # boxes of a track before one that is settled that may still smooth it
+"""Sampled frames that a gap may last to be filled."""
+_BEFORE = 8  # earlier boxes of a track that may smooth a box
+_WIDTHS = np.array([[2.0], [5.0]])  # sd of the weights of places and of sizes, which change more slowly
 
 
 @dataclass
-class _Sighting:
-    """A box of a track. look: counted from 0. row: of the frame's detections, -1 for a gap that was filled."""
+class _Observation:
+    """A box of a track. index: of the sampled frame, from 0. row: of the frame's detections, -1 in a filled gap."""
 
     frame: int
-    look: int
+    index: int
     box_px: np.ndarray
     score: float
     row: int
 
 
 @dataclass
-class _Page:
+class _Pending:
+    """The decision on a sampled frame. tracks: by number."""
+
     frame: int
-    look: int
-    tracks: dict[int, _Sighting] = field(default_factory=dict)
+    index: int
+    tracks: dict[int, _Observation] = field(default_factory=dict)
 
 
-class Ledger:
-    """One page a look. `settle` gives out those whose time has come, the same ones however the looks came in."""
+class FixedLagSmoother:
+    """Holds each sampled frame back for a fixed number of frames; `settle` returns those that are due."""
 
     def __init__(self, hits: int, smooth: bool, interval: int = 1) -> None:
-        """hits: detections that confirm a track. smooth: move boxes of a score below 1 to where their track was.
+        """hits: detections that confirm a track. smooth: smooth boxes of a score below 1 along their track.
 
-        interval: frames between looks.
+        interval: frames from one sampled frame to the next.
         """
         self.hits, self.smooth, self.interval = hits, smooth, interval
-        self.pages: deque[_Page] = deque()
-        self.looks = 0
-        self.delay = hits - 1 + FILLED  # looks for which a page is held back
+        self.pending: deque[_Pending] = deque()
+        self.count = 0  # sampled frames so far
+        self.delay = hits - 1 + FILLED  # sampled frames for which one is held back
         self.kept = self.delay + _BEFORE
-        self.steps: deque[np.ndarray | None] = deque(maxlen=2 * self.kept)  # to each of the latest looks
-        self.moving = False  # whether the camera ever did
-        self.past: dict[int, deque[_Sighting]] = {}
-        self.sure: set[int] = set()
+        self.steps: deque[np.ndarray | None] = deque(maxlen=2 * self.kept)  # camera motion to each of the latest frames
+        self.has_moved = False  # whether the camera ever did
+        self.observations: dict[int, deque[_Observation]] = {}
+        self.confirmed: set[int] = set()
         self.counts: dict[int, int] = {}
         self.identities: dict[int, int] = {}
-        self.named = 0
-        self.gone: deque[tuple[int, int]] = deque()  # (look, track) of those forgotten
+        self.identity_count = 0
+        self.forgotten: deque[tuple[int, int]] = deque()  # (sampled frames before, track)
 
-    def write(
+    def add(
         self,
         frame: int,
         tracks: np.ndarray,
@@ -62,82 +66,84 @@ class Ledger:
         row: np.ndarray,
         now_from_before: np.ndarray | None,
     ) -> None:
-        """Add a look: numbers of tracks (N,), their boxes, scores and rows among the frame's detections."""
+        """Add a frame: numbers of tracks (N,), their boxes, scores and rows among the frame's detections."""
         self.steps.append(now_from_before)
-        self.moving |= now_from_before is not None
-        page = _Page(frame, self.looks)
-        self.pages.append(page)
-        self.looks += 1
-        for number, box, certainty, at in zip(tracks.tolist(), box_px, score.tolist(), row.tolist(), strict=True):
-            sighting = _Sighting(frame, page.look, box, certainty, at)
+        self.has_moved |= now_from_before is not None
+        pending = _Pending(frame, self.count)
+        self.pending.append(pending)
+        self.count += 1
+        for number, box, confidence, at in zip(tracks.tolist(), box_px, score.tolist(), row.tolist(), strict=True):
+            observation = _Observation(frame, pending.index, box, confidence, at)
             self.counts[number] = self.counts.get(number, 0) + 1
-            if self.counts[number] >= self.hits or certainty >= 1:
-                self.sure.add(number)
-            past = self.past.setdefault(number, deque(maxlen=self.kept))
-            if past and 1 < page.look - past[-1].look <= FILLED + 1:
-                self._fill(number, past[-1], sighting)
-            past.append(sighting)
-            page.tracks[number] = sighting
+            if self.counts[number] >= self.hits or confidence >= 1:
+                self.confirmed.add(number)
+            past = self.observations.setdefault(number, deque(maxlen=self.kept))
+            if past and 1 < pending.index - past[-1].index <= FILLED + 1:
+                self._fill(number, past[-1], observation)
+            past.append(observation)
+            pending.tracks[number] = observation
 
     def forget(self, numbers: np.ndarray) -> None:
-        """Tracks that will not be seen again; what is known of them is kept as long as a page may name them."""
+        """Drop tracks that have ended, as soon as no pending frame can hold them."""
         for number in numbers.tolist():
             self.counts.pop(number, None)
-            self.gone.append((self.looks, number))
+            self.forgotten.append((self.count, number))
 
-    def confirmed(self, numbers: np.ndarray) -> np.ndarray:
-        """(N,) which tracks are more than a false alarm."""
-        return np.array([number in self.sure for number in numbers.tolist()], bool)
+    def are_confirmed(self, numbers: np.ndarray) -> np.ndarray:
+        """(N,) which tracks are confirmed."""
+        return np.array([number in self.confirmed for number in numbers.tolist()], bool)
 
     def settle(self, everything: bool = False) -> list[Tracks]:
-        """The frames on which no later look has a say; all of them at the end."""
+        """The frames that no later one can change; all of them at the end."""
         done = []
-        while self.pages and (everything or len(self.pages) > self.delay):
-            page = self.pages.popleft()
-            sure = [(number, seen) for number, seen in page.tracks.items() if number in self.sure]
-            for number, _ in sure:
+        while self.pending and (everything or len(self.pending) > self.delay):
+            pending = self.pending.popleft()
+            confirmed = [(number, seen) for number, seen in pending.tracks.items() if number in self.confirmed]
+            for number, _ in confirmed:
                 if number not in self.identities:
-                    self.named += 1
-                    self.identities[number] = self.named
+                    self.identity_count += 1
+                    self.identities[number] = self.identity_count
             done.append(
                 Tracks(
-                    page.frame,
-                    np.array([self.identities[number] for number, _ in sure], np.int64),
-                    np.array([self._box(number, seen) for number, seen in sure], float).reshape(-1, 4),
-                    np.array([seen.score for _, seen in sure], float),
-                    np.array([seen.row for _, seen in sure], np.int64),
+                    pending.frame,
+                    np.array([self.identities[number] for number, _ in confirmed], np.int64),
+                    np.array([self._box(number, seen) for number, seen in confirmed], float).reshape(-1, 4),
+                    np.array([seen.score for _, seen in confirmed], float),
+                    np.array([seen.row for _, seen in confirmed], np.int64),
                 )
             )
             self._tidy()
         return done
 
-    def _fill(self, number: int, before: _Sighting, after: _Sighting) -> None:
-        for page in self.pages:
-            if before.look < page.look < after.look:
-                part = (page.frame - before.frame) / (after.frame - before.frame)
-                start = seen_from(before.box_px, self._step(before.look, page.look))
-                end = seen_from(after.box_px, self._step(after.look, page.look))
+    def _fill(self, number: int, before: _Observation, after: _Observation) -> None:
+        for pending in self.pending:
+            if before.index < pending.index < after.index:
+                part = (pending.frame - before.frame) / (after.frame - before.frame)
+                start = _transform(before.box_px, self._step(before.index, pending.index))
+                end = _transform(after.box_px, self._step(after.index, pending.index))
                 score = before.score + part * (after.score - before.score)
-                page.tracks[number] = _Sighting(page.frame, page.look, between(start, end, part), score, -1)
+                pending.tracks[number] = _Observation(
+                    pending.frame, pending.index, start + part * (end - start), score, -1
+                )
 
-    def _box(self, number: int, seen: _Sighting) -> np.ndarray:
+    def _box(self, number: int, seen: _Observation) -> np.ndarray:
         if not self.smooth or seen.score >= 1:
             return seen.box_px
-        near = [s for s in self.past.get(number, ()) if s.look > self.looks - len(self.steps)]
+        near = [s for s in self.observations.get(number, ()) if s.index > self.count - len(self.steps)]
         if len(near) < 2:
             return seen.box_px
         boxes = np.array([s.box_px for s in near])
-        if self.moving:
-            boxes = np.array([seen_from(s.box_px, self._step(s.look, seen.look)) for s in near])
-        return smoothed(boxes, np.array([s.frame / self.interval for s in near]), seen.frame / self.interval)
+        if self.has_moved:
+            boxes = np.array([_transform(s.box_px, self._step(s.index, seen.index)) for s in near])
+        return smooth_box(boxes, np.array([s.frame / self.interval for s in near]), seen.frame / self.interval)
 
     def _step(self, there: int, here: int) -> np.ndarray | None:
-        """How pixels moved from one look to another; None if the camera stood still between them."""
-        if not self.moving:
+        """How pixels moved from one sampled frame to another; None if the camera stood still between them."""
+        if not self.has_moved:
             return None
         low, high = sorted((there, here))
-        oldest = self.looks - len(self.steps)
-        steps = [s for look in range(low + 1, high + 1) if (s := self.steps[look - oldest]) is not None]
+        oldest = self.count - len(self.steps)
+        steps = [s for index in range(low + 1, high + 1) if (s := self.steps[index - oldest]) is not None]
         if not steps:
             return None
         high_from_low = steps[0]
@@ -146,11 +152,38 @@ class Ledger:
         return high_from_low if there < here else np.linalg.inv(high_from_low)
 
     def _tidy(self) -> None:
-        """Drop what no page still held back can ask for."""
-        while self.gone and self.gone[0][0] < self.looks - len(self.pages):
-            _, number = self.gone.popleft()
+        """Drop what no pending frame can need."""
+        while self.forgotten and self.forgotten[0][0] < self.count - len(self.pending):
+            _, number = self.forgotten.popleft()
             self.identities.pop(number, None)
-            self.sure.discard(number)
-        oldest = self.looks - len(self.steps)
-        for number in [n for n, past in self.past.items() if past[-1].look <= oldest]:
-            del self.past[number]
+            self.confirmed.discard(number)
+        oldest = self.count - len(self.steps)
+        for number in [n for n, past in self.observations.items() if past[-1].index <= oldest]:
+            del self.observations[number]
+
+
+def smooth_box(box_px: np.ndarray, times: np.ndarray, at: float) -> np.ndarray:
+    """The box (4,) at a time, by straight lines fitted to boxes (N, 4) around it; sides by their logarithm.
+
+    times: (N,) of the boxes, in intervals. Weights are Gaussian, so that the fit is local; a slight pull towards no
+    slope decides where the times do not.
+    """
+    place, size = _weights(tuple((times - at).tolist()))
+    centre = place @ (box_px[:, :2] + box_px[:, 2:] / 2)
+    side = np.exp(size @ np.log(box_px[:, 2:]))
+    return np.concatenate([centre - side / 2, side])
+
+
+@lru_cache(maxsize=1024)
+def _weights(since: tuple[float, ...]) -> np.ndarray:
+    """(2, N) weights of boxes for the place and for the size. Few patterns of times recur again and again."""
+    time = np.array(since)
+    weight = np.exp(-0.5 * (time / _WIDTHS) ** 2)
+    total = weight.sum(axis=1, keepdims=True)
+    once = (weight @ time)[:, None]
+    twice = (weight @ time**2)[:, None] + 1e-3 * _WIDTHS**2
+    return (twice - once * time) * weight / (total * twice - once**2)
+
+
+def _transform(box_px: np.ndarray, here_from_there: np.ndarray | None) -> np.ndarray:
+    return box_px if here_from_there is None else transform_boxes(box_px[None], here_from_there)[0]

@@ -1,7 +1,7 @@
-"""The source's association and the identities that follow from it (appendix C): absolute positions, RGB histograms.
+"""The source's tracker: association of absolute positions and RGB histograms (appendix C).
 
-Every `interval` the last K frames are assigned anew; a target takes the identity of the older target that the newest
-link of that window names. What fails in it is kept: see the tests, and `tracks` for what is done better.
+With every sampled frame, the last K frames are assigned anew; a target takes the identity of the older target that the
+newest link of that window names. What fails in it is kept: see the tests, and `score_tracker` for the improved one.
 """
 
 from collections import deque
@@ -13,47 +13,58 @@ import numpy as np
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking import assignment, jaccard
-from torchvision_dddas.tracking import lagrangian as relaxation
-from torchvision_dddas.tracking.dispersion import dispersion, location_weight, of_window
-from torchvision_dddas.tracking.gating import gate
-from torchvision_dddas.tracking.triplet_scores import pair_gain_over_alone
+from torchvision_dddas.tracking.dual_ascent import assign_triplets
+from torchvision_dddas.tracking.source_affinity import (
+    centres,
+    dispersion,
+    frames_considered,
+    gate,
+    location_weight,
+    normalize_channels,
+    pair_affinity,
+    pair_gain_over_alone,
+    triplet_affinity,
+)
 from torchvision_dddas.types import Detections, Float, Int, Tracks
 
 
-class Look:
-    """What the association knows of a frame; histograms are made when they are first asked for."""
+class Features:
+    """The features of a frame's targets; histograms are computed when first needed."""
 
     def __init__(self, box_px: Float[np.ndarray, "N 4"], histograms: Callable[[], np.ndarray] | None) -> None:
-        """histograms: gives (N, 768) numbers of pixels or shares; None where there is no picture."""
-        self.centre_px = jaccard.centres(box_px)
-        self._make = histograms
-        self._made = np.zeros((len(box_px), 768)) if histograms is None or not len(box_px) else None
+        """histograms: gives (N, 768) counts of pixels or shares; None where there is no picture."""
+        self.centre_px = centres(box_px)
+        self._compute = histograms
+        self._histograms = np.zeros((len(box_px), 768)) if histograms is None or not len(box_px) else None
 
     def __len__(self) -> int:
         return len(self.centre_px)
 
     @property
     def has_picture(self) -> bool:
-        """Whether there are histograms to ask for."""
-        return self._make is not None
+        """Whether there are histograms."""
+        return self._compute is not None
 
     def histogram(self, normalization: str) -> Float[np.ndarray, "N 768"]:
         """The boxes' histograms by the reading that `paper.histogram` names."""
-        if self._made is None and self._make is not None:
-            self._made = np.asarray(self._make(), float)
-            if self._made.shape != (len(self), 768):
+        if self._histograms is None and self._compute is not None:
+            self._histograms = np.asarray(self._compute(), float)
+            if self._histograms.shape != (len(self), 768):
                 raise InputError(
                     f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
-                    f"got {self._made.shape}. Make them with engine.histograms.rgb_histograms."
+                    f"got {self._histograms.shape}. Compute them with tracking.appearance.rgb_histograms."
                 )
-        assert self._made is not None
-        return jaccard.per_channel(self._made) if normalization == "channel" else self._made
+        assert self._histograms is not None
+        return normalize_channels(self._histograms) if normalization == "channel" else self._histograms
 
 
 @dataclass(frozen=True)
 class Association:
-    """How a window was assigned: rows (i, j) or (i, j, k), newest first, from 1, and 0 for the dummy; and by what."""
+    """How a window was assigned.
+
+    rows: (Z, K) indices from 1, newest frame first, 0 for the dummy. weight: of the location. appearance_dispersion:
+    None where it was not needed.
+    """
 
     rows: Int[np.ndarray, "Z K"]
     weight: float
@@ -61,27 +72,28 @@ class Association:
     appearance_dispersion: float | None
 
 
-def associate(window: Sequence[Look], parameters: PaperParameters) -> Association:
+def associate(window: Sequence[Features], parameters: PaperParameters) -> Association:
     """Assign the targets of two or three frames, newest first: weigh, gate, solve."""
-    counts = [len(look) for look in window]
-    location = of_window([dispersion(look.centre_px, parameters.location_cut) for look in window], counts, parameters)
+    counts = [len(frame) for frame in window]
+    considered = window[: frames_considered(counts, parameters)]
+    location = min(dispersion(frame.centre_px, parameters.location_cut) for frame in considered)
 
     def appearance() -> float:
-        found = [dispersion(look.histogram(parameters.histogram), parameters.appearance_cut) for look in window]
-        return of_window(found, counts, parameters)
+        histograms = [frame.histogram(parameters.histogram) for frame in considered]
+        return min(dispersion(histogram, parameters.appearance_cut) for histogram in histograms)
 
-    asked: float | None = None
-    if not all(look.has_picture or not len(look) for look in window):
+    appearance_dispersion: float | None = None
+    if not all(frame.has_picture or not len(frame) for frame in window):
         weight = 1.0
     elif parameters.rule == "fixed":
         weight = parameters.weight
     else:
-        weight, asked = location_weight(location, appearance, parameters.lowest_dispersion)
-    by_location = affinity([look.centre_px for look in window], parameters) if weight > 0 else None
+        weight, appearance_dispersion = location_weight(location, appearance, parameters.lowest_dispersion)
+    by_location = affinity([frame.centre_px for frame in window], parameters) if weight > 0 else None
     by_appearance = (
-        affinity([look.histogram(parameters.histogram) for look in window], parameters) if weight < 1 else None
+        affinity([frame.histogram(parameters.histogram) for frame in window], parameters) if weight < 1 else None
     )
-    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, asked)
+    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, appearance_dispersion)
 
 
 def assign(
@@ -92,7 +104,7 @@ def assign(
 ) -> Int[np.ndarray, "Z K"]:
     """The best assignment of affinities with a dummy first on each axis; a feature of no weight may be None.
 
-    Every real target stands in exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
+    Every real target is in exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
     """
     parts = [(share, score) for share, score in ((weight, location), (1 - weight, appearance)) if score is not None]
     by_feature = parameters.gated == "features"
@@ -105,19 +117,19 @@ def assign(
     if score.ndim == 2:
         return _best_pairs(score)
     if max(score.shape) - 1 <= parameters.exact_targets:
-        return assignment.triplets_exact(score)
-    return relaxation.triplets(score, parameters.gap).triplets
+        return assign_triplets(score, gap=0.0, most_exact=None).triplets
+    return assign_triplets(score, parameters.gap).triplets
 
 
 def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.ndarray:
-    """Of the targets of two or three frames by one feature, newest first, with a dummy first on each axis."""
+    """Affinity of the targets of two or three frames by one feature, newest first, with a dummy first on each axis."""
     if len(features) == 2:
-        return jaccard.pairs(features[0], features[1])
-    return jaccard.triplets(features[0], features[1], features[2], parameters.dummy)
+        return pair_affinity(features[0], features[1])
+    return triplet_affinity(features[0], features[1], features[2], parameters.dummy)
 
 
 def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
-    """As `triplets_exact`, for two frames: what a pair gains over leaving both with the dummy is SciPy's matter."""
+    """The best assignment of two frames, every real target in exactly one row."""
     matched = best_pairs(pair_gain_over_alone(score)) + 1
     rows = [matched]
     for axis, size in enumerate(score.shape):
@@ -128,16 +140,16 @@ def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
     return pairs[np.lexsort(pairs.T[::-1])]
 
 
-class PaperTracker:
-    """The state of a run by the source's association; the same interface as `tracks.Tracker`, and never any delay."""
+class SourceTracker:
+    """The state of a run by the source's association; the interface of `ScoreTracker`, without delay."""
 
-    def __init__(self, settings: Settings, interval_frames: int, size: tuple[float, float] | None = None) -> None:
-        """interval_frames, size: not needed here; what is fed is what is associated, in pixels of the picture."""
+    def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None = None) -> None:
+        """interval, size: not used; positions are compared in pixels of the picture."""
         self.parameters = settings.paper
-        self.window: deque[Look] = deque(maxlen=self.parameters.window)  # newest first
+        self.window: deque[Features] = deque(maxlen=self.parameters.window)  # newest first
         self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window)
         self.next_identity = 1
-        self.association: Association | None = None  # the newest window's, to be looked at
+        self.association: Association | None = None  # of the newest window
 
     def feed(
         self,
@@ -145,20 +157,20 @@ class PaperTracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
-        interval_frames: int | None = None,
+        interval: int | None = None,
     ) -> list[Tracks]:
-        """Take the detections of a frame and give them identities at once.
+        """Add the detections of a frame, and give them identities at once.
 
-        now_from_before, interval_frames: not used; the source compares positions in the picture, whatever the camera
-        did, and however long it took.
-        appearance: gives (N, 768) histograms of the boxes. It is called only where the dispersion of the locations asks
-        for it, which may be while one of the next frames is fed, and at most once.
+        now_from_before, interval: not used. appearance: gives (N, 768) histograms of the boxes. It is called at most
+        once, where the dispersion of the locations requires it, maybe while one of the next frames is fed.
         """
-        self.window.appendleft(Look(detections.box_px, appearance))
+        self.window.appendleft(Features(detections.box_px, appearance))
         identity = np.zeros(len(detections), np.int64)
         if len(self.window) > 1:
             self.association = associate(list(self.window), self.parameters)
-            identity = inherited(self.association.rows, len(detections), list(self.identities)[: len(self.window) - 1])
+            identity = inherit_identities(
+                self.association.rows, len(detections), list(self.identities)[: len(self.window) - 1]
+            )
         new = np.flatnonzero(identity == 0)
         identity[new] = self.next_identity + np.arange(len(new))
         self.next_identity += len(new)
@@ -166,14 +178,14 @@ class PaperTracker:
         return [Tracks(frame, identity, detections.box_px, detections.score, np.arange(len(detections)))]
 
     def end(self) -> list[Tracks]:
-        """Nothing: no frame ever waits."""
+        """Nothing: no frame waits."""
         return []
 
 
-def inherited(
+def inherit_identities(
     rows: Int[np.ndarray, "Z K"], count: int, identities: Sequence[Int[np.ndarray, "N"]]
 ) -> Int[np.ndarray, "N"]:
-    """The identities of the newest frame's targets by the window's links, 0 for who is new.
+    """The identities of the newest frame's targets by the window's links, 0 for a new target.
 
     identities: of the older frames, newest first. The newest link counts: i to j, or i to k where j is the dummy,
     unless another target has that identity by its own link to j.

@@ -1,197 +1,319 @@
-"""From detections to identities, one look at a time."""
+"""Identities of detections: the public tracker, and tracking of whole clips and tables."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.appearance_score import blended, in_doubt, likeness_scores, visible_share
-from torchvision_dddas.tracking.kalman import SEEN, carried_boxes
-from torchvision_dddas.tracking.lookahead import best_links, plausible
-from torchvision_dddas.tracking.scores import Sight, births_of, link_scores, near_border
-from torchvision_dddas.tracking.smoother import FILLED, Ledger
-from torchvision_dddas.tracking.speed_prior import Pace
-from torchvision_dddas.tracking.track_memory import remembered
-from torchvision_dddas.tracking.track_state import Roster, widened
-from torchvision_dddas.types import Detections, Tracks
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import chain
+from torchvision_dddas.tracking.appearance import rgb_histograms, strip_histograms
+from torchvision_dddas.tracking.camera_motion import CameraMotion, Registrar
+from torchvision_dddas.tracking.score_tracker import ScoreTracker
+from torchvision_dddas.tracking.source_tracker import SourceTracker
+from torchvision_dddas.types import (
+    Adjustment,
+    Detections,
+    DetectionTable,
+    Frame,
+    Scene,
+    Source,
+    TrackedFrame,
+    Tracks,
+    is_sampled,
+)
 
-
-@dataclass
-class _Look:
-    """A frame and those of its detections that count. row: of the frame's detections. step: now from the look before.
-
-    appearance: gives the (M, D) histograms. signature: these, (M, 0) until asked for, and visible: share of each box.
-    interval: frames from the look before, were none missing.
-    """
-
-    frame: int
-    box_px: np.ndarray
-    score: np.ndarray
-    row: np.ndarray
-    step: np.ndarray | None
-    appearance: Callable[[], np.ndarray] | None
-    signature: np.ndarray
-    visible: np.ndarray
-    interval: int = 1
-
-    def examine(self) -> None:
-        """Look at the picture, once."""
-        if self.appearance is not None and len(self.row):
-            self.signature, self.visible = self.appearance()[self.row], visible_share(self.box_px)
-        self.appearance = None
-
-    def boxes_before(self) -> np.ndarray:
-        """The boxes in the coordinates of the look before."""
-        return self.box_px if self.step is None else carried_boxes(self.box_px, np.linalg.inv(self.step))
+MOTION = "moving"
+"""The kind of detections that the motion detector makes."""
 
 
 class Tracker:
-    """The state of a run. Feed it frames in order; each call returns the frames that are settled by it, in order.
+    """Gives detections lasting identities, one sampled frame after another.
 
-    A batch run is the same calls one after another, so it gives the same result as a run online. A frame is settled
-    `track.hits` + 2 looks later at the most.
+    A frame is settled some frames later (with `track.mode = paper`, the source's three-frame association, at once);
+    `update` returns the frames that are settled by it, in order, and `flush` the rest.
     """
 
-    def __init__(self, settings: Settings, interval_frames: int, size: tuple[float, float] | None = None) -> None:
-        """interval_frames: usual distance of the frames fed. size: (width, height) of the picture, None if unknown."""
-        self.parameters, self.interval, self.size = settings.track, interval_frames, size
-        self.pace = Pace(self.parameters.speed)
-        self.roster = Roster()
-        self.ledger = Ledger(self.parameters.hits, self.parameters.smooth, interval_frames)
-        self.begun = 0
-        self.before: _Look | None = None
-        self.waiting: _Look | None = None
-        self.seen = self.doubtful = self.births = 0  # detections; those not certain; tracks begun inside the picture
-
-    def feed(
+    def __init__(
         self,
-        frame: int,
-        detections: Detections,
-        now_from_before: np.ndarray | None = None,
-        appearance: Callable[[], np.ndarray] | None = None,
-        interval_frames: int | None = None,
-    ) -> list[Tracks]:
-        """Take the detections of a frame, whose number is above the last one's.
+        settings: Settings | None = None,
+        interval: int = 1,
+        size: tuple[float, float] | None = None,
+        motion: bool | None = None,
+        certain: bool = False,
+    ) -> None:
+        """interval: frames from one sampled frame to the next. size: (width, height) of the pictures, None if unknown.
 
-        now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
-        appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, and maybe with
-        the next frame. interval_frames: from the frame before, where that is not the usual distance.
+        motion: whether the detections are of the motion detector. Then they count as certain, and their boxes scatter
+        as blobs do; None: as the kind of the first ones says. certain: count every score as 1.
+        Raises InputError for an interval below 1 or a size that is not two positive numbers.
         """
-        row = np.flatnonzero(detections.score >= self.parameters.min_score)
-        box = detections.box_px[row]
-        asked = None if self.parameters.appearance == "never" else appearance
-        unknown = np.zeros((len(row), 0), np.float32), np.ones(len(row))
-        interval = self.interval if interval_frames is None else interval_frames
-        look = _Look(frame, box, detections.score[row], row, now_from_before, asked, *unknown, interval)
-        if self.parameters.appearance == "always":
-            look.examine()
-        if not self.parameters.look_ahead:
-            self._decide(look, None)
-        else:
-            if self.waiting is not None:
-                self._decide(self.waiting, look)
-            self.waiting = look
-        return self.ledger.settle()
+        if not isinstance(interval, int | np.integer) or interval < 1:
+            raise InputError(f"interval must be a whole number of frames from 1, got {interval}")
+        if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
+            raise InputError(f"size must be (width, height) in pixels, got {size}")
+        self.settings, self.interval, self.size = settings or Settings(), int(interval), size
+        self.appearance_s = 0.0  # seconds spent on histograms, some of them for earlier frames
+        self._motion, self._certain = motion, certain
+        self._tracker: ScoreTracker | SourceTracker | None = None
+        self._frame: int | None = None
+        self._scores: deque[np.ndarray] = deque()  # as given, of the frames that are not settled
 
-    def end(self) -> list[Tracks]:
+    def update(
+        self,
+        detections: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]",
+        camera_motion: np.ndarray | None = None,
+        image: np.ndarray | None = None,
+        frame: int | None = None,
+        interval: int | None = None,
+    ) -> list[Tracks]:
+        """Add the detections of the next sampled frame; returns the frames that are settled by it.
+
+        detections: a record, (N, 4) boxes x, y, width, height in pixels, or these and (N,) scores. camera_motion:
+        (3, 3) pixel homography from the frame before; None: the camera stood still, or it is unknown. image: (H, W, 3)
+        uint8 BGR or (H, W) grey, where appearance shall count. frame: its number; None: the last one's plus interval,
+        from 1. interval: distance from the frame before, where that is not the usual one.
+        Raises InputError for other shapes, boxes without a size, values that are not finite, and a number that is not
+        above the last one's.
+        """
+        detections = _check_detections(detections)
+        camera_motion = _check_motion(camera_motion)
+        if image is not None and (
+            image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,))
+        ):
+            raise InputError(f"image must be (H, W, 3) or (H, W) uint8, got {image.shape} {image.dtype}")
+        expected = 1 if self._frame is None else self._frame + (interval or self.interval)
+        number = expected if frame is None else frame
+        if self._frame is not None and number <= self._frame:
+            raise InputError(f"frame {number} follows frame {self._frame}; give the frames in order, each once")
+        self._frame = number
+        if self._tracker is None:
+            self._tracker = self._start(detections)
+        self._scores.append(detections.score)
+        if self._motion or self._certain:
+            detections = replace(detections, score=np.ones(len(detections)))
+        appearance = None if image is None else self._histograms(image, detections.box_px)
+        return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance, interval))
+
+    def flush(self) -> list[Tracks]:
+        """The frames that are not settled yet, at the end of a run."""
+        return self._with_given_scores(self._tracker.end()) if self._tracker is not None else []
+
+    def _start(self, detections: Detections) -> "ScoreTracker | SourceTracker":
+        if self._motion is None:
+            self._motion = detections.kind == MOTION
+        settings, track = self.settings, self.settings.track
+        if self._motion:  # blobs come in parts, with shadows, and joined
+            blobs = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter, "births": track.own_births}
+            settings = settings.model_copy(update={"track": track.model_copy(update=blobs)})
+        tracker = SourceTracker if track.mode == "paper" else ScoreTracker
+        return tracker(settings, self.interval, self.size)
+
+    def _histograms(self, image: np.ndarray, box_px: np.ndarray) -> Callable[[], np.ndarray]:
+        histograms = rgb_histograms if self.settings.track.mode == "paper" else strip_histograms
+
+        def compute() -> np.ndarray:
+            start = time.perf_counter()
+            found = histograms(image, box_px)
+            self.appearance_s += time.perf_counter() - start
+            return found
+
+        return compute
+
+    def _with_given_scores(self, settled: list[Tracks]) -> list[Tracks]:
+        found = []
+        for tracks in settled:
+            given, score = self._scores.popleft(), np.array(tracks.score, float)
+            is_detection = tracks.row >= 0
+            score[is_detection] = given[tracks.row[is_detection]]
+            found.append(replace(tracks, score=score))
+        return found
+
+
+def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]") -> Detections:
+    if isinstance(given, Detections):
+        box, score, record = given.box_px, given.score, given
+    else:
+        has_scores = isinstance(given, tuple) and len(given) == 2
+        try:
+            box = np.asarray(given[0] if has_scores else given, float)
+            score = np.asarray(given[1], float) if has_scores else np.ones(len(box))
+        except (TypeError, ValueError):
+            raise InputError("detections must be a Detections record, (N, 4) boxes, or (boxes, scores)") from None
+        box = box.reshape(0, 4) if box.size == 0 else box
+        if box.ndim != 2 or box.shape[1] != 4:
+            raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
+        unknown = np.full(len(box), np.nan)
+        record = Detections(box, score, box[:, 2] * box[:, 3], unknown, unknown, kind="given")
+    if box.ndim != 2 or box.shape[1] != 4:
+        raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
+    if score.shape != (len(box),):
+        raise InputError(f"scores must be one a box, ({len(box)},); got {score.shape}")
+    if not (np.isfinite(box).all() and np.isfinite(score).all()):
+        raise InputError("boxes and scores must be finite; leave out detections that are unknown")
+    if len(box) and not (box[:, 2:] > 0).all():
+        row = int((box[:, 2:] <= 0).any(axis=1).argmax())
+        width, height = box[row, 2:]
+        raise InputError(f"width and height must be above 0 px, got {width:g} x {height:g} in box {row}")
+    return record
+
+
+def _check_motion(camera_motion: np.ndarray | None) -> np.ndarray | None:
+    if camera_motion is None:
+        return None
+    motion = np.asarray(camera_motion, float)
+    if motion.shape != (3, 3) or not np.isfinite(motion).all():
+        raise InputError(f"camera_motion must be a finite (3, 3) homography; got shape {motion.shape}")
+    return motion
+
+
+class FrameTracker:
+    """A tracker of whole records: it keeps each frame until its tracks are settled."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        interval: int,
+        size: tuple[float, float] | None,
+        motion: bool | None = False,
+        certain: bool = False,
+        pictures: bool = True,
+    ) -> None:
+        """As Tracker. pictures: whether settled frames keep their pictures, which are most of a long run's memory."""
+        self.interval, self.pictures = interval, pictures
+        self.tracker = Tracker(settings, interval, size, motion, certain)
+        self._waiting: deque[TrackedFrame] = deque()
+
+    def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
+        """Add a frame, whose tracks are not known yet; yields the frames that are settled by it."""
+        frame, before, start = given.frame, self.tracker.appearance_s, time.perf_counter()
+        interval = max(self.interval, frame.skipped + 1) if frame is not None and frame.skipped else None
+        image = frame.image if frame is not None else None
+        settled = self.tracker.update(given.detections, given.now_from_before, image, given.number, interval)
+        appearance_s = self.tracker.appearance_s - before
+        seconds = {"appearance": appearance_s, "track": time.perf_counter() - start - appearance_s}
+        if frame is not None and not self.pictures:
+            given = replace(given, frame=without_picture(frame))
+        self._waiting.append(replace(given, seconds=given.seconds | seconds))
+        yield from self._settle(settled)
+
+    def flush(self) -> Iterator[TrackedFrame]:
         """The frames that were still waiting."""
-        if self.waiting is not None:
-            self._decide(self.waiting, None)
-            self.waiting = None
-        return self.ledger.settle(everything=True)
+        yield from self._settle(self.tracker.flush())
 
-    def _decide(self, look: _Look, ahead: _Look | None) -> None:
-        """Link a look's detections to the tracks, in view of the next look where there is one."""
-        if look.step is not None:
-            self.roster = self.roster.carried(look.step)
-        if self.before is not None:
-            before = self.before.box_px if look.step is None else carried_boxes(self.before.box_px, look.step)
-            self.pace.add(before, look.box_px, look.frame - self.before.frame)
-        self.seen += len(look.score)
-        self.doubtful += int((look.score < 1).sum())
-        links = self._scores(self.roster, look, look.box_px)
-        unexamined = [near for near in (look, ahead) if near is not None and near.appearance is not None]
-        if unexamined and in_doubt(links, self.roster.signature):
-            for near in unexamined:
-                near.examine()
-            links = self._scores(self.roster, look, look.box_px)
-        tracks, now = plausible(links)
-        born = self._born(look)
-        followed = self._followed(look, tracks, now, born.at_border)
-        if ahead is not None and len(ahead.row):
-            onward = self._scores(followed.plus(born).plus(self.roster), ahead, ahead.boxes_before())
-            parts = np.split(onward, [len(followed), len(followed) + len(born)])
-            chosen = best_links(links[tracks, now], tracks, now, *parts)
-        else:
-            best = best_pairs(links)
-            chosen = np.isin(tracks * len(look.row) + now, best[:, 0] * len(look.row) + best[:, 1])
-        self._commit(look, tracks[chosen], now[chosen], followed.only(chosen), born)
-        self.before = look
+    def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
+        for tracks in settled:
+            yield replace(self._waiting.popleft(), tracks=tracks)
 
-    def _sight(self, look: _Look) -> Sight:
-        doubt = self.doubtful / max(self.seen, 1)
-        births = births_of(self.births, self.seen, doubt, self.interval)
-        return Sight(look.frame, look.interval, self.pace.speed, births, doubt, self.size)
 
-    def _scores(self, roster: Roster, look: _Look, box_px: np.ndarray) -> np.ndarray:
-        """(N, M) scores of links to a look's detections, whose boxes are given in the roster's coordinates."""
-        scores = link_scores(roster.state, roster.at_border, box_px, self._sight(look), self.parameters)
-        if roster.signature.shape[1] and look.signature.shape[1]:
-            scores += likeness_scores(roster.signature, look.signature, look.visible, self.parameters)
-        return scores
+def without_picture(frame: Frame) -> Frame:
+    """The frame with a black picture of the same size, which takes no memory."""
+    return replace(frame, image=np.broadcast_to(np.uint8(0), frame.image.shape))
 
-    def _followed(self, look: _Look, tracks: np.ndarray, now: np.ndarray, at_border: np.ndarray) -> Roster:
-        """The tracks (K,) after a detection (K,) each. at_border: (M,) which of the look's detections are."""
-        old, box, sight = self.roster, look.box_px[now], self._sight(look)
-        later = kalman.predicted(old.state[tracks], look.frame, sight.agility(self.parameters))
-        hits = old.hits[tracks] + 1
-        width = max(old.signature.shape[1], look.signature.shape[1])
-        signature, seen = widened(old.signature, width)[tracks], widened(look.signature, width)[now]
-        return Roster(
-            kalman.updated(later, box, look.frame, self.parameters.scatter, self.parameters.size_scatter),
-            blended(signature, seen, look.visible[now], hits) if width else signature,
-            at_border[now],
-            old.number[tracks],
-            hits,
+
+def track_scenes(
+    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
+) -> Iterator[TrackedFrame]:
+    """Identities of a clip's own detections at frames 1, 1 + interval, ... The scenes' registrations are chained."""
+    tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures)
+    steps: list[np.ndarray] = []
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = {}
+    for scene in scenes:
+        # An unknown step is left out: the product of the others is nearer to the truth than a camera that stood still.
+        if scene.step is not None and scene.step.reliable:
+            steps.append(scene.step.later_from_earlier)
+        adjustments += scene.adjustments
+        for stage, spent in scene.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent
+        number = scene.frame.number
+        if not is_sampled(number, interval):
+            continue
+        motion = chain(steps) if steps else None
+        found = TrackedFrame(
+            number,
+            scene.frame,
+            scene.detections,
+            Tracks(number),
+            motion,
+            cause=scene.cause,
+            adjustments=adjustments,
+            seconds=seconds,
         )
+        yield from tracker.update(found)
+        steps, adjustments, seconds = [], (), {}
+    yield from tracker.flush()
 
-    def _born(self, look: _Look) -> Roster:
-        """Tracks that would begin with each detection (M,) of a look, without numbers yet."""
-        box, count = look.box_px, len(look.row)
-        return Roster(
-            kalman.started(box, look.frame, self.parameters.scatter, self.pace.speed, self.parameters.size_scatter),
-            look.signature,
-            near_border(box, self.size),
-            np.full(count, -1),
-            np.ones(count, np.int64),
-        )
 
-    def _commit(self, look: _Look, tracks: np.ndarray, now: np.ndarray, followed: Roster, born: Roster) -> None:
-        """Write down that these tracks (K,), now `followed`, have these detections (K,), and begin new ones."""
-        unmatched = np.ones(len(look.row), bool)
-        unmatched[now] = False
-        beginning = unmatched & (look.score >= self.parameters.birth_score)
-        new = np.flatnonzero(beginning)
-        begun = replace(born.only(beginning), number=self.begun + np.arange(len(new)))
-        self.begun += len(begun)
-        if self.before is not None:
-            self.births += int((~begun.at_border).sum())
-        unseen = np.ones(len(self.roster), bool)
-        unseen[tracks] = False
-        self.roster = self.roster.only(unseen).plus(followed).plus(begun)
-        number, at = np.concatenate([followed.number, begun.number]), np.concatenate([now, new])
-        self.ledger.write(look.frame, number, look.box_px[at], look.score[at], look.row[at], look.step)
-        self._forget(look)
+def track_clip(
+    source: Source, table: DetectionTable, engine: Registrar, settings: Settings, interval: int
+) -> Iterator[TrackedFrame]:
+    """Identities of a table of detections along its clip, at frames 1, 1 + interval, ...
 
-    def _forget(self, look: _Look) -> None:
-        """Drop the tracks that were lost too long ago, or left, or were seen too seldom to be anything."""
-        keep = remembered(self.roster.state, look.frame, look.interval, self.size, self.parameters)
-        late = look.frame - self.roster.state[:, SEEN] > (FILLED + 1) * look.interval
-        if late.any():
-            keep &= ~late | self.ledger.confirmed(self.roster.number)
-        if not keep.all():
-            self.ledger.forget(self.roster.number[~keep])
-            self.roster = self.roster.only(keep)
+    The camera's motion is estimated from one picture to the next that can be read. Frames that cannot be read, or lie
+    after the clip's end, are tracked without picture.
+    """
+    tracker, camera, number = _table_tracker(table, settings, interval, source.size), CameraMotion(engine), 1
+    unread = "the frame could not be read"
+    start = time.perf_counter()
+    for frame in source.every(interval):
+        read = time.perf_counter()
+        for missing in range(number, frame.number, interval):
+            yield from tracker.update(_frame_of(table, missing, cause=unread))
+        number = frame.number + interval
+        motion, cause = camera.update(frame.image)
+        seconds = {"read": read - start, "register": time.perf_counter() - read}
+        yield from tracker.update(_frame_of(table, frame.number, frame, motion, cause, seconds))
+        start = time.perf_counter()
+    for missing in range(number, max(source.last, table.last) + 1, interval):
+        yield from tracker.update(_frame_of(table, missing, cause=unread))
+    yield from tracker.flush()
+
+
+def track_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[TrackedFrame]:
+    """Identities of a table alone, from its first to its last row: no camera motion, no appearance.
+
+    Frames without rows are empty. Of a long stretch of these, those between the frame when all tracks are forgotten and
+    the one before the next row are left out.
+    """
+    tracker = _table_tracker(table, settings, interval, table.extent)
+    forgotten = settings.track.memory_frames + (settings.track.hits + 3) * interval
+    for number in _table_frames(table, interval, forgotten):
+        yield from tracker.update(_frame_of(table, number))
+    yield from tracker.flush()
+
+
+def _table_frames(table: DetectionTable, interval: int, forgotten: int) -> Iterator[int]:
+    """Each sampled frame, but of a stretch without rows only the first `forgotten` frames and the last one.
+
+    One stray row must not cost a million empty frames.
+    """
+    if not len(table):
+        return
+    start, last = table.first + -(table.first - 1) % interval, table.last - (table.last - 1) % interval
+    for row in np.union1d(table.frame[is_sampled(table.frame, interval)], [last]).tolist():
+        quiet = range(start, min(row, start + forgotten), interval)
+        yield from quiet
+        yield from range(max(start + len(quiet) * interval, row - interval), row + 1, interval)
+        start = row + interval
+
+
+def _table_tracker(
+    table: DetectionTable, settings: Settings, interval: int, size: tuple[float, float] | None
+) -> FrameTracker:
+    return FrameTracker(settings, interval, size, motion=table.own, certain=table.certain)
+
+
+def _frame_of(
+    table: DetectionTable,
+    number: int,
+    frame: Frame | None = None,
+    motion: np.ndarray | None = None,
+    cause: str = "",
+    seconds: dict[str, float] | None = None,
+) -> TrackedFrame:
+    lines = table.line[table.rows(number)]
+    return TrackedFrame(number, frame, table.at(number), Tracks(number), motion, lines, cause, seconds=seconds or {})

@@ -16,10 +16,15 @@ from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.functional.soft import step
-from torchvision_dddas.tracking.dispersion import dissimilarity, joined_at, speaking
-from torchvision_dddas.tracking.gating import alternatives, raised
-from torchvision_dddas.tracking.source_tracker import Look, affinity
-from torchvision_dddas.tracking.triplet_scores import pair_gain_over_alone
+from torchvision_dddas.tracking.source_affinity import (
+    best_alternatives,
+    blend_gate,
+    dissimilarity,
+    frames_considered,
+    joined_at,
+    pair_gain_over_alone,
+)
+from torchvision_dddas.tracking.source_tracker import Features, affinity
 from torchvision_dddas.tuning.examples import boxed
 from torchvision_dddas.tuning.family import Example, Tick
 
@@ -164,7 +169,7 @@ def _windows(
     clip: Clip, table: TrackTable, parameters: PaperParameters, interval: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
     """The newer frame's number and what is known of it and the one before."""
-    before: tuple[np.ndarray, Look] | None = None
+    before: tuple[np.ndarray, Features] | None = None
     for number, identity, look in _looks(clip, table, interval):
         if before is not None:
             yield number, window_of((look, before[1]), (identity, before[0]), parameters)
@@ -172,7 +177,7 @@ def _windows(
 
 
 def window_of(
-    looks: tuple[Look, Look], identities: tuple[np.ndarray, np.ndarray], parameters: PaperParameters
+    looks: tuple[Features, Features], identities: tuple[np.ndarray, np.ndarray], parameters: PaperParameters
 ) -> dict[str, np.ndarray]:
     """One of `Windows`, without its first axis. looks, identities: newer frame first."""
     counts = [len(look) for look in looks]
@@ -187,24 +192,24 @@ def window_of(
             joined[place, frame, :count, :count] = joined_at(dissimilarity(pair[frame]))
     return {
         "similarity": similarity,
-        "alternative": np.stack([alternatives(score, parameters.gate) for score in similarity]),
+        "alternative": np.stack([best_alternatives(score, parameters.gate) for score in similarity]),
         "now": np.ones(counts[0], bool),
         "before": np.ones(counts[1], bool),
         "true": identities[0][:, None] == identities[1][None],
         "joined_at": joined,
         "there": there,
-        "speaks": np.arange(2) < speaking(counts, parameters),
+        "speaks": np.arange(2) < frames_considered(counts, parameters),
         "pictured": np.array(pictured),
     }
 
 
-def _looks(clip: Clip, table: TrackTable, interval: int) -> Iterator[tuple[int, np.ndarray, Look]]:
+def _looks(clip: Clip, table: TrackTable, interval: int) -> Iterator[tuple[int, np.ndarray, Features]]:
     """Number, identities and look of each frame from the first to the last with boxes."""
-    from torchvision_dddas.tracking.histograms import rgb_histograms
+    from torchvision_dddas.tracking.appearance import rgb_histograms
 
     for number, identity, box_px, image in boxed(clip, table, interval):
         counted = None if image is None else rgb_histograms(image, box_px)
-        yield number, identity, Look(box_px, None if counted is None else lambda counted=counted: counted)  # type: ignore[misc]
+        yield number, identity, Features(box_px, None if counted is None else lambda counted=counted: counted)  # type: ignore[misc]
 
 
 # Of messages; more change the loss by less than a hundredth where targets crowd.
@@ -249,7 +254,7 @@ def link_gains(parameters: PaperParameters, windows: Windows, softness: float = 
     weight = location_weight(parameters, windows, softness)
     share = torch.stack([weight, 1 - weight], 1)[:, :, None, None]
     how_far = step(1 - parameters.threshold - windows.alternative, softness).to(windows.similarity)
-    gain: Tensor = pair_gain_over_alone((share * raised(windows.similarity, how_far, parameters.threshold)).sum(1))
+    gain: Tensor = pair_gain_over_alone((share * blend_gate(windows.similarity, how_far, parameters.threshold)).sum(1))
     return gain
 
 

@@ -18,12 +18,18 @@ from torchvision_dddas.evaluation.studies.record import Task
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.appearance_score import blended, likeness, scores_of, visible_share
-from torchvision_dddas.tracking.kalman import carried_boxes
-from torchvision_dddas.tracking.scores import Sight, births_of, link_scores, near_border
+from torchvision_dddas.tracking.appearance import appearance_scores, blend_histograms, similarity, visible_shares
+from torchvision_dddas.tracking.kalman import transform_boxes
+from torchvision_dddas.tracking.scores import (
+    SceneState,
+    SpeedPrior,
+    association_scores,
+    birth_rate,
+    blend_speed,
+    is_near_border,
+    is_remembered,
+)
 from torchvision_dddas.tracking.smoother import FILLED
-from torchvision_dddas.tracking.speed_prior import Pace, speed_of
-from torchvision_dddas.tracking.track_memory import remembered
 from torchvision_dddas.tuning.examples import Owned, boxed, owned
 from torchvision_dddas.tuning.family import Example, Tick
 from torchvision_dddas.types import DetectionTable
@@ -124,7 +130,7 @@ class Looks:
     """Stretches of clips, T looks each, in which box n is always target n; float64 but for what is yes or no.
 
     frame: numbers. interval: usual distance of the looks. size: width and height of the picture. usual, known: of the
-    pace. births, doubt: as `Sight` has them. box_px: x, y, width, height, any where none is there. there: whether a
+    speed prior. births, doubt: as in SceneState. box_px: x, y, width, height, any where none is there. there: whether a
     target is seen. certain: with the score 1. begins: with a score that may begin a track. step: homographies from the
     look before. likeness: of tracks (rows) and boxes, NaN where unknown. visible: shares of the boxes. own: whether the
     boxes are of moving targets that were found in the clip.
@@ -195,13 +201,13 @@ class _Look:
 
 
 def _looks(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Iterator[_Look]:
-    pace, before = Pace(settings.track.speed), None
+    pace, before = SpeedPrior(settings.track.speed), None
     size = _size(clip, boxes)
     seen, doubtful, births, known = 0, 0, 0, set[int]()
     for number, identity, box_px, step, signature in _shown(clip, boxes.table, settings, interval):
         score = boxes.score[boxes.table.frame == number]
         if before is not None:
-            pace.add(before if step is None else carried_boxes(before, step), box_px, interval)
+            pace.add(before if step is None else transform_boxes(before, step), box_px, interval)
         seen += len(box_px)
         doubtful += int((score < 1).sum())
         doubt = doubtful / max(seen, 1)
@@ -210,13 +216,13 @@ def _looks(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Itera
             "size": np.array(size, float),
             "usual": pace.usual,
             "known": float(pace.known),
-            "births": births_of(births, seen, doubt, interval),
+            "births": birth_rate(births, seen, doubt, interval),
             "doubt": doubt,
             "own": boxes.own,
         }
         yield _Look(number, identity, box_px, score, step, signature, fixed)
         begun = (score >= settings.track.birth_score) & ~np.isin(identity, list(known))
-        births += int((begun & ~near_border(box_px, size)).sum()) if before is not None else 0
+        births += int((begun & ~is_near_border(box_px, size)).sum()) if before is not None else 0
         known |= set(identity[begun].tolist())
         before = box_px
 
@@ -240,16 +246,16 @@ def _shown(
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]]:
     """Number, identities, boxes, camera's motion and histograms of each look from the first to the last with boxes."""
     from torchvision_dddas.detection import load_engine
-    from torchvision_dddas.tracking.appearance import strips
-    from torchvision_dddas.tracking.camera_motion import Camera
+    from torchvision_dddas.tracking import CameraMotion
+    from torchvision_dddas.tracking.appearance import strip_histograms
 
-    camera, looks_matter = Camera(load_engine("onboard", settings)), settings.track.appearance != "never"
+    camera, looks_matter = CameraMotion(load_engine("onboard", settings)), settings.track.appearance != "never"
     for number, identity, box_px, image in boxed(clip, table, interval):
         if image is None:
             yield number, identity, box_px, None, None
             continue
-        step, _ = camera.step(image)
-        yield number, identity, box_px, step, strips(image, box_px) if looks_matter else None
+        step, _ = camera.update(image)
+        yield number, identity, box_px, step, strip_histograms(image, box_px) if looks_matter else None
 
 
 def _stacked(looks: Sequence[_Look], birth_score: float) -> dict[str, np.ndarray]:
@@ -262,13 +268,13 @@ def _stacked(looks: Sequence[_Look], birth_score: float) -> dict[str, np.ndarray
     for t, look in enumerate(looks):
         here = np.searchsorted(names, look.identity)
         box_px[t, here], score[t, here] = look.box_px, look.score
-        visible[t, here] = visible_share(look.box_px)
+        visible[t, here] = visible_shares(look.box_px)
         if look.signature is not None and len(here):
             if signature is None:
                 signature = np.zeros((len(names), look.signature.shape[1]))
-            alike[t][:, here] = likeness(signature, look.signature)
+            alike[t][:, here] = similarity(signature, look.signature)
             hits[here] += 1
-            signature[here] = blended(signature[here], look.signature, visible[t, here], hits[here])
+            signature[here] = blend_histograms(signature[here], look.signature, visible[t, here], hits[here])
     fixed = {key: np.stack([np.asarray(look.fixed[key]) for look in looks]) for key in looks[0].fixed}
     once = {key: fixed.pop(key)[0] for key in ("interval", "size", "own")}
     return {
@@ -330,19 +336,19 @@ def unlikeliness(
         known: Any = looks.known[:, look, None]
         doubt: Any = looks.doubt[:, look, None]
         births: Any = looks.births[:, look, None, None]
-        speed = speed_of(parameters.speed, usual, known)
-        sight = Sight(frame, interval, speed, births, doubt, size)
-        begun: Any = kalman.started(box, frame, mine.scatter, speed, mine.size_scatter)
+        speed = blend_speed(parameters.speed, usual, known)
+        sight = SceneState(frame, interval, speed, births, doubt, size)
+        begun: Any = kalman.start(box, frame, mine.scatter, speed, mine.size_scatter)
         if tracks is None:
             no = torch.zeros_like(there)
             tracks = _Tracks(begun, no, torch.zeros_like(there, dtype=torch.int64), no, no)
         elif moves:
             step: Any = looks.step[:, look]
-            tracks.state = kalman.carried(tracks.state, step)
+            tracks.state = kalman.transform(tracks.state, step)
         if tracks.alive.any():
-            score: Any = link_scores(tracks.state, tracks.left, box, sight, mine)
+            score: Any = association_scores(tracks.state, tracks.left, box, sight, mine)
             if compares:
-                score = score + scores_of(likeness[:, look], visible[:, look], parameters)
+                score = score + appearance_scores(likeness[:, look], visible[:, look], parameters)
             true = tracks.alive & there
             margin = wrong - (wrong + missed) * torch.eye(score.shape[-1]).to(score)
             rival = score + margin
@@ -363,21 +369,23 @@ def _dense(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"]:
     return torch.take_along_dim(score, first[..., None], -2)
 
 
-def _after(tracks: _Tracks, begun: Any, looks: Looks, look: int, sight: Sight, parameters: TrackParameters) -> _Tracks:
+def _after(
+    tracks: _Tracks, begun: Any, looks: Looks, look: int, sight: SceneState, parameters: TrackParameters
+) -> _Tracks:
     """The tracks after a look, each with its own box: `Tracker._commit` on what is true."""
     box: Any = looks.box_px[:, look]
     there, certain = looks.there[:, look], looks.certain[:, look]
     on = there & tracks.alive
-    later: Any = kalman.predicted(tracks.state, sight.frame, sight.agility(parameters))
-    seen: Any = kalman.updated(later, box, sight.frame, parameters.scatter, parameters.size_scatter)
+    later: Any = kalman.predict(tracks.state, sight.frame, sight.agility(parameters))
+    seen: Any = kalman.update(later, box, sight.frame, parameters.scatter, parameters.size_scatter)
     new = there & ~tracks.alive & looks.begins[:, look]
     state = torch.where(on[..., None], seen, torch.where(new[..., None], begun, tracks.state))
     hits = torch.where(new, 1, tracks.hits + on.long())
     sure = (tracks.sure & ~new) | ((on | new) & certain) | (hits >= parameters.hits)
     held: Any = state.detach()
-    kept: Any = remembered(held, sight.frame, sight.interval, sight.size, parameters)
+    kept: Any = is_remembered(held, sight.frame, sight.interval, sight.size, parameters)
     late = sight.frame - state[..., kalman.SEEN] > (FILLED + 1) * sight.interval
-    at_border: Any = near_border(box, sight.size)
+    at_border: Any = is_near_border(box, sight.size)
     left = torch.where(on | new, at_border, tracks.left)
     return _Tracks(state, (tracks.alive | new) & kept & (sure | ~late), hits, sure, left)
 

@@ -14,7 +14,7 @@ from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.studies.record import Source
 from torchvision_dddas.evaluation.studies.stages import KNOBS, allowed, find, narrowed, opened, scenes_again, upstream
 from torchvision_dddas.io.images import decode_image
-from torchvision_dddas.tracking.sequence import follow_scenes
+from torchvision_dddas.tracking import track_scenes
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_tracks_of_what_was_kept_are_those_of_a_run_of_the_clip(clips, interval)
     clip, settings = clips["tracks"], load_config()
     source = opened(clip)
     scenes = detect_motion(source, settings, "onboard")
-    wanted = list(follow_scenes(scenes, settings, interval, source.size))
+    wanted = list(track_scenes(scenes, settings, interval, source.size))
     found = found_in(clip, "tracking", settings, interval)
     assert found.looked.tolist() == [followed.number for followed in wanted]
     assert found.identity.tolist() == [i for followed in wanted for i in followed.tracks.identity.tolist()]

@@ -158,12 +158,12 @@ def scenes_again(clip: Clip, found: Found) -> Iterator[Scene]:
 def _tracking(clip: Clip, settings: Settings, backend: str, interval: int, before: Found | None, tick: Tick) -> Rows:
     """Identities: `dddas track CLIP`, or of the data set's own detections."""
     from torchvision_dddas.io.detection_tables import read_detections
-    from torchvision_dddas.tracking.sequence import follow_scenes
+    from torchvision_dddas.tracking import track_scenes
 
     if upstream(clip, "tracking") is not None:
         assert before is not None, "tracks are of what was seen to move"
         size = opened(clip).size
-        return followed_kept(follow_scenes(scenes_again(clip, before), settings, interval, size, False), tick)
+        return followed_kept(track_scenes(scenes_again(clip, before), settings, interval, size, False), tick)
     assert clip.given is not None, "allowed() asks for tracks where there is something to follow"
     return _followed(clip, read_detections(clip.given), settings, backend, interval, tick)
 
@@ -191,16 +191,16 @@ def _followed(clip: Clip, table: "DetectionTable", settings: Settings, backend: 
     """A table along the clip's pictures, or alone where it has none."""
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.detection_tables import check_table
-    from torchvision_dddas.tracking.sequence import follow_clip, follow_table
+    from torchvision_dddas.tracking import track_clip, track_table
 
     if not clip.pictures:
         notes = check_table(table, interval)
-        rows = followed_kept(follow_table(table, settings, interval), tick)
+        rows = followed_kept(track_table(table, settings, interval), tick)
         rows.notes += notes
         return rows
     source = opened(clip)
     notes = check_table(table, interval, source)
-    rows = followed_kept(follow_clip(source, table, load_engine(backend, settings), settings, interval), tick)
+    rows = followed_kept(track_clip(source, table, load_engine(backend, settings), settings, interval), tick)
     rows.notes += [*notes, *map(str, source.problems)]
     return rows
 
