@@ -656,6 +656,11 @@ class Fix:
     changes: tuple[str, ...] = ()
     cause: str = ""
 
+    @property
+    def is_used(self) -> tuple[bool, ...]:
+        """Of each landmark seen, whether it took part in locating the frame."""
+        return tuple(state in ("used", "reassigned") for state in self.state)
+
 
 @dataclass(frozen=True)
 class Elevation:

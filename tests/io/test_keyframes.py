@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.report.keyframes import MOST, KeyFrames
+from torchvision_dddas.io.output.key_frames import MOST, KeyFrames
 
 PICTURE = np.full((24, 32, 3), 90, np.uint8)
 

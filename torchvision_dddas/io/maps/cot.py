@@ -1,4 +1,4 @@
-"""GroundLocations targets as Cursor-on-Target events, the XML that situational-awareness tools exchange."""
+"""Located targets as Cursor-on-Target events, the XML that situational-awareness tools exchange."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from torchvision_dddas.io.maps.ellipses import semi_axes
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks, iso_utc
-from torchvision_dddas.io.maps.kml import plain
+from torchvision_dddas.io.maps.kml import xml_text
 
 UNKNOWN = "9999999.0"
 """A height or an error that is not known."""
@@ -35,15 +35,15 @@ def cot(tracks: GroundTracks, source: str = "dddas") -> str:
     lines = []
     for row, (sigma_m, _), until in zip(rows.tolist(), axes.tolist(), stale, strict=True):
         longitude, latitude = tracks.lonlat_deg[row].tolist()
-        uid = name(source, tracks.start_utc_s, tracks.target[row])
+        uid = event_uid(source, tracks.start_utc_s, tracks.target[row])
         when = tracks.times_utc[row], until
         lines.append(event(uid, tracks.target[row], when, (longitude, latitude), sigma_m, tracks.velocity_m_s[row]))
     return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + "".join(lines) + "</events>\n"
 
 
-def name(source: str, start_utc_s: float, target: int) -> str:
-    """What tells a target of a run from all others."""
-    return f"{plain(source)}-{start_utc_s:.0f}-{target}"
+def event_uid(source: str, start_utc_s: float, target: int) -> str:
+    """The uid of a target of a run."""
+    return f"{xml_text(source)}-{start_utc_s:.0f}-{target}"
 
 
 def event(

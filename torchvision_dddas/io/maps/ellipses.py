@@ -1,14 +1,19 @@
-"""How well a place is known, as an ellipse that holds the true place with a probability of 95 %."""
+"""Error ellipses of places, and lines and rings on the ellipsoid for maps that end at 180 degrees of longitude."""
+
+import math
+from itertools import pairwise
 
 import numpy as np
 
-from torchvision_dddas.io.maps.ground_tracks import GroundTracks
+_AXIS_M, _SQUARED_ECCENTRICITY = 6_378_137.0, 6.694379990141316e-3  # WGS84
 
+Place = list[float]
+"""Longitude and latitude in degrees."""
 CHI2_95 = 5.991464547107979
-"""What a chi-squared variable of two degrees of freedom stays below in 95 % of all cases: -2 ln 0.05."""
+"""The 95 % quantile of chi-squared with two degrees of freedom, -2 ln 0.05."""
 
-MOST = 2_000
-"""A map shows about one ellipse a second of each target, but fewer where there would be more than so many."""
+Place = list[float]
+"""Longitude and latitude in degrees."""
 
 
 def semi_axes(covariance_m2: np.ndarray, chi2: float = CHI2_95) -> tuple[np.ndarray, np.ndarray]:
@@ -32,15 +37,72 @@ def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.
     return axes_m[:, None, :1] * np.cos(turn)[:, None] * along + axes_m[:, None, 1:] * np.sin(turn)[:, None] * across
 
 
-def shown(tracks: GroundTracks, every_s: float = 1.0, most: int = MOST) -> np.ndarray:
-    """(K,) rows whose ellipses a map shows: of each target the last, and about one each every_s before it.
+def rounded(lonlat_deg: np.ndarray) -> list[Place]:
+    """Places to 1e-8 of a degree, which is a millimetre."""
+    found: list[Place] = np.round(lonlat_deg, 8).tolist()
+    return found
 
-    The times between are lengthened where there would be more than `most`, but each target's last is shown always.
+
+def cut_line(places: list[Place]) -> list[list[Place]]:
+    """The line as lines of which none goes over 180 degrees; their ends there are no places of the line."""
+    # Most lines go nowhere near, and are long.
+    if len(places) < 2 or np.abs(np.diff([place[0] for place in places])).max() <= 180:
+        return [places]
+    lines = [places[:1]]
+    for before, after in pairwise(places):
+        if abs(after[0] - before[0]) > 180:
+            edge = math.copysign(180.0, before[0])
+            # Degrees to the edge, and from it on the other side.
+            here, there = abs(edge - before[0]), abs(-edge - after[0])
+            share = here / (here + there) if here + there > 0 else 0.0
+            latitude = round(before[1] + share * (after[1] - before[1]), 8)
+            lines[-1].append([edge, latitude])
+            lines.append([[-edge, latitude]])
+        lines[-1].append(after)
+    return lines
+
+
+def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
+    """A small ring of metres about a place as closed rings in degrees, two where it lies on both sides of 180 degrees.
+
+    ring_m: (K, 2) metres east and north, convex and anticlockwise, as the rings will be. Degrees a metre are those at
+    the place: on the ellipsoid 100 m off are 1 mm out. None where the ring comes too near a pole to be a ring there.
     """
-    known = np.isfinite(tracks.covariance_m2).all(axis=(1, 2))
-    span = sum(
-        float(t[-1] - t[0]) for t in (tracks.time_s[rows] for rows in tracks.of.values()) if np.isfinite(t).all()
-    )
-    apart = max(every_s, span / most)
-    rows = [row for of in tracks.of.values() for row in tracks.spaced(apart, of)]
-    return np.array([row for row in rows if known[row]], int)
+    longitude, latitude = (float(v) for v in lonlat_deg)
+    reach = float(np.hypot(*ring_m.T).max())
+    to_pole_m = (90 - abs(latitude)) * 111_000
+    # Within a tenth of the way to the pole a degree of longitude changes its length by as much.
+    if not reach <= to_pole_m / 10:
+        return []
+    degrees = (longitude, latitude) + ring_m * degrees_per_metre(latitude)
+    if np.abs(degrees[:, 0]).max() <= 180:
+        parts = [degrees]
+    else:
+        edges = (-540.0, -180.0, 180.0)
+        parts = [_clip(_clip(degrees, west, 1.0), west + 360, -1.0) - (west + 180, 0.0) for west in edges]
+    rings = [rounded(part) for part in parts if len(part) >= 3]
+    return [[*ring, ring[0]] for ring in rings]
+
+
+def degrees_per_metre(latitude_deg: float) -> np.ndarray:
+    """(2,) degrees of longitude and of latitude that a metre east, or north, is on the WGS84 ellipsoid."""
+    latitude = math.radians(latitude_deg)
+    root = math.sqrt(1 - _SQUARED_ECCENTRICITY * math.sin(latitude) ** 2)
+    along_parallel = _AXIS_M / root * math.cos(latitude)
+    along_meridian = _AXIS_M * (1 - _SQUARED_ECCENTRICITY) / root**3
+    return np.degrees([1 / along_parallel, 1 / along_meridian])
+
+
+def _clip(ring: np.ndarray, edge: float, side: float) -> np.ndarray:
+    """The part of a convex ring east (side 1) or west (-1) of a longitude."""
+    inside = (ring[:, 0] - edge) * side >= 0
+    if inside.all() or not inside.any():
+        return ring[inside]
+    kept = []
+    for k, (before, after) in enumerate(zip(np.roll(ring, 1, axis=0), ring, strict=True)):
+        if inside[k] != inside[k - 1]:
+            share = (edge - before[0]) / (after[0] - before[0])
+            kept.append([edge, before[1] + share * (after[1] - before[1])])
+        if inside[k]:
+            kept.append(after)
+    return np.array(kept)

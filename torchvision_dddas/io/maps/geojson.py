@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.io.maps.dateline import Place, cut_line, ring_about, rounded
-from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes, shown
-from torchvision_dddas.io.maps.ground_tracks import GroundTracks
+from torchvision_dddas.io.maps.ellipses import Place, cut_line, ring_about, ring_m, rounded, semi_axes
+from torchvision_dddas.io.maps.ground_tracks import GroundTracks, ellipse_rows
 
 
 def geojson(
@@ -19,7 +18,7 @@ def geojson(
     `frames` has the frame of each place and `times` its time where a clock is known, else `seconds` since the clip's
     first frame where that is; `sigma_m` how well it is known: the root of the covariance's trace, null where it is not.
     A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
-    ellipses: with those that hold the true place with 95 %, as in `ellipses.shown`. landmarks: they too, by their
+    ellipses: with those that hold the true place with 95 %, as in `ellipse_rows`. landmarks: they too, by their
     names. `bbox` goes from west to east, over 180 degrees where the places do.
     Raises ValueError where there is no geographic origin.
     """
@@ -34,8 +33,8 @@ def geojson(
     return {"type": "FeatureCollection", **box, "features": features}
 
 
-def encoded(collection: dict[str, Any]) -> bytes:
-    """The file's bytes."""
+def encode_geojson(collection: dict[str, Any]) -> bytes:
+    """The bytes of the file."""
     return (json.dumps(collection, separators=(",", ":")) + "\n").encode()
 
 
@@ -62,7 +61,7 @@ def _track(tracks: GroundTracks, rows: slice, properties: dict[str, Any]) -> dic
 
 def _ellipses(tracks: GroundTracks) -> list[dict[str, Any]]:
     assert tracks.lonlat_deg is not None
-    rows = shown(tracks)
+    rows = ellipse_rows(tracks)
     axes, bearing = semi_axes(tracks.covariance_m2[rows])
     features = []
     for row, ring, (major, minor), turned in zip(rows.tolist(), ring_m(axes, bearing), axes, bearing, strict=True):

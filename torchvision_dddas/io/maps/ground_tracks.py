@@ -1,4 +1,4 @@
-"""The places of all targets over time, kept while frames go by: what maps are made of at the end."""
+"""The places of all targets over time, kept while frames go by; maps are made of them at the end."""
 
 import math
 from dataclasses import dataclass
@@ -8,6 +8,9 @@ from itertools import pairwise
 import numpy as np
 
 from torchvision_dddas.types import Positions
+
+MOST_ELLIPSES = 2_000
+"""Ellipses of a map, about."""
 
 _ROW = np.dtype(
     [
@@ -101,7 +104,7 @@ class Gathered:
         self._count = count
 
     def tracks(self, geographic: bool, start_utc_s: float = math.nan) -> GroundTracks:
-        """What was kept, by target. geographic: whether the positions had longitudes and latitudes."""
+        """The places by target. geographic: whether they have longitudes and latitudes."""
         rows = self._rows[: self._count]
         rows = rows[np.argsort(rows["target"], kind="stable")]
         return GroundTracks(
@@ -114,3 +117,17 @@ class Gathered:
             rows["velocity_m_s"],
             start_utc_s,
         )
+
+
+def ellipse_rows(tracks: GroundTracks, every_s: float = 1.0, most: int = MOST_ELLIPSES) -> np.ndarray:
+    """(K,) rows whose ellipses a map shows: the last of each target, and about one each every_s before it.
+
+    The intervals grow where there would be more than `most`; each target's last is always among them.
+    """
+    known = np.isfinite(tracks.covariance_m2).all(axis=(1, 2))
+    span = sum(
+        float(t[-1] - t[0]) for t in (tracks.time_s[rows] for rows in tracks.of.values()) if np.isfinite(t).all()
+    )
+    apart = max(every_s, span / most)
+    rows = [row for of in tracks.of.values() for row in tracks.spaced(apart, of)]
+    return np.array([row for row in rows if known[row]], int)

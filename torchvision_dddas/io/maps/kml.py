@@ -5,9 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from torchvision_dddas.io.maps.dateline import Place, cut_line, ring_about, rounded
-from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes, shown
-from torchvision_dddas.io.maps.ground_tracks import GroundTracks
+from torchvision_dddas.io.maps.ellipses import Place, cut_line, ring_about, ring_m, rounded, semi_axes
+from torchvision_dddas.io.maps.ground_tracks import GroundTracks, ellipse_rows
 from torchvision_dddas.io.overlay import identity_colour
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
@@ -28,7 +27,7 @@ def kml(
     """
     if tracks.lonlat_deg is None:
         raise ValueError("these positions have no longitude and latitude")
-    parts = [_HEAD.format(name=plain(name)), *(_style(f"target-{t}", identity_colour(t)) for t in tracks.of)]
+    parts = [_HEAD.format(name=xml_text(name)), *(_style(f"target-{t}", identity_colour(t)) for t in tracks.of)]
     parts.append(_folder("tracks", [_track(tracks, of, f"target {t}", f"target-{t}") for t, of in tracks.of.items()]))
     parts.append(_folder("95 % ellipses", _ellipses(tracks)))
     if landmarks is not None and landmarks.lonlat_deg is not None:
@@ -40,7 +39,7 @@ def kml(
     return "".join([*parts, "</Document>\n</kml>\n"])
 
 
-def plain(text: str) -> str:
+def xml_text(text: str) -> str:
     """A text as XML holds it: escaped, without the control characters that XML has no way to write."""
     kept = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff" and c < "\ufffe"))
     return escape(kept, quote=False).replace('"', "&quot;")
@@ -79,12 +78,12 @@ def _track(tracks: GroundTracks, rows: slice, name: str, style: str) -> str:
             for a, b in pairwise([0, *cuts, len(places)])
         ]
         shape = pieces[0] if len(pieces) == 1 else f"<gx:MultiTrack>{''.join(pieces)}</gx:MultiTrack>"
-    return f"<Placemark><name>{plain(name)}</name><styleUrl>#{style}</styleUrl>{shape}</Placemark>\n"
+    return f"<Placemark><name>{xml_text(name)}</name><styleUrl>#{style}</styleUrl>{shape}</Placemark>\n"
 
 
 def _ellipses(tracks: GroundTracks) -> list[str]:
     assert tracks.lonlat_deg is not None
-    rows = shown(tracks)
+    rows = ellipse_rows(tracks)
     if tracks.times_utc is None:
         rows = rows[np.isin(rows, [of.stop - 1 for of in tracks.of.values()])]
     axes, bearing = semi_axes(tracks.covariance_m2[rows])

@@ -9,29 +9,64 @@ import numpy as np
 
 from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks
-from torchvision_dddas.io.maps.map_frame import (
+from torchvision_dddas.io.maps.map_drawing import (
     BOTTOM,
     FINE,
     INK,
     LEFT,
+    MARK,
     PAPER,
     TOP,
+    Labels,
     MapFrame,
     blank,
+    dashes,
+    draw_camera,
+    draw_dot,
     draw_grid,
+    draw_landmark,
+    draw_look,
     draw_scale,
+    draw_verdict,
     frame_around,
+    line,
     text_width,
     write,
 )
-from torchvision_dddas.io.maps.map_signs import Signs, draw_look, draw_signs, draw_verdict
-from torchvision_dddas.io.maps.map_symbols import MARK, Labels, dashes, draw_camera, draw_dot, draw_landmark, line
 from torchvision_dddas.io.overlay import Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho
 
+_MOST_SIGNS = 400
+_LOOKS_APART_M = 2.0
 VIEW = (0, 130, 240)
 LOWEST = float(np.sin(np.radians(3)))
 """Nothing is seen farther than where a ray comes down at 3 degrees: the horizon is no place."""
+
+
+class Signs:
+    """Signs of what ground vehicles did: where a target was told human or not, and from where they looked.
+
+    A look every two metres of each vehicle, and a fixed number of all.
+    """
+
+    def __init__(self) -> None:
+        self.verdicts: list[tuple[int, str, np.ndarray]] = []
+        self.looks: list[tuple[np.ndarray, np.ndarray]] = []
+        self._last: dict[str, np.ndarray] = {}
+
+    def told(self, target: int, kind: str, east_north_m: np.ndarray) -> None:
+        """A target was told human or not_human, here for the first time or otherwise than before."""
+        if len(self.verdicts) < _MOST_SIGNS:
+            self.verdicts.append((target, kind, np.array(east_north_m, float)))
+
+    def look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
+        """A vehicle saw a target."""
+        last = self._last.get(vehicle)
+        if not np.isfinite(from_m).all() or (last is not None and np.linalg.norm(from_m - last) < _LOOKS_APART_M):
+            return
+        self._last[vehicle] = np.array(from_m, float)
+        if len(self.looks) < _MOST_SIGNS:
+            self.looks.append((np.array(from_m, float), np.array(at_m, float)))
 
 
 @dataclass(frozen=True)
@@ -73,8 +108,10 @@ def map_picture(
     for target, rows in tracks.of.items():
         _draw_last(plot, frame, tracks, rows.stop - 1, _dark(target))
     if signs is not None:
-        draw_signs(plot, frame, signs)
-        for _, _, place in signs.verdicts:
+        for from_m, at_m in signs.looks:
+            draw_look(plot, frame.pixels(from_m), frame.pixels(at_m))
+        for _, kind, place in signs.verdicts:
+            draw_verdict(plot, frame.pixels(place), kind)
             labels.keep_free(place)
     for shown in (tracks, landmarks):
         for rows in shown.of.values():

@@ -2,31 +2,45 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.types import Adjustment
+from torchvision_dddas.io.overlay.layers import ToMetres, command_metres
+from torchvision_dddas.types import Adjustment, FrameResult, Order
 
-NAME = "log.txt"
+LOG_TXT = "log.txt"
 
-ADJUSTED, WORLD, PROBLEM, NOTICED = "adjusted", "world", "problem", "noticed"
-"""Kinds of lines: a knob that the feedback moved; what happened in a simulated world, as only that knows; what went
-wrong; what the run itself noticed of its instruments, silent or frozen."""
-TOLD, ORDERED, REPAIRED, MARK = "told", "ordered", "repaired", "landmark"
-"""More of them: what ground vehicles say of a target; what vehicles were asked; what was repaired; landmarks unseen."""
+ADJUSTED = "adjusted"
+"""Kind of an entry: a parameter that the feedback moved."""
+WORLD = "world"
+"""An event of a simulated world."""
+PROBLEM = "problem"
+"""Something that went wrong."""
+NOTICED = "noticed"
+"""An instrument that the run noticed to be silent or frozen."""
+TOLD = "told"
+"""What ground vehicles say of a target."""
+ORDERED = "ordered"
+"""What vehicles were asked to do."""
+REPAIRED = "repaired"
+"""What was repaired or excluded."""
+MARK = "landmark"
+"""A landmark that the picture does not show."""
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
-_CLOSE = 10
-"""What is said again within so many frames goes on."""
+_CLOSE_FRAMES = 10
+_FAR_M = 15.0
+"""A goal that moved by less is the same: it goes with a crowd."""
+_UAV = "uav"
 
 
 @dataclass
 class Entry:
     """What happened at a frame, or in `count` frames from `first` to `last`.
 
-    time_s: None where only the frame tells it. short: in a few words, for a picture's caption.
+    time_s: None where it follows from the frame. short: a few words for a picture's caption.
     """
 
     first: int
@@ -43,29 +57,29 @@ class Entry:
 
 @dataclass
 class RunLog:
-    """The entries of a run as they come. Memory grows with them: about 300 bytes each."""
+    """The entries of a run as they come, about 300 bytes each."""
 
     entries: list[Entry] = field(default_factory=list)
     _open: dict[str, Entry] = field(default_factory=dict)
 
     def add(self, frame: int, kind: str, text: str, time_s: float | None = None, short: str = "") -> None:
-        """Something that happened at a frame."""
+        """Add an entry."""
         text = " ".join(text.split())
         self.entries.append(Entry(frame, kind, text, time_s=time_s, short=short or text))
 
     def adjusted(self, moved: Adjustment) -> None:
-        """A parameter that was moved, and why."""
-        change = f"{moved.parameter} {number(moved.old)} -> {number(moved.new)}"
+        """Add a parameter that was moved, and why."""
+        change = f"{moved.parameter} {_number(moved.old)} -> {_number(moved.new)}"
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
-    def going_on(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
-        """Something that may last: said again within a few frames it is one entry, also where its numbers differ.
+    def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
+        """Add something that may last: repeated within a few frames it stays one entry, also where its numbers differ.
 
-        step: frames since the one before that was looked at. key: what makes it the same; its words without numbers.
+        step: frames since the last one processed. key: what makes it the same, by default its text without numbers.
         """
         key = f"{kind} {key or _NUMBER.sub('0', text)}"
         entry = self._open.get(key)
-        if entry is not None and frame - entry.last <= max(_CLOSE, 2 * step):
+        if entry is not None and frame - entry.last <= max(_CLOSE_FRAMES, 2 * step):
             entry.last, entry.count = frame, entry.count + 1
             return
         self.add(frame, kind, text)
@@ -76,22 +90,21 @@ class RunLog:
         return sorted(self.entries, key=lambda entry: entry.first)
 
 
-def number(value: float) -> str:
-    """A knob's value for a reader."""
+def _number(value: float) -> str:
     return "none" if not math.isfinite(value) else f"{value:.5g}"
 
 
 class Clock:
-    """When frames were, from those looked at."""
+    """The times of frames, from those that were processed."""
 
     def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
-        """frame, time_s: (N,) of the frames looked at, growing; NaN where a time is not known."""
-        self._looked_at = np.array(frame, float)
+        """frame, time_s: (N,) of the processed frames, growing; NaN where a time is not known."""
+        self._processed = np.array(frame, float)
         known = np.isfinite(time_s)
-        self._frame, self._time_s = self._looked_at[known], np.array(time_s, float)[known]
+        self._frame, self._time_s = self._processed[known], np.array(time_s, float)[known]
 
     def at(self, number: int) -> float:
-        """The time of a frame; it goes on at the same rate beyond the first and the last; NaN where nothing tells."""
+        """The time of a frame, extrapolated beyond the first and the last; NaN where no time is known."""
         frame, time_s = self._frame, self._time_s
         if not len(frame):
             return math.nan
@@ -102,24 +115,66 @@ class Clock:
         return float(np.interp(number, frame, time_s))
 
     def of(self, entry: Entry) -> float:
-        """When something began."""
+        """The time of an entry."""
         return self.at(entry.first) if entry.time_s is None else entry.time_s
 
-    def seldom(self, entry: Entry) -> str:
-        """In how many of the frames looked at while it lasted, in words, if not in all."""
+    def occurrence(self, entry: Entry) -> str:
+        """In how many of the processed frames from first to last it occurred, in words; empty if in all."""
         if entry.last == entry.first:
             return ""
-        since = np.searchsorted(self._looked_at, entry.first)
-        among = int(np.searchsorted(self._looked_at, entry.last, side="right") - since)
+        since = np.searchsorted(self._processed, entry.first)
+        among = int(np.searchsorted(self._processed, entry.last, side="right") - since)
         return f"in {entry.count} of {among} frames" if entry.count < among else ""
 
 
-def lines(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -> str:
-    """The text of the log. heading: lines that go before."""
+def format_log(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -> str:
+    """The text of log.txt. heading: lines that go before."""
     out = [*(f"# {line}" for line in heading), "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
     for entry in entries:
-        at, seldom = clock.of(entry), clock.seldom(entry)
+        at, occurrence = clock.of(entry), clock.occurrence(entry)
         when = f"{at:9.3f}" if math.isfinite(at) else f"{'':9}"
-        lasted = "" if entry.last == entry.first else f" (to frame {entry.last}{seldom and f', {seldom}'})"
+        lasted = "" if entry.last == entry.first else f" (to frame {entry.last}{occurrence and f', {occurrence}'})"
         out.append(f"{when}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted}")
     return "\n".join(out) + "\n"
+
+
+class CommandLog:
+    """Logs what vehicles are asked to do, where it is new."""
+
+    def __init__(self) -> None:
+        self._goal: dict[str, np.ndarray] = {}
+
+    def add(self, surveyed: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
+        """Log the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
+        command, frame = surveyed.command, surveyed.followed.number
+        if command is None:
+            return
+        scale = command_metres(surveyed)
+        if command.look_at is not None and _UAV not in explained and self._new(_UAV, command.look_at, scale):
+            height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
+            log.add(frame, ORDERED, f"the UAV keeps {_place(command.look_at, scale)} in view{height}", short="UAV sent")
+        for order in command.orders:
+            if order.vehicle not in explained and self._new(order.vehicle, order.goal, scale):
+                log.add(frame, ORDERED, _words(order, scale), short=f"{order.vehicle} sent")
+
+    def _new(self, who: str, goal: np.ndarray, scale: ToMetres | None) -> bool:
+        there = np.asarray(goal, float) if scale is None else scale(goal)
+        far = _FAR_M if scale is not None else 0.0
+        last = self._goal.get(who)
+        if last is not None and float(np.linalg.norm(there - last)) <= far:
+            return False
+        self._goal[who] = there
+        return True
+
+
+def _place(place: np.ndarray, scale: ToMetres | None) -> str:
+    if scale is None:
+        return "{:.7g}, {:.7g}".format(*place)
+    return "({:.1f}, {:.1f}) m".format(*scale(place))
+
+
+def _words(order: Order, scale: ToMetres | None) -> str:
+    text = f"{order.vehicle} goes to {_place(order.goal, scale)} at {order.speed_m_s:g} m/s"
+    if order.look_at is not None:
+        text += f" and looks at {_place(order.look_at, scale)}"
+    return text

@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+import re
 import sys
 import time
 from collections import Counter
@@ -13,27 +14,38 @@ from typing import Any
 
 from torchvision_dddas import __version__
 from torchvision_dddas.io.atomic_files import write_whole
-from torchvision_dddas.types import Adjustment, Scene
+from torchvision_dddas.io.overlay.layers import LIKELY
+from torchvision_dddas.types import (
+    Adjustment,
+    AerialLocations,
+    Confirmation,
+    FrameResult,
+    GroundLocations,
+    PeopleFrame,
+    Scene,
+    TrackedFrame,
+)
 
-NAME = "run.json"
+RUN_JSON = "run.json"
 _STEP = math.log(1.01)
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Durations:
-    """Total and median of a stage's times, in memory that does not grow: counts in bins 1 % wide."""
+    """Total and median of a stage's times, in fixed memory: counts in bins 1 % wide."""
 
     def __init__(self) -> None:
         self.total_s = 0.0
         self._bins: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """Count one more time."""
+        """Add a time."""
         self.total_s += seconds
         self._bins[round(math.log(max(seconds, 1e-9)) / _STEP)] += 1
 
     @property
     def median_s(self) -> float:
-        """The median, to 1 %; 0 without any time."""
+        """The median to 1 %; 0 without any time."""
         left = (sum(self._bins.values()) + 1) // 2
         for place in sorted(self._bins):
             left -= self._bins[place]
@@ -42,21 +54,21 @@ class Durations:
         return 0.0
 
 
-class Record:
-    """Collects the facts of a run. The file says `running` from the first frame on, so that a killed run shows.
+class RunRecord:
+    """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
 
-    counts: what a command wants to say beside the frames and targets. notes: what the user should know of the run.
+    counts: what a command counts beside frames and targets. notes: what the user should know of the run.
     """
 
-    def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
-        """Start a journal; facts are the things known before the run: input, backend, settings, outputs."""
-        self._path = folder / NAME
-        self._facts = facts
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
+        """facts: what is known before the run, such as input, backend, settings and outputs."""
+        self.facts = dict(facts)
+        self._path = folder / RUN_JSON
         self._begun = time.perf_counter()
         self._stages: dict[str, Durations] = {}
-        self._unreliable: list[dict[str, Any]] = []
-        self._adjustments: list[dict[str, Any]] = []
         self.frames = self.targets = self.unreliable_frames = 0
+        self.adjustments: list[dict[str, Any]] = []
+        self.unreliable: list[dict[str, Any]] = []
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
@@ -70,23 +82,23 @@ class Record:
         adjustments: Sequence[Adjustment] = (),
         cause: str | None = None,
     ) -> None:
-        """Take note of a frame. cause: why nothing could be concluded from it; None where all is well."""
+        """Count a frame. cause: why nothing could be concluded from it; None where all is well."""
         if self.frames == 0:
             self._save("running")
         self.frames += 1
         self.targets += targets
         for stage, spent in seconds.items():
             self._stages.setdefault(stage, Durations()).add(spent)
-        self._adjustments += [
+        self.adjustments += [
             {"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause} for a in adjustments
         ]
         if cause is not None:
             self.unreliable_frames += 1
-            last = self._unreliable[-1] if self._unreliable else None
+            last = self.unreliable[-1] if self.unreliable else None
             if last and last["last"] == self._last and last["cause"] == cause:
                 last["last"] = number
             else:
-                self._unreliable.append({"first": number, "last": number, "cause": cause})
+                self.unreliable.append({"first": number, "last": number, "cause": cause})
         self._last = number
 
     def close(self, complete: bool) -> None:
@@ -94,9 +106,9 @@ class Record:
         self._save("complete" if complete else "interrupted")
 
     def discard(self) -> None:
-        """Say that the run failed, if it had begun."""
+        """Write that the run failed, if it had begun."""
         if self.frames:
-            with suppress(OSError):  # the file that says `running` stays, which is true enough
+            with suppress(OSError):  # the file that says `running` stays
                 self._save("failed")
 
     def _save(self, state: str) -> None:
@@ -105,14 +117,14 @@ class Record:
             "state": state,
             "interrupted": state == "interrupted",
             "versions": versions(),
-            **self._facts,
+            **self.facts,
             "frames": {"written": self.frames, "unreliable": self.unreliable_frames},
             "targets": self.targets,
             **self.counts,
             "notes": list(self.notes),
             "problems": list(self.problems),
-            "unreliable": self._unreliable,
-            "adjustments": self._adjustments,
+            "unreliable": self.unreliable,
+            "adjustments": self.adjustments,
             "seconds": {
                 "wall": round(seconds, 3),
                 "stages": {
@@ -124,17 +136,8 @@ class Record:
         write_whole(self._path, (json.dumps(finite(record), indent=2) + "\n").encode())
 
 
-class Journal(Record):
-    """The record of a run that gives scenes."""
-
-    def write(self, scene: Scene) -> None:
-        """Take note of a scene."""
-        cause = None if scene.reliable else scene.cause
-        self.note(scene.frame.number, len(scene.detections), scene.seconds, scene.adjustments, cause)
-
-
 def finite(value: Any) -> Any:
-    """The same record for JSON: numbers it cannot hold become null, and what it does not know becomes text."""
+    """A value that JSON can hold: numbers that are not finite become null, unknown types become text."""
     if isinstance(value, dict):
         return {str(k): finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -158,11 +161,217 @@ def versions() -> dict[str, str]:
     return found
 
 
-def read(folder: Path) -> dict[str, Any] | None:
-    """The record of an earlier run in a folder; None if there is none, or none of ours."""
+def read_run_record(folder: Path) -> dict[str, Any] | None:
+    """The content of run.json in a folder; None if there is none that dddas wrote."""
     try:
-        record = json.loads((folder / NAME).read_text(encoding="utf-8"))
+        record = json.loads((folder / RUN_JSON).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
     versions = record.get("versions") if isinstance(record, dict) else None
     return record if isinstance(versions, dict) and "torchvision_dddas" in versions else None
+
+
+class DetectionRecord(RunRecord):
+    """The record of `dddas detect`."""
+
+    def write(self, scene: Scene) -> None:
+        """Count a scene."""
+        cause = None if scene.reliable else scene.cause
+        self.note(scene.frame.number, len(scene.detections), scene.seconds, scene.adjustments, cause)
+
+
+class TrackRecord(RunRecord):
+    """The record of a run that gives identities, numbered from 1 without gaps."""
+
+    identities = bridges = untracked = first = 0
+
+    def write(self, followed: TrackedFrame) -> None:
+        """Count a frame."""
+        tracks, targets = followed.tracks, len(followed.detections)
+        seen = int((tracks.row >= 0).sum())
+        self.identities = int(tracks.identity.max(initial=self.identities))
+        self.first = self.first or followed.number
+        self.bridges += len(tracks) - seen
+        self.untracked += targets - seen
+        self.counts |= {
+            "first_frame": self.first,
+            "last_frame": followed.number,
+            "identities": self.identities,
+            "tracked": self.targets + targets - self.untracked,
+            "untracked": self.untracked,
+            "bridges": self.bridges,
+        }
+        self.note(followed.number, targets, followed.seconds, followed.adjustments, followed.cause or None)
+
+
+class PeopleRecord(RunRecord):
+    """The record of `dddas people`.
+
+    unlikely: people below LIKELY. cut: people whom the picture's border cuts. share: windows searched, of all windows
+    of all frames. overlay: name of the video, or of the picture of a single image.
+    """
+
+    unlikely = cut = everywhere = nowhere = unread = 0
+    share = 0.0
+    overlay = "overlay.mp4"
+
+    def write(self, found: PeopleFrame) -> None:
+        """Count a frame."""
+        self.unlikely += int((found.people.score < LIKELY).sum())
+        self.cut += int(found.people.cut.sum())
+        if found.cause:
+            self.unread += 1
+        else:
+            self.everywhere += found.regions_px is None
+            self.nowhere += found.share == 0
+            self.share += (found.share - self.share) / (self.frames + 1 - self.unread)
+        self.counts = {
+            "unlikely": self.unlikely,
+            "cut": self.cut,
+            "searched": {
+                "share_of_windows": round(self.share, 4),
+                "frames_everywhere": self.everywhere,
+                "frames_in_regions": self.frames + 1 - self.unread - self.everywhere - self.nowhere,
+                "frames_nowhere": self.nowhere,
+            },
+        }
+        self.note(found.frame.number, len(found.people), found.seconds, found.adjustments, found.cause or None)
+
+
+class GroundRecord(RunRecord):
+    """The record of `dddas locate ground`.
+
+    people: rows of positions.csv. by: sightings by what gave their distance, `bearing` where nothing did.
+    """
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
+        super().__init__(folder, facts)
+        self.people = 0
+        self.by = dict.fromkeys(("both", "height", "feet", "bearing"), 0)
+        self.counts = {"people": 0, "sightings": self.by}
+
+    def write(self, located: GroundLocations) -> None:
+        """Count a frame."""
+        self.people += len(located.positions)
+        self.counts["people"] = self.people
+        for by in located.sightings.by.tolist():
+            self.by[by] += 1
+        self.note(located.frame, len(located.sightings), {})
+
+
+class ConfirmationRecord(RunRecord):
+    """The record of `dddas confirm`. kinds: rows of each kind."""
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
+        super().__init__(folder, facts)
+        self.kinds: Counter[str] = Counter()
+        self.counts = {"kinds": {}, "rows_looked_at": 0}
+
+    def write(self, confirmed: Confirmation) -> None:
+        """Count a frame."""
+        self.kinds.update(confirmed.kind)
+        self.counts["kinds"] = dict(self.kinds)
+        self.counts["rows_looked_at"] += sum(bool(names) for names in confirmed.seen_by)
+        self.note(confirmed.frame, len(confirmed.kind), {})
+
+
+class AerialRecord(RunRecord):
+    """The record of a run that locates targets from the air.
+
+    positions: rows of positions.csv. by: frames by what gave the camera's pose, `nothing` for those not located.
+    weak: spans of frames that were located with something amiss. repairs: what was changed and why.
+    landmarks: of each, in how many frames it was seen, used, and left out of those located; and the spans of frames in
+    which it was reassigned or excluded.
+    """
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any], names: Sequence[str]) -> None:
+        super().__init__(folder, facts)
+        self.names = tuple(names)
+        self.positions = 0
+        self.by = dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0)
+        self.weak, self.repairs = Spans(), Spans()
+        self.landmarks: dict[str, dict[str, Any]] = {
+            name: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for name in names
+        }
+
+    def write(self, grounded: AerialLocations) -> None:
+        """Count a frame."""
+        frame, fix, before = grounded.frame, grounded.fix, self._last
+        self.positions += len(grounded.positions)
+        self.by[fix.by or "nothing"] += 1
+        for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
+            landmark = self.landmarks[self.names[which]]
+            landmark["seen"] += 1
+            landmark["used"] += is_used
+            landmark["left_out"] += bool(fix.by) and not is_used
+            if state in ("reassigned", "excluded"):
+                spans = landmark[state]
+                if spans and spans[-1][1] == before:
+                    spans[-1][1] = frame
+                else:
+                    spans.append([frame, frame])
+        if fix.by and fix.cause:
+            self.weak.add(frame, before, fix.cause, by=fix.by)
+        for change in fix.changes:
+            self.repairs.add(frame, before, change)
+        self.counts |= {
+            "positions": self.positions,
+            "by": self.by,
+            "landmarks": self.landmarks,
+            "weak": self.weak.rows,
+            "repairs": self.repairs.rows,
+        }
+        cause = None if fix.by else fix.cause or "nothing told where the camera was"
+        self.note(frame, len(grounded.box_px), grounded.seconds, grounded.adjustments, cause)
+
+
+class Spans:
+    """Remarks on frames; the same remark on successive frames is one row, also where its numbers differ."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._open: dict[str, dict[str, Any]] = {}
+
+    def add(self, frame: int, before: int, text: str, **more: Any) -> None:
+        """Add a remark on a frame. before: the number of the frame that came before it."""
+        key = _NUMBER.sub("0", f"{text} {more}")
+        row = self._open.get(key)
+        if row is not None and row["last"] in (before, frame):
+            row["last"] = frame
+        else:
+            self._open[key] = row = {"first": frame, "last": frame, **more, "cause": text}
+            self.rows.append(row)
+
+
+class IdentityCounts:
+    """Adds counts of identities, and the spans of frames in which nothing could be found, to an aerial record."""
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._identities = self._bridges = self._untracked = 0
+        self._not_found: list[dict[str, Any]] = []
+
+    def write(self, result: FrameResult) -> None:
+        """Count a frame."""
+        followed = result.followed
+        self._identities = int(followed.tracks.identity.max(initial=self._identities))
+        self._bridges += int((followed.tracks.row < 0).sum())
+        self._untracked += len(followed.untracked)
+        if followed.cause:
+            last = self._not_found[-1] if self._not_found else None
+            if last and last["cause"] == followed.cause and last["last"] == followed.number - 1:
+                last["last"] = followed.number
+            else:
+                self._not_found.append({"first": followed.number, "last": followed.number, "cause": followed.cause})
+        self._record.counts |= {
+            "identities": self._identities,
+            "bridges": self._bridges,
+            "untracked": self._untracked,
+            "nothing_found": self._not_found,
+        }
+
+    def close(self, complete: bool) -> None:
+        """Nothing to do."""
+
+    def discard(self) -> None:
+        """Nothing to do."""

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.io.maps.map_frame import step_of
+from torchvision_dddas.io.maps import round_step
 from torchvision_dddas.io.report.page import format_number
 
 WIDTH, HEIGHT = 420, 300
@@ -275,7 +275,7 @@ def _ticks(limits: tuple[float, float], log: bool, count: int) -> list[tuple[flo
     if log:
         powers = range(math.ceil(math.log10(limits[0]) - 1e-9), math.floor(math.log10(limits[1]) + 1e-9) + 1)
         return [(10.0**k, f"{10.0**k:g}") for k in powers]
-    step = step_of(limits[1] - limits[0], count)
+    step = round_step(limits[1] - limits[0], count)
     first, last = math.ceil(limits[0] / step - 1e-9), math.floor(limits[1] / step + 1e-9)
     return [(k * step, f"{k * step:g}".replace("-", "−")) for k in range(first, last + 1)]
 

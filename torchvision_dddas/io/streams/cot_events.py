@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchvision_dddas.io.maps.cot import STALE_S, event, name
+from torchvision_dddas.io.maps.cot import STALE_S, event, event_uid
 from torchvision_dddas.io.maps.ellipses import semi_axes
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.io.streams.about import About
@@ -38,7 +38,7 @@ class CotEvents:
             if target in self._told_s or not (abs(longitude) <= 180 and abs(latitude) <= 90):
                 continue
             self._told_s[target] = now_s
-            uid = name(self._about.source, self._begun_utc_s, target)
+            uid = event_uid(self._about.source, self._begun_utc_s, target)
             sigma_m, velocity = axes[row, 0], grounded.velocity_m_s[row]
             messages.append(event(uid, target, (time, stale), (longitude, latitude), sigma_m, velocity).encode())
         return messages

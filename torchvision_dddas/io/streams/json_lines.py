@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
-from torchvision_dddas.io.report.timelines import USED
 from torchvision_dddas.io.streams.about import About
 from torchvision_dddas.io.tables import compass_deg
 from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult, TrackedFrame
@@ -132,7 +131,7 @@ def _ground(grounded: AerialLocations, surveyed: FrameResult | None, about: Abou
         landmarks.append(fields)
     return {
         "by": fix.by,
-        "landmarks_used": sum(state in USED for state in fix.state),
+        "landmarks_used": sum(fix.is_used),
         "cause": fix.cause,
         "changes": list(fix.changes),
         "landmarks": landmarks,

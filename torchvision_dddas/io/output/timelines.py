@@ -9,11 +9,9 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, TOLD, WORLD, Entry
-from torchvision_dddas.io.report.charts import Events, Line, Panel, time_chart
+from torchvision_dddas.io.report import Events, Line, Panel, time_chart
 from torchvision_dddas.types import Adjustment, AerialLocations, Confirmation, FrameResult
 
-USED = ("used", "reassigned")
-"""States of a landmark that took part in locating a frame."""
 KINDS = ("human", "not_human", "unseen")
 """What ground vehicles can say of a target, as in Confirmation."""
 
@@ -78,7 +76,7 @@ class LocationTimeline(Timeline):
                 grounded.frame,
                 grounded.time_s,
                 len(fix.landmark),
-                sum(state in USED for state in fix.state),
+                sum(fix.is_used),
                 _median_sigma(grounded.positions.covariance_m2),
                 _median_sigma(grounded.relative_m2),
                 fix.chi2,

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from torchvision_dddas.io.output.run_record import finite
-from torchvision_dddas.io.report.charts import Panel
-from torchvision_dddas.io.report.keyframes import KeyFrame
-from torchvision_dddas.io.report.page import Cell, Column, render_page, table
-from torchvision_dddas.io.report.timelines import Timeline
+from torchvision_dddas.io.output.key_frames import KeyFrame
+from torchvision_dddas.io.output.run_record import RunRecord, finite
+from torchvision_dddas.io.output.timelines import Timeline
+from torchvision_dddas.io.report import Cell, Column, Panel, render_page, table
 
+REPORT = "report.html"
 MOST_TABLE_ROWS = 200
 """Rows of a table in the report; run.json or log.txt has them all."""
 FOLDED_FACTS = ("scenario", "settings")
@@ -39,6 +39,19 @@ class RunSummary:
     first_tables: Sequence[Table] = ()
     key_frames: Sequence[KeyFrame] = ()
     panels: Sequence[Panel] = ()
+
+    @classmethod
+    def of(
+        cls,
+        record: RunRecord,
+        title: str,
+        complete: bool,
+        figures: Sequence[tuple[str, str]],
+        tables: Sequence[Table] = (),
+    ) -> "RunSummary":
+        """Summarize a run with the facts and notes of its record."""
+        state = "complete" if complete else "interrupted: up to the last whole frame"
+        return cls(title, state, figures, record.facts, tables, [*record.notes, *record.problems])
 
 
 def run_report(summary: RunSummary, timeline: Timeline) -> str:
