@@ -267,14 +267,14 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, table, tmp_path):
     """In a process of its own, with a true signal after the third frame was written."""
     program = """
         import sys, time
-        from torchvision_dddas.io.output.track_tables import TrackTables
-        honest, seen = TrackTables.write, []
+        from torchvision_dddas.io.tables import TableFiles
+        honest, seen = TableFiles.write, []
 
         def write(self, followed):
             honest(self, followed)
             seen.append(followed.number)
 
-        TrackTables.write = write
+        TableFiles.write = write
         from contextlib import contextmanager
         import torchvision_dddas.cli
 

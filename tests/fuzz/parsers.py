@@ -128,7 +128,7 @@ def _record(path: Path) -> None:
     from torchvision_dddas.evaluation.metrics import clip
     from torchvision_dddas.io.output import run_record as journal
 
-    journal.read(path.parent)
+    journal.read_run_record(path.parent)
     clip.load(path.parent)
 
 

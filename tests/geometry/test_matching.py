@@ -46,9 +46,7 @@ def test_nobody_is_assigned_to_nobody(shape: tuple[int, int]) -> None:
 def test_what_a_run_onboard_loads_leaves_the_slow_libraries_out() -> None:
     """They are half of its start and a third of its memory."""
     slow = ("scipy", "jaxtyping", "pymap3d", "onnxruntime", "torch", "rich", "asyncio")
-    script = (
-        "import sys, torchvision_dddas.cli, torchvision_dddas.pipeline, torchvision_dddas.io.output.pipeline_output\n"
-    )
+    script = "import sys, torchvision_dddas.cli, torchvision_dddas.pipeline, torchvision_dddas.io.output\n"
     script += f"import torchvision_dddas.detection.opencv_engine\nprint([n for n in {slow!r} if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "[]"

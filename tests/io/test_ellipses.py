@@ -5,8 +5,15 @@ from hypothesis import strategies as st
 
 from tests.io.ground import positions, tracks
 from torchvision_dddas import geometry
-from torchvision_dddas.io.maps.dateline import cut_line, degrees_per_metre, ring_about
-from torchvision_dddas.io.maps.ellipses import CHI2_95, ring_m, semi_axes, shown
+from torchvision_dddas.io.maps.ellipses import (
+    CHI2_95,
+    cut_line,
+    degrees_per_metre,
+    ring_about,
+    ring_m,
+    semi_axes,
+)
+from torchvision_dddas.io.maps.ground_tracks import ellipse_rows
 
 
 def test_an_ellipse_lies_along_its_larger_variance_clockwise_from_north():
@@ -88,12 +95,12 @@ def test_a_line_is_cut_each_time_it_goes_over_180_degrees():
 
 def test_ellipses_are_shown_once_a_second_and_at_the_last_place():
     found = tracks([positions(frame, [[0, 0]]) for frame in range(1, 36)])
-    assert found.frame[shown(found)].tolist() == [1, 11, 21, 31, 35]
-    assert found.frame[shown(found, most=2)].tolist() == [1, 18, 35]
+    assert found.frame[ellipse_rows(found)].tolist() == [1, 11, 21, 31, 35]
+    assert found.frame[ellipse_rows(found, most=2)].tolist() == [1, 18, 35]
 
 
-def test_without_times_or_with_unknown_errors_only_what_is_known_is_shown():
+def test_without_times_or_with_unknown_errors_only_what_is_known_is_ellipse_rows():
     untimed = tracks([positions(frame, [[0, 0]]) for frame in (1, 2, 3)], timed=False)
-    assert untimed.frame[shown(untimed)].tolist() == [3]
+    assert untimed.frame[ellipse_rows(untimed)].tolist() == [3]
     unknown = tracks([positions(1, [[0, 0]], np.full((2, 2), np.nan))])
-    assert len(shown(unknown)) == 0
+    assert len(ellipse_rows(unknown)) == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.io.ground import NAMES, ORIGIN, START, positions, tracks
-from torchvision_dddas.io.maps.geojson import encoded, geojson
+from torchvision_dddas.io.maps import encode_geojson, geojson
 
 
 def walk(count=30, origin=ORIGIN, covariance=((4, 0), (0, 1)), step=1.0):
@@ -12,7 +12,7 @@ def walk(count=30, origin=ORIGIN, covariance=((4, 0), (0, 1)), step=1.0):
 
 
 def read(*given, **more):
-    return json.loads(encoded(geojson(*given, **more)))
+    return json.loads(encode_geojson(geojson(*given, **more)))
 
 
 def test_a_track_has_its_frames_times_and_errors_beside_its_places():

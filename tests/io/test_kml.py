@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.io.ground import NAMES, ORIGIN, positions, tracks
-from torchvision_dddas.io.maps.kml import kml, plain
-from torchvision_dddas.io.output.position_output import PositionOutput
+from torchvision_dddas.io.maps.kml import kml, xml_text
+from torchvision_dddas.io.output import GroundRecorder
 from torchvision_dddas.types import GroundLocations, Sightings
 
 KML, GX = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
@@ -85,7 +85,7 @@ def test_names_come_back_as_they_were_given():
     root = read(tracks(walk()), name='a "<clip>" & \x00more', landmarks=marks, names=NAMES)
     assert root[0].findtext(f"{KML}name") == 'a "<clip>" & more'
     assert marks_of(root, "landmarks")[0].findtext(f"{KML}name") == "delta & <co>"
-    assert plain("a\x0bb\ud800\uffff") == "ab"
+    assert xml_text("a\x0bb\ud800\uffff") == "ab"
 
 
 def test_a_track_over_180_degrees_is_several_whose_places_are_all_there():
@@ -119,7 +119,7 @@ def test_people_located_from_the_ground_are_written_too(tmp_path):
         np.zeros((0, 2)), none, none, none, np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros((0, 2, 6))
     )
     for geographic in (True, False):
-        with PositionOutput(tmp_path) as output:
+        with GroundRecorder(tmp_path) as output:
             output.begin({}, ("a",), geographic)
             for frame in walk(3, origin=ORIGIN if geographic else None):
                 members = np.zeros((2, 1), int)

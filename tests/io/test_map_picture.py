@@ -6,7 +6,7 @@ import pytest
 
 from tests.io.ground import DOWN, NAMES, positions, tracks
 from torchvision_dddas.geo.projection import axes_of, rays
-from torchvision_dddas.io.maps.map_frame import FINE, LEFT, TOP, WIDTH, frame_around, step_of
+from torchvision_dddas.io.maps.map_drawing import FINE, LEFT, TOP, WIDTH, frame_around, round_step
 from torchvision_dddas.io.maps.map_picture import CameraPath, map_picture, view_of
 from torchvision_dddas.types import Camera, CameraPose, Fix, Ortho
 
@@ -64,7 +64,7 @@ def test_north_is_up_and_all_places_are_inside():
 
 @pytest.mark.parametrize("span", [0.3, 9.0, 40.0, 777.0, 1e5])
 def test_steps_of_a_grid_are_round_and_not_too_many(span):
-    step = step_of(span, 12)
+    step = round_step(span, 12)
     assert f"{step:.0e}"[0] in "125" and 4 <= span / step <= 12.001
 
 

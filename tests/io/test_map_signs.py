@@ -4,8 +4,8 @@ import numpy as np
 
 from tests.io.ground import positions, tracks
 from torchvision_dddas.io.maps.ground_tracks import Gathered
-from torchvision_dddas.io.maps.map_picture import map_picture
-from torchvision_dddas.io.maps.map_signs import COLOURS, Signs
+from torchvision_dddas.io.maps.map_drawing import VERDICTS
+from torchvision_dddas.io.maps.map_picture import Signs, map_picture
 
 
 def shown(signs):
@@ -24,10 +24,10 @@ def test_the_map_shows_where_a_target_was_told_human_and_where_not():
     bare = shown(Signs())
     signs.told(1, "human", np.array([10.0, 0]))
     human = shown(signs)
-    assert near(human, COLOURS["human"]) > near(bare, COLOURS["human"]) + 60
-    assert near(human, COLOURS["not_human"]) == near(bare, COLOURS["not_human"])
+    assert near(human, VERDICTS["human"]) > near(bare, VERDICTS["human"]) + 60
+    assert near(human, VERDICTS["not_human"]) == near(bare, VERDICTS["not_human"])
     signs.told(1, "not_human", np.array([30.0, 0]))
-    assert near(shown(signs), COLOURS["not_human"]) > near(bare, COLOURS["not_human"]) + 60
+    assert near(shown(signs), VERDICTS["not_human"]) > near(bare, VERDICTS["not_human"]) + 60
 
 
 def test_a_wedge_opens_from_the_vehicle_towards_what_it_saw():

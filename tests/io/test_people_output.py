@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.output.people_output import PeopleOutput
+from torchvision_dddas.io.output import PeopleRecorder
 from torchvision_dddas.types import Adjustment, Frame, People, PeopleFrame
 
 
@@ -26,7 +26,7 @@ def record(folder):
 
 def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(tmp_path):
     line = Adjustment(2, "people.regions_share", 1.0, 0.2, "2 people expected")
-    with PeopleOutput(tmp_path / "out", ()) as output:
+    with PeopleRecorder(tmp_path / "out", ()) as output:
         output.begin({"input": "x"}, 10)
         for one in (
             recognized(1),
@@ -56,7 +56,7 @@ def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(
 
 @pytest.mark.parametrize("single", [False, True])
 def test_a_clip_gets_a_film_and_a_picture_a_picture(tmp_path, single):
-    with PeopleOutput(tmp_path) as output:
+    with PeopleRecorder(tmp_path) as output:
         journal = output.begin({}, 10, single)
         for number in range(1, 2 if single else 4):
             output.write(recognized(number))
@@ -70,4 +70,4 @@ def test_a_clip_gets_a_film_and_a_picture_a_picture(tmp_path, single):
 def test_files_of_someone_else_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("mine")
     with pytest.raises(InputError, match=f"{name} was not written by dddas"):
-        PeopleOutput(tmp_path)
+        PeopleRecorder(tmp_path)

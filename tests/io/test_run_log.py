@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.output.run_log import MARK, PROBLEM, WORLD, Clock, RunLog, lines
+from torchvision_dddas.io.output.run_log import MARK, PROBLEM, WORLD, Clock, RunLog, format_log
 from torchvision_dddas.types import Adjustment
 
 FRAME = np.arange(1, 101)
@@ -12,7 +12,7 @@ TIME_S = (FRAME - 1) / 10
 
 def text(log, frame=FRAME, time_s=TIME_S):
     """The lines below the heading."""
-    return lines(log.ordered(), Clock(frame, time_s), ["clip"]).splitlines()[3:]
+    return format_log(log.ordered(), Clock(frame, time_s), ["clip"]).splitlines()[3:]
 
 
 def test_an_adjustment_is_told_with_its_time_its_values_and_its_cause():
@@ -38,7 +38,7 @@ def test_lines_are_in_the_order_of_the_frames_whenever_they_were_told():
 def test_what_lasts_is_one_line_that_says_how_long_though_its_numbers_differ():
     log = RunLog()
     for frame in range(10, 20):
-        log.going_on(frame, 1, PROBLEM, f"not located: {frame % 3} landmarks")
+        log.add_lasting(frame, 1, PROBLEM, f"not located: {frame % 3} landmarks")
     (line,) = text(log)
     assert "not located: 1 landmarks (to frame 19)" in line
 
@@ -46,7 +46,7 @@ def test_what_lasts_is_one_line_that_says_how_long_though_its_numbers_differ():
 def test_what_comes_and_goes_is_one_line_that_says_how_often():
     log = RunLog()
     for frame in range(10, 31, 4):
-        log.going_on(frame, 1, MARK, "blue is not seen", key="blue")
+        log.add_lasting(frame, 1, MARK, "blue is not seen", key="blue")
     (line,) = text(log)
     assert "(to frame 30, in 6 of 21 frames)" in line
 
@@ -54,7 +54,7 @@ def test_what_comes_and_goes_is_one_line_that_says_how_often():
 def test_where_every_fifth_frame_is_looked_at_these_count_as_all():
     log = RunLog()
     for frame in range(11, 60, 5):
-        log.going_on(frame, 5, PROBLEM, "dark")
+        log.add_lasting(frame, 5, PROBLEM, "dark")
     (line,) = text(log, FRAME[::5], TIME_S[::5])
     assert line.endswith("dark (to frame 56)")
 
@@ -62,7 +62,7 @@ def test_where_every_fifth_frame_is_looked_at_these_count_as_all():
 def test_what_comes_again_much_later_is_told_again():
     log = RunLog()
     for frame in (10, 11, 50):
-        log.going_on(frame, 1, PROBLEM, "dark")
+        log.add_lasting(frame, 1, PROBLEM, "dark")
     assert len(text(log)) == 2
 
 

@@ -9,9 +9,9 @@ import pytest
 from tests.io.ground import grounded
 from tests.pages import Page, points_inside
 from torchvision_dddas.io.output.run_log import WORLD, Entry
-from torchvision_dddas.io.report.charts import TIME_LEFT, TIME_WIDTH
 from torchvision_dddas.io.output.run_report import MOST_TABLE_ROWS, RunSummary, format_span, run_report
 from torchvision_dddas.io.output.timelines import LocationTimeline, RunTimeline, chi2_limit
+from torchvision_dddas.io.report.charts import TIME_LEFT, TIME_WIDTH
 from torchvision_dddas.types import Adjustment, Detections, Frame, FrameResult, TrackedFrame, Tracks
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)

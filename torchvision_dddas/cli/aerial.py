@@ -15,8 +15,8 @@ from torchvision_dddas.io.run_inputs import AerialInput, read_locator
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.geo import AerialLocator
-    from torchvision_dddas.io.output.location_output import GroundedJournal
-    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.io.output import Site
+    from torchvision_dddas.io.output.run_record import AerialRecord, RunRecord
 
 Marked = Annotated[
     Path, typer.Option("--landmarks", metavar="FILE", help="A CSV of landmarks: where they were, and where they show.")
@@ -62,11 +62,10 @@ def aerial(
     Writes positions.csv, fixes.csv (how each picture lies on the ground), maps, a report and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import saved
-    from torchvision_dddas.io.output.location_output import SAVED
+    from torchvision_dddas.io.output import AerialRecorder, parse_save
 
     given = AerialInput(landmarks, telemetry, camera, dem, background)
-    settings, names = load_config(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), parse_save(save, AerialRecorder.saved)
     journal = aerial_into(out, table, given, settings, clip, backend.value, names, rate, quiet)
     if not quiet:
         for line in summary(journal, out):
@@ -83,18 +82,18 @@ def aerial_into(
     save: Sequence[str] = (),
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "GroundedJournal":
+) -> "AerialRecord":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas import open_video
     from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
-    from torchvision_dddas.io.output.location_output import GroundedOutput
+    from torchvision_dddas.io.output import AerialRecorder
 
     check_rate(rate_hz)
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
-    refuse_own_input(inputs, [folder / name for name in GroundedOutput.files], "folder with --out")
-    with GroundedOutput(folder, save) as output:
+    refuse_own_input(inputs, [folder / name for name in AerialRecorder.files], "folder with --out")
+    with AerialRecorder(folder, save) as output:
         read = read_detections(table)
         source = open_video(clip, rate_hz=rate_hz) if clip else None
         rate = source.rate_hz if source is not None else rate_hz
@@ -106,7 +105,7 @@ def aerial_into(
         )
         check_table(read, locator)
         facts = {"input": table, **given.facts, "rows": len(read), **about(locator), "settings": settings.model_dump()}
-        journal = output.begin(facts, **ground_facts(locator, given.background))
+        journal = output.begin(facts, map_site(locator, given.background))
         journal.notes += notes
         if not len(read):
             journal.notes.append("the table has no rows: nothing to locate")
@@ -137,37 +136,37 @@ def about(locator: "AerialLocator") -> dict[str, Any]:
     }
 
 
-def ground_facts(locator: "AerialLocator", background: Path | None) -> dict[str, Any]:
-    """What GroundedOutput.begin wants to know. Raises InputError for a background that cannot be read."""
+def map_site(locator: "AerialLocator", background: Path | None) -> "Site":
+    """What the maps show of the ground. Raises InputError for a background that cannot be read."""
     from functools import partial
 
     from torchvision_dddas import geometry
     from torchvision_dddas.io.elevation import read_ortho
+    from torchvision_dddas.io.output import Site
 
     site = locator.site
-    start_utc_s = site.telemetry.start_utc_s if site.telemetry is not None else math.nan
-    return {
-        "names": site.landmarks.names,
-        "origin_deg": site.origin_deg,
-        "start_utc_s": start_utc_s,
-        "rate_hz": locator.rate_hz,
-        "background": None if background is None else read_ortho(background, site.places, site.origin_deg),
-        "camera": locator.camera,
-        "degrees": None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
-    }
+    return Site(
+        names=site.landmarks.names,
+        origin_deg=site.origin_deg,
+        start_utc_s=site.telemetry.start_utc_s if site.telemetry is not None else math.nan,
+        rate_hz=locator.rate_hz,
+        background=None if background is None else read_ortho(background, site.places, site.origin_deg),
+        camera=locator.camera,
+        to_degrees=None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
+    )
 
 
-def summary(journal: "GroundedJournal", folder: Path) -> list[str]:
+def summary(journal: "AerialRecord", folder: Path) -> list[str]:
     """What to tell the user at the end."""
-    from torchvision_dddas.io.output.location_output import GroundedOutput
+    from torchvision_dddas.io.output import AerialRecorder
 
-    made = [name for name in GroundedOutput.files if (folder / name).exists()]
+    made = [name for name in AerialRecorder.files if (folder / name).exists()]
     first = f"{journal.frames} frames, {journal.targets} targets"
     notes = [f"note: {note}" for note in journal.notes]
     return [first, *ground_lines(journal), *notes, f"{folder}: {', '.join(made)}"]
 
 
-def ground_lines(journal: "Record") -> list[str]:
+def ground_lines(journal: "RunRecord") -> list[str]:
     """How many positions there are, by what, and how many frames could not be located."""
     counts: dict[str, Any] = {"positions": 0, "by": {}, **journal.counts}
     by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.io.output import RunRecord
     from torchvision_dddas.types import Source
 
 
@@ -43,7 +43,7 @@ def clip_facts(source: "Source") -> dict[str, Any]:
 
 
 def last_lines(
-    first: str, journal: "Record", folder: Path, made: Sequence[str], notes: Sequence[str] = ()
+    first: str, journal: "RunRecord", folder: Path, made: Sequence[str], notes: Sequence[str] = ()
 ) -> list[str]:
     """What to tell the user at the end: the counts, what reading got over, notes, and what was made where."""
     lines = [first]

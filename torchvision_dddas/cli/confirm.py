@@ -13,7 +13,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.confirmation_output import ConfirmJournal
+    from torchvision_dddas.io.output.run_record import ConfirmationRecord
     from torchvision_dddas.people.confirmation import Vehicle
     from torchvision_dddas.types import Confirmation
 
@@ -79,14 +79,14 @@ def confirm_into(
     identities: bool | None = None,
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "ConfirmJournal":
+) -> "ConfirmationRecord":
     """Confirm and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import read_header
-    from torchvision_dddas.io.output.confirmation_output import ConfirmOutput
+    from torchvision_dddas.io.output import ConfirmationRecorder
 
     check_rate(rate_hz)
-    written = [folder / name for name in ConfirmOutput.files]
+    written = [folder / name for name in ConfirmationRecorder.files]
     refuse_own_input([blobs, *people, *cameras, *poses], written, "folder with --out")
     headers = {path: read_header(path) for path in (blobs, *people)}
     places = {path: "east_m" in header for path, header in headers.items()}
@@ -98,7 +98,7 @@ def confirm_into(
                 f"{blobs} has {_KIND[places[blobs]]}, {path} has {_KIND[of_places]}; give positions.csv for all "
                 "(dddas locate), or boxes of the same pictures for all"
             )
-    with ConfirmOutput(folder) as output:
+    with ConfirmationRecorder(folder) as output:
         facts = {
             "blobs": blobs,
             "people": list(people),
@@ -144,7 +144,7 @@ def _on_the_ground(
 ) -> _Found:
     from torchvision_dddas.io.detection_tables import read_rows
     from torchvision_dddas.io.ground_tables import read_positions
-    from torchvision_dddas.io.output.confirmation_output import COLUMNS
+    from torchvision_dddas.io.output import CONFIRMATION_NAMES
     from torchvision_dddas.people.confirmation import confirm_positions
 
     given = read_positions(blobs)
@@ -153,7 +153,7 @@ def _on_the_ground(
         notes.append("without --camera nothing is known of what was seen: no blob can be found not human")
     if identities is None:  # a table of positions does not say it, and looks at different blobs must not add up
         notes.append("every row is judged alone; where target numbers last, --identities adds up the looks at each")
-    rows = read_rows(blobs, COLUMNS)
+    rows = read_rows(blobs, CONFIRMATION_NAMES)
     return *rows, confirm_positions(given, vehicles, settings, interval, bool(identities), rate_hz)
 
 
@@ -194,14 +194,14 @@ def _in_pictures(
     from dataclasses import replace
 
     from torchvision_dddas.io.detection_tables import read_detections, read_rows
-    from torchvision_dddas.io.output.confirmation_output import COLUMNS
+    from torchvision_dddas.io.output import CONFIRMATION_NAMES
     from torchvision_dddas.people.confirmation import confirm_pictures
 
     given = read_detections(blobs)
     if identities is False:
         given = replace(given, identity=None)
     tables = [read_detections(path) for path in people]
-    return *read_rows(blobs, COLUMNS), confirm_pictures(given, tables, _names(people), settings, interval)
+    return *read_rows(blobs, CONFIRMATION_NAMES), confirm_pictures(given, tables, _names(people), settings, interval)
 
 
 def _names(people: Sequence[Path]) -> list[str]:
@@ -214,7 +214,7 @@ def _names(people: Sequence[Path]) -> list[str]:
     return [name.replace(";", "-") for name in names]
 
 
-def summary(journal: "ConfirmJournal", folder: Path) -> list[str]:
+def summary(journal: "ConfirmationRecord", folder: Path) -> list[str]:
     """What to tell the user at the end."""
     kinds = journal.kinds
     told = f"{kinds['human']} human, {kinds['not_human']} not human, {kinds['unseen']} unseen"

@@ -17,16 +17,16 @@ def demo(
     from torchvision_dddas.cli.detect import detect_clip, summary
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import SAVED
+    from torchvision_dddas.io.output import DetectionRecorder
     from torchvision_dddas.simulation import film_clip
 
     if not quiet:
         typer.echo(f"filming the scenario demo into {out / 'clip'}", err=True)
     clip = film_clip(out / "clip")
-    journal = detect_clip(str(clip / "frames"), out, load_config(), "auto", SAVED, quiet=quiet)
+    journal = detect_clip(str(clip / "frames"), out, load_config(), "auto", DetectionRecorder.saved, quiet=quiet)
     report = score(clip / "masks", out, None, out)
     if not quiet:
         show(report)
-        for line in summary(journal, out, SAVED):
+        for line in summary(journal, out, DetectionRecorder.saved):
             typer.echo(line)
         typer.echo(f"Look at {out / 'overlay.mp4'}; the clip and its true masks are in {clip}")

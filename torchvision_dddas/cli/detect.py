@@ -13,7 +13,7 @@ from torchvision_dddas.cli.progress import progress
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.run_record import Journal
+    from torchvision_dddas.io.output.run_record import DetectionRecord
 
 
 @explained
@@ -42,9 +42,9 @@ def detect(
     Writes detections.txt (MOTChallenge), detections.csv, masks/, overlay.mp4 and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output import DetectionRecorder, parse_save
 
-    settings, names = load_config(config, set_ or []), saved(save)
+    settings, names = load_config(config, set_ or []), parse_save(save, DetectionRecorder.saved)
     for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
         journal = detect_clip(clip, folder, settings, backend.value, names, telemetry, rate, quiet)
         if not quiet:
@@ -61,16 +61,16 @@ def detect_clip(
     telemetry: Path | None = None,
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "Journal":
+) -> "DetectionRecord":
     """Detect in one clip and write under a folder; returns the record of the run.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.output import Output
+    from torchvision_dddas.io.output import DetectionRecorder
 
-    refuse_own_input([Path(clip)], [folder / name for name in Output.files], "folder with --out")
-    with Output(folder, save) as output:
+    refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
+    with DetectionRecorder(folder, save) as output:
         from torchvision_dddas import open_video
         from torchvision_dddas.detection import detect_motion, load_engine
         from torchvision_dddas.io.telemetry import read_telemetry
@@ -97,7 +97,7 @@ def detect_clip(
     return journal
 
 
-def summary(journal: "Journal", folder: Path, save: Sequence[str]) -> list[str]:
+def summary(journal: "DetectionRecord", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     saved = {"masks": "masks/", "overlay": "overlay.mp4"}
     made = ["detections.csv", "detections.txt", *(saved[name] for name in save), "run.json"]

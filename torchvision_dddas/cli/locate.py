@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.position_output import PositionJournal
+    from torchvision_dddas.io.output.run_record import GroundRecord
 
 locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
 locate.command()(aerial)
@@ -58,22 +58,22 @@ def ground_into(
     settings: "Settings",
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "PositionJournal":
+) -> "GroundRecord":
     """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
     from torchvision_dddas.geo.ground_locator import GroundLocator
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.detection_tables import read_detections
-    from torchvision_dddas.io.output.position_output import PositionOutput
+    from torchvision_dddas.io.output import GroundRecorder
 
     if len(cameras) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
     check_rate(rate_hz)
     if poses and len(poses) != len(tables):
         raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; wanted one --poses for each, or none")
-    written = [folder / name for name in PositionOutput.files]
+    written = [folder / name for name in GroundRecorder.files]
     refuse_own_input([*tables, *cameras, *poses], written, "folder with --out")
-    with PositionOutput(folder) as output:
+    with GroundRecorder(folder) as output:
         read = [read_detections(table) for table in tables]
         kinds = [read_camera(camera) for camera in cameras]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
@@ -104,7 +104,7 @@ def _told_apart(names: list[str]) -> tuple[str, ...]:
     return tuple(f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1))
 
 
-def summary(journal: "PositionJournal", folder: Path) -> list[str]:
+def summary(journal: "GroundRecord", folder: Path) -> list[str]:
     """What to tell the user at the end."""
     by = journal.by
     told = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"

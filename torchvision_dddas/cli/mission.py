@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from torchvision_dddas.cli.aerial import ground_facts
+from torchvision_dddas.cli.aerial import map_site
 from torchvision_dddas.cli.clips import clip_facts
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
@@ -15,8 +15,8 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.control import Mission
     from torchvision_dddas.evaluation.metrics.crowds import CrowdScore
-    from torchvision_dddas.io.output.run_record import Record
-    from torchvision_dddas.simulation import SimulatorSource
+    from torchvision_dddas.io.output import RunRecord
+    from torchvision_dddas.simulation import SimulatedRunRecorder, SimulatorSource
 
 SIMULATED = "sim:"
 """What names of scenarios begin with."""
@@ -42,12 +42,12 @@ def fly(
     overrides: of the settings; scene: of the scenario. Raises InputError for bad input.
     """
     from torchvision_dddas.cli.run import summary
-    from torchvision_dddas.io.output import saved
-    from torchvision_dddas.simulation import SAVED_WITH_TRUTH
+    from torchvision_dddas.io.output import parse_save
+    from torchvision_dddas.simulation import SimulatedRunRecorder
 
     if useless := [name for name, given in files.items() if given is not None]:
         raise InputError(f"{useless[0]} is of no use with {SIMULATED}{scenario}: the simulated vehicles tell it")
-    names = saved(save, SAVED_WITH_TRUTH)
+    names = parse_save(save, SimulatedRunRecorder.saved)
     journal, score = fly_into(folder, scenario, config, overrides, scene, seed, backend, names, quiet)
     if not quiet:
         first, *others = summary(journal, folder, True, names)
@@ -67,11 +67,11 @@ def fly_into(
     backend: str = "auto",
     save: Sequence[str] = (),
     quiet: bool = False,
-) -> "tuple[Record, CrowdScore]":
+) -> "tuple[RunRecord, CrowdScore]":
     """As `fly`, but returns the record of the run and its score, and says nothing at its end."""
-    from torchvision_dddas.simulation import SimulatedRunOutput
+    from torchvision_dddas.simulation import SimulatedRunRecorder
 
-    with SimulatedRunOutput(folder, save) as output:
+    with SimulatedRunRecorder(folder, save) as output:
         from torchvision_dddas import geometry
         from torchvision_dddas.config import load_config
         from torchvision_dddas.control import StartedSource, build_mission
@@ -96,7 +96,7 @@ def fly_into(
         mission = build_mission(source, settings, backend, chosen.clip.located_by == "landmarks")
         engine = load_engine(backend, mission.settings)
         journal = _begin(output, mission, simulated, engine.name)
-        output.knows(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
+        output.record_truth(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
         scorer = CrowdScorer(partial(geometry.east_north, origin_deg=simulated.origin_deg))
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
@@ -104,12 +104,12 @@ def fly_into(
                 for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):
                     for truth in simulated.truths():
                         scorer.feed(truth)
-                        output.true(truth)
+                        output.add_truth(truth)
                         for event in truth.events:
-                            output.event(truth.frame, event, truth.time_s)
+                            output.story.event(truth.frame, event, truth.time_s)
                     _noticed(output, mission)
                     scorer.feed(surveyed)
-                    output.survey(surveyed)
+                    output.write(surveyed)
                     for _ in range(surveyed.followed.number - done):
                         tick()
                     done = surveyed.followed.number
@@ -117,21 +117,21 @@ def fly_into(
             _noticed(output, mission)
             journal.problems += [str(problem) for problem in simulated.problems]
             for problem in simulated.problems:
-                output.event(problem.frame, str(problem), kind="problem")
+                output.story.event(problem.frame, str(problem), kind="problem")
         score = scorer.score()
-        output.scored(score.by_name(), score.lines())
+        output.story.score(score.by_name(), score.lines())
     return journal, score
 
 
-def _noticed(output: Any, mission: "Mission") -> None:
+def _noticed(output: "SimulatedRunRecorder", mission: "Mission") -> None:
     """Tell what the run itself saw to go wrong."""
-    from torchvision_dddas.io.output.run_log import NOTICED
+    from torchvision_dddas.io.output import NOTICED
 
     for notice in mission.notices():
-        output.event(notice.frame, notice.text, notice.time_s, NOTICED)
+        output.story.event(notice.frame, notice.text, notice.time_s, NOTICED)
 
 
-def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: str) -> "Record":
+def _begin(output: "SimulatedRunRecorder", mission: "Mission", source: "SimulatorSource", backend: str) -> "RunRecord":
     """Say what the run is."""
     locator, site = mission.watch.locator, mission.watch.locator.site
     facts: dict[str, Any] = {
@@ -142,7 +142,4 @@ def _begin(output: Any, mission: "Mission", source: "SimulatorSource", backend: 
         "origin_deg": site.origin_deg,
         "settings": mission.settings.model_dump(),
     }
-    journal = output.begin(facts, **ground_facts(locator, None))
-    output.also(journal, source.rate_hz, source.size, site.landmarks.names, site.origin_deg is not None)
-    kept: Record = journal
-    return kept
+    return output.begin(facts, source.rate_hz, source.size, map_site(locator, None))

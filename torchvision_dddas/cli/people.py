@@ -15,7 +15,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.people_output import PeopleJournal
+    from torchvision_dddas.io.output.run_record import PeopleRecord
     from torchvision_dddas.people.scorer import WindowScorer
 
 
@@ -51,11 +51,10 @@ def people(
     Writes detections.txt (MOTChallenge), detections.csv with the feet, overlay.mp4 (.png for a picture) and run.json.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import saved
-    from torchvision_dddas.io.output.people_output import SAVED
+    from torchvision_dddas.io.output import PeopleRecorder, parse_save
     from torchvision_dddas.people import detector as recognizing
 
-    settings, names = load_config(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), parse_save(save, PeopleRecorder.saved)
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
     recognizer = cache(lambda: recognizing.recognizer_of(settings.people, backend.value))
@@ -75,17 +74,17 @@ def people_into(
     around: Path | None = None,
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "PeopleJournal":
+) -> "PeopleRecord":
     """Recognize the people of one clip or picture and write under a folder; returns the record of the run.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.output.people_output import PeopleOutput
+    from torchvision_dddas.io.output import PeopleRecorder
 
     given = [Path(clip), *([] if around is None else [around])]
-    refuse_own_input(given, [folder / name for name in PeopleOutput.files], "folder with --out")
-    with PeopleOutput(folder, save) as output:
+    refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
+    with PeopleRecorder(folder, save) as output:
         from torchvision_dddas import open_video
         from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
         from torchvision_dddas.people.detector import recognize
@@ -120,7 +119,7 @@ def people_into(
     return journal
 
 
-def _notes(journal: "PeopleJournal", name: str, rows: int, last: int, frames: int) -> list[str]:
+def _notes(journal: "PeopleRecord", name: str, rows: int, last: int, frames: int) -> list[str]:
     """What the user should know of a table that said where to search."""
     if last > frames:
         return [f"the clip ended after frame {frames}, {name} goes on to {last}"]
@@ -130,7 +129,7 @@ def _notes(journal: "PeopleJournal", name: str, rows: int, last: int, frames: in
     return []
 
 
-def summary(journal: "PeopleJournal", folder: Path, save: Sequence[str]) -> list[str]:
+def summary(journal: "PeopleRecord", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     made = ["detections.csv", "detections.txt", *(journal.overlay for _ in save), "run.json"]
     found = f"{journal.targets} {'person' if journal.targets == 1 else 'people'}"

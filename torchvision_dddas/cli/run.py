@@ -12,8 +12,8 @@ from torchvision_dddas.cli.aerial import (
     Heights,
     Lens,
     about,
-    ground_facts,
     ground_lines,
+    map_site,
 )
 from torchvision_dddas.cli.clips import clip_facts, last_lines
 from torchvision_dddas.cli.mission import SIMULATED, fly
@@ -25,7 +25,7 @@ from torchvision_dddas.io.run_inputs import AerialInput, prepare_run
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.io.output import RunRecord
 
 
 @explained
@@ -114,10 +114,9 @@ def run(
                 out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet
             )
         )
-    from torchvision_dddas.io.output import saved
-    from torchvision_dddas.io.output.pipeline_output import SAVED
+    from torchvision_dddas.io.output import PipelineRecorder, parse_save
 
-    names = saved(save, SAVED)
+    names = parse_save(save, PipelineRecorder.saved)
     journal = run_into(out, clip, given, telemetry, interval, settings, backend.value, names, rate, quiet)
     if not quiet:
         for line in summary(journal, out, given is not None, names):
@@ -146,18 +145,17 @@ def run_into(
     save: Sequence[str] = (),
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "Record":
+) -> "RunRecord":
     """The whole path, written under a folder; returns the record of the run. given: None where nothing is located.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.output.pipeline_output import FoundOutput, SurveyOutput
+    from torchvision_dddas.io.output import PipelineRecorder
 
-    kind = FoundOutput if given is None else SurveyOutput
     files = given.files if given is not None else [telemetry] if telemetry is not None else []
-    refuse_own_input([Path(clip), *files], [folder / name for name in kind.files], "folder with --out")
-    with kind(folder, save) as output:
+    refuse_own_input([Path(clip), *files], [folder / name for name in PipelineRecorder.files], "folder with --out")
+    with PipelineRecorder(folder, save) as output:
         from torchvision_dddas import open_video
         from torchvision_dddas.pipeline import survey
 
@@ -171,37 +169,31 @@ def run_into(
             "interval_frames": interval,
             "backend": engine.name,
         }
-        journal: Record
         rate = source.rate_hz / interval
-        if isinstance(output, SurveyOutput):
-            assert given is not None
-            assert watch is not None
-            site = watch.locator.site
+        if watch is not None and given is not None:
             facts |= {**given.facts, **about(watch.locator), "settings": settings.model_dump()}
-            journal = output.begin(facts, **ground_facts(watch.locator, given.background))
-            output.also(journal, rate, source.size, site.landmarks.names, site.origin_deg is not None)
-            write = output.survey
+            site = map_site(watch.locator, given.background)
+            journal = output.begin(facts, rate, source.size, site)
         else:
             journal = output.begin({**facts, "settings": settings.model_dump()}, rate, source.size)
-            write = output.write
             notes.append("no --landmarks was given: nothing was located")
         journal.notes += notes
         try:
             count = None if source.count is None else -(-source.count // interval)
             with progress(source.name, count, quiet) as tick:
                 for surveyed in survey(source, engine, settings, ready.flight, watch, interval):
-                    write(surveyed)
+                    output.write(surveyed)
                     tick()
         finally:
             journal.problems += [str(problem) for problem in source.problems]
     return journal
 
 
-def summary(journal: "Record", folder: Path, located: bool, save: Sequence[str]) -> list[str]:
+def summary(journal: "RunRecord", folder: Path, located: bool, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
-    from torchvision_dddas.io.output.pipeline_output import ALL, FOUND
+    from torchvision_dddas.io.output import PipelineRecorder
 
-    files = ALL if located else FOUND
+    files = PipelineRecorder.files if located else PipelineRecorder.found_files
     made = [n for n in files if (folder / n).exists() and (n != "overlay.mp4" or "overlay" in save)]
     counts = journal.counts
     found = f"{journal.frames} frames, {journal.targets} targets, {counts.get('identities', 0)} identities"

@@ -13,7 +13,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.io.output.run_record import Record
+    from torchvision_dddas.io.output import RunRecord
     from torchvision_dddas.simulation import RadioReport, RecordedFrame, Scenario, Shot, Simulator
 
 
@@ -43,7 +43,7 @@ def simulate(
     Writes frames/, telemetry.csv, landmarks.csv, colours.toml, camera.toml and dem.tif as `dddas run` takes them,
     ground/ as `dddas people` and `dddas locate ground` do, truth/ as `dddas evaluate` does, scenario.toml and run.json.
     """
-    from torchvision_dddas.io.output import saved
+    from torchvision_dddas.io.output import parse_save
     from torchvision_dddas.simulation import RECORDED, load_scenario, scenario_names
 
     if scenario is None:
@@ -53,7 +53,7 @@ def simulate(
     if frames is not None and frames < 1:
         raise InputError(f"--frames is {frames}; wanted 1 or more")
     chosen = load_scenario(scenario, set_ or [], seed)
-    kinds = saved(save, RECORDED)
+    kinds = parse_save(save, RECORDED)
     journal = simulate_into(out, chosen, kinds, frames, quiet, scenario)
     if not quiet:
         for line in summary(journal, out, chosen):
@@ -67,7 +67,7 @@ def simulate_into(
     frames: int | None = None,
     quiet: bool = False,
     name: str = "simulated",
-) -> "Record":
+) -> "RunRecord":
     """Run a scenario and write it under a folder; returns the record of the run. name: the scenario's, for messages.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
@@ -186,7 +186,7 @@ def write_dem(path: Path, simulator: "Simulator") -> list[str]:
     return []
 
 
-def summary(journal: "Record", folder: Path, scenario: "Scenario") -> list[str]:
+def summary(journal: "RunRecord", folder: Path, scenario: "Scenario") -> list[str]:
     """What to tell the user at the end: the counts, what happened, notes, and how to go on."""
     events = journal.counts["events"]
     lines = [f"{journal.frames} frames of {scenario.camera.width_px}×{scenario.camera.height_px}, {len(events)} events"]

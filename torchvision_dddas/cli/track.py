@@ -15,7 +15,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.detection import Engine
-    from torchvision_dddas.io.output.track_output import TrackJournal
+    from torchvision_dddas.io.output.run_record import TrackRecord
     from torchvision_dddas.types import DetectionTable, Source, TrackedFrame
 
 
@@ -45,10 +45,9 @@ def track(
     Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 where there is a clip, and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import saved
-    from torchvision_dddas.io.output.track_output import SAVED
+    from torchvision_dddas.io.output import TrackRecorder, parse_save
 
-    settings, names = load_config(config, set_ or []), saved(save, SAVED)
+    settings, names = load_config(config, set_ or []), parse_save(save, TrackRecorder.saved)
     if clip is None and detections is None:
         raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
     if interval < 1:
@@ -73,17 +72,17 @@ def track_into(
     save: Sequence[str] = (),
     rate_hz: float | None = None,
     quiet: bool = False,
-) -> "TrackJournal":
+) -> "TrackRecord":
     """Track and write under a folder; returns the record of the run. One of clip and detections must be given.
 
     Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
     """
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.output.track_output import TrackOutput
+    from torchvision_dddas.io.output import TrackRecorder
 
     given = [Path(name) for name in (clip, detections) if name is not None]
-    refuse_own_input(given, [folder / name for name in TrackOutput.files], "folder with --out")
-    with TrackOutput(folder, save) as output:
+    refuse_own_input(given, [folder / name for name in TrackRecorder.files], "folder with --out")
+    with TrackRecorder(folder, save) as output:
         from torchvision_dddas import open_video
         from torchvision_dddas.detection import load_engine
         from torchvision_dddas.io.detection_tables import check_birth_score, check_table, read_detections
@@ -148,7 +147,7 @@ def looks(table: "DetectionTable | None", source: "Source | None", interval: int
     return None if last is None else -(-last // interval)
 
 
-def summary(journal: "TrackJournal", folder: Path, save: Sequence[str]) -> list[str]:
+def summary(journal: "TrackRecord", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     made = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in save), "run.json"]
     found = f"{journal.frames} frames, {journal.targets} detections, {journal.identities} identities"

@@ -30,12 +30,11 @@ from torchvision_dddas.simulation.scenario_file import (
 )
 from torchvision_dddas.simulation.simulator import Shot, Simulator
 from torchvision_dddas.simulation.source import SimulatorSource, name_scenario_in_errors, open_scenario, open_simulator
-from torchvision_dddas.simulation.truth import SAVED_WITH_TRUTH, SimulatedRunOutput, TruthOutput
+from torchvision_dddas.simulation.truth import SimulatedRunRecorder, TruthOutput
 from torchvision_dddas.simulation.world import World, build_world
 
 __all__ = [
     "RECORDED",
-    "SAVED_WITH_TRUTH",
     "AircraftParameters",
     "CameraParameters",
     "CarPlan",
@@ -49,7 +48,7 @@ __all__ = [
     "RecordingOutput",
     "Scenario",
     "Shot",
-    "SimulatedRunOutput",
+    "SimulatedRunRecorder",
     "Simulator",
     "SimulatorSource",
     "TeamParameters",

@@ -13,8 +13,7 @@ import numpy as np
 from torchvision_dddas.config import format_toml
 from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
 from torchvision_dddas.io.colour_files import format_colours
-from torchvision_dddas.io.output.detection_output import RunFolder
-from torchvision_dddas.io.output.run_record import NAME, Record
+from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.overlay import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.simulation.scenario import Scenario
@@ -65,12 +64,12 @@ class RecordedFrame:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class RecordingOutput(RunFolder[RecordedFrame]):
-    """Everything that `dddas simulate` writes. Raises InputError as RunFolder does."""
+class RecordingOutput(RunRecorder[RecordedFrame]):
+    """Everything that `dddas simulate` writes. Raises InputError as RunRecorder does."""
 
     files: ClassVar[tuple[str, ...]] = (
         *("frames/000001.jpg", "clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif"),
-        *("scenario.toml", *TruthOutput.files, NAME),
+        *("scenario.toml", *TruthOutput.files, RUN_JSON),
     )
 
     def begin(
@@ -81,34 +80,36 @@ class RecordingOutput(RunFolder[RecordedFrame]):
         colours: Colours,
         scenario: str,
         lonlat: LonLat,
-    ) -> Record:
+    ) -> RunRecord:
         """Say what the run is, for run.json.
 
         scenario: the text of scenario.toml. lonlat: (N, 2) longitudes and latitudes of (N, 2) local metres.
         """
-        self.journal = kept = Record(self.folder, {**facts, "outputs": ["tables", *self._save]})
+        record = RunRecord(self.folder, {**facts, "outputs": ["tables", *self.save]})
         texts = {"camera.toml": camera_toml(camera), "scenario.toml": scenario}
         if len(colours):
             texts["colours.toml"] = format_colours(colours)
-        self._sinks = [_Kept(kept), _Texts(self.folder, texts), _Reports(self.folder), _Truth(self, lonlat)]
-        if "frames" in self._save:
-            self._sinks.append(_Frames(self.folder / "frames"))
-        if "video" in self._save:
-            self._sinks.append(_Video(self.folder, rate_hz, camera.size_px))
-        if "ground" in self._save:
-            self._sinks.append(_Ground(self.folder / "ground", colours.names))
-        return kept
+        parts: list[Part[RecordedFrame]] = [_Kept(record), _Texts(self.folder, texts)]
+        parts += [_Reports(self.folder), _Truth(self, lonlat)]
+        if "frames" in self.save:
+            parts.append(_Frames(self.folder / "frames"))
+        if "video" in self.save:
+            parts.append(_Video(self.folder, rate_hz, camera.size_px))
+        if "ground" in self.save:
+            parts.append(_Ground(self.folder / "ground", colours.names))
+        self.add_parts(record, parts)
+        return record
 
     @property
     def masks(self) -> bool:
         """Whether masks are to be written."""
-        return "masks" in self._save
+        return "masks" in self.save
 
 
 class _Kept:
     """The record of the run: frames, events, dropped frames."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RunRecord) -> None:
         self._record = record
         self._events: list[dict[str, Any]] = []
         record.counts = {"events": self._events, "dropped": 0}

@@ -5,17 +5,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
 from torchvision_dddas.io.images import Masks
-from torchvision_dddas.io.maps.geojson import encoded, geojson
-from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks
-from torchvision_dddas.io.output.detection_output import uninterrupted
-from torchvision_dddas.io.output.pipeline_output import ALL, SurveyOutput
-from torchvision_dddas.io.output.pipeline_output import SAVED as MADE
+from torchvision_dddas.io.maps import Gathered, GroundTracks, encode_geojson, geojson
+from torchvision_dddas.io.output import PipelineRecorder
+from torchvision_dddas.io.output.recorder import uninterrupted
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.types import Bodies, FrameResult, Positions, Truth
 
@@ -105,7 +103,7 @@ class TruthOutput:
         if self._masks is not None:
             self._masks.close(complete)
         targets, fleet = self._targets.tracks(True), self._landmarks.tracks(True)
-        content = encoded(geojson(targets, landmarks=_ranked(fleet), names=_names(fleet)))
+        content = encode_geojson(geojson(targets, landmarks=_ranked(fleet), names=_names(fleet)))
         write_whole(self._folder / "tracks.geojson", content)
 
     def discard(self) -> None:
@@ -181,43 +179,38 @@ def _names(fleet: GroundTracks) -> tuple[str, ...]:
     return tuple(f"ugv{k + 1}" for k in range(len(np.unique(fleet.target))))
 
 
-# The folder of a run in a simulated world: what a run of the whole path leaves, and the truth beside it.
+class SimulatedRunRecorder(PipelineRecorder):
+    """The folder of a run in a simulated world: what `dddas run` writes, and truth/ for `dddas evaluate`."""
 
+    files: ClassVar[tuple[str, ...]] = (*PipelineRecorder.files, *TruthOutput.files)
+    saved: ClassVar[tuple[str, ...]] = (*PipelineRecorder.saved, "truth")
 
-SAVED_WITH_TRUTH = (*MADE, "truth")
-"""What --save may name. The tables and run.json are always written."""
-
-
-class SimulatedRunOutput(SurveyOutput):
-    """As SurveyOutput, with truth/ for `dddas evaluate`: the tables of TruthOutput, without masks."""
-
-    files: ClassVar[tuple[str, ...]] = (*ALL, *TruthOutput.files)
-
-    def knows(self, lonlat: LonLat) -> None:
-        """After `also`. lonlat: (N, 2) longitudes and latitudes of (N, 2) metres of the world."""
-        self._truth = TruthOutput(self.folder, lonlat, masks=False) if "truth" in self._save else None
+    def record_truth(self, lonlat: LonLat) -> None:
+        """Call after `begin`. lonlat: (N, 2) longitudes and latitudes of (N, 2) metres of the world."""
+        self._truth = TruthOutput(self.folder, lonlat, masks=False) if "truth" in self.save else None
         self._ahead: deque[Truth] = deque()
 
-    def true(self, truth: Truth) -> None:
-        """What is true of a frame, before it is surveyed: it is written then, so that both end at one frame."""
+    def add_truth(self, truth: Truth) -> None:
+        """Add the truth of a frame before its result; both are written together, so that both end at one frame."""
         if self._truth is not None:
             self._ahead.append(truth)
 
-    def survey(self, item: FrameResult) -> None:
-        """Write a frame and what is true until then. Raises InputError if the disk refuses."""
+    def write(self, item: FrameResult) -> None:
+        """Write a frame and the truth until then. Raises InputError if the disk refuses."""
         with uninterrupted():
-            super().survey(item)
-            self._write(item.followed.number)
+            super().write(item)
+            self._write_truth(item.followed.number)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place, as SurveyOutput; the truth of an earlier run here goes."""
+        """Put everything in its place; without `truth` in save, that of an earlier run is removed."""
         with uninterrupted():
             with self._refusals():
                 if self._truth is None:
-                    _without(self.folder)
+                    for name in TruthOutput.files:
+                        remove(self.folder / name)
                 else:
                     if complete:
-                        self._write(math.inf)
+                        self._write_truth(math.inf)
                     self._truth.close(complete)
             super().close(complete)
 
@@ -229,14 +222,7 @@ class SimulatedRunOutput(SurveyOutput):
                 truth.discard()
             super().discard()
 
-    def _write(self, until: float) -> None:
-        """The truths that wait, up to a frame."""
+    def _write_truth(self, until: float) -> None:
         with self._refusals():
             while self._truth is not None and self._ahead and self._ahead[0].frame <= until:
                 self._truth.write(self._ahead.popleft())
-
-
-def _without(folder: Path) -> None:
-    """Remove an earlier run's truth."""
-    for name in TruthOutput.files:
-        remove(folder / name)

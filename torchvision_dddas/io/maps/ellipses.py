@@ -7,8 +7,6 @@ import numpy as np
 
 _AXIS_M, _SQUARED_ECCENTRICITY = 6_378_137.0, 6.694379990141316e-3  # WGS84
 
-Place = list[float]
-"""Longitude and latitude in degrees."""
 CHI2_95 = 5.991464547107979
 """The 95 % quantile of chi-squared with two degrees of freedom, -2 ln 0.05."""
 

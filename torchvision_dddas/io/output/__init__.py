@@ -1,1 +1,39 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
+
+from torchvision_dddas.io.output.ground_maps import Site
+from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder, parse_save
+from torchvision_dddas.io.output.recorders import (
+    AerialRecorder,
+    ConfirmationRecorder,
+    DetectionRecorder,
+    GroundRecorder,
+    PeopleRecorder,
+    PipelineRecorder,
+    TrackRecorder,
+)
+from torchvision_dddas.io.output.run_log import NOTICED, PROBLEM, WORLD
+from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, finite, versions
+from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
+
+__all__ = [
+    "CONFIRMATION_NAMES",
+    "NOTICED",
+    "PROBLEM",
+    "RUN_JSON",
+    "WORLD",
+    "AerialRecorder",
+    "ConfirmationRecorder",
+    "DetectionRecorder",
+    "GroundRecorder",
+    "Part",
+    "PartOf",
+    "PeopleRecorder",
+    "PipelineRecorder",
+    "RunRecord",
+    "RunRecorder",
+    "Site",
+    "TrackRecorder",
+    "finite",
+    "parse_save",
+    "versions",
+]

@@ -17,8 +17,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
-from torchvision_dddas.io.output.run_record import NAME as RECORD
-from torchvision_dddas.io.output.run_record import finite, versions
+from torchvision_dddas.io.output.run_record import RUN_JSON, finite, versions
 
 RESULTS, EVENTS = "results.jsonl", "events.log"
 
@@ -96,7 +95,7 @@ class SessionLog:
     def state(self, state: str, now: dict[str, Any]) -> None:
         """Replace run.json. state: running, complete, stopped or failed."""
         record = {"state": state, "versions": versions(), **self.facts, **now}
-        write_whole(self.folder / RECORD, (json.dumps(finite(record), indent=2) + "\n").encode())
+        write_whole(self.folder / RUN_JSON, (json.dumps(finite(record), indent=2) + "\n").encode())
 
     def close(self) -> None:
         """Nothing follows."""

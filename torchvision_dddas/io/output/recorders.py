@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -50,8 +50,8 @@ from torchvision_dddas.types import (
 class DetectionRecorder(RunRecorder[Scene]):
     """The folder of `dddas detect`: tables, masks, overlay."""
 
-    files = ("detections.txt", "detections.csv", *RunRecorder.files)
-    saved = ("masks", "overlay")
+    files: ClassVar[tuple[str, ...]] = ("detections.txt", "detections.csv", *RunRecorder.files)
+    saved: ClassVar[tuple[str, ...]] = ("masks", "overlay")
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float) -> DetectionRecord:
         """Start the run. facts: for run.json. rate_hz: of the overlay."""
@@ -68,8 +68,8 @@ class DetectionRecorder(RunRecorder[Scene]):
 class TrackRecorder(RunRecorder[TrackedFrame]):
     """The folder of `dddas track`: tables, overlay."""
 
-    files = ("tracks.txt", "tracks.csv", *RunRecorder.files)
-    saved = ("overlay",)
+    files: ClassVar[tuple[str, ...]] = ("tracks.txt", "tracks.csv", *RunRecorder.files)
+    saved: ClassVar[tuple[str, ...]] = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> TrackRecord:
         """Start the run. rate_hz, size: of the overlay, (width, height)."""
@@ -84,8 +84,8 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
 class PeopleRecorder(RunRecorder[PeopleFrame]):
     """The folder of `dddas people`: tables, overlay."""
 
-    files = ("detections.txt", "detections.csv", "overlay.png", *RunRecorder.files)
-    saved = ("overlay",)
+    files: ClassVar[tuple[str, ...]] = ("detections.txt", "detections.csv", "overlay.png", *RunRecorder.files)
+    saved: ClassVar[tuple[str, ...]] = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> PeopleRecord:
         """Start the run. rate_hz: of the overlay. is_single: one image, whose overlay is no video."""
@@ -103,7 +103,7 @@ class PeopleRecorder(RunRecorder[PeopleFrame]):
 class GroundRecorder(RunRecorder[GroundLocations]):
     """The folder of `dddas locate ground`: tables, maps."""
 
-    files = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
+    files: ClassVar[tuple[str, ...]] = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
 
     def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> GroundRecord:
         """Start the run. cameras: their names. has_degrees: whether longitudes and latitudes are known."""
@@ -124,7 +124,7 @@ class GroundRecorder(RunRecorder[GroundLocations]):
 class ConfirmationRecorder(RunRecorder[Confirmation]):
     """The folder of `dddas confirm`: the blobs' table with what was found of them."""
 
-    files = ("confirmed.csv", RUN_JSON)
+    files: ClassVar[tuple[str, ...]] = ("confirmed.csv", RUN_JSON)
 
     def begin(
         self, facts: Mapping[str, Any], header: Sequence[str], cells: Sequence[Sequence[str]]
@@ -138,8 +138,8 @@ class ConfirmationRecorder(RunRecorder[Confirmation]):
 class AerialRecorder(RunRecorder[AerialLocations]):
     """The folder of `dddas locate aerial`: tables, maps, a report."""
 
-    files = ("positions.csv", "fixes.csv", *AerialMaps.files, RUN_JSON)
-    saved = ("cot", "map", "report")
+    files: ClassVar[tuple[str, ...]] = ("positions.csv", "fixes.csv", *AerialMaps.files, RUN_JSON)
+    saved: ClassVar[tuple[str, ...]] = ("cot", "map", "report")
 
     def begin(self, facts: Mapping[str, Any], site: Site) -> AerialRecord:
         """Start the run."""
@@ -152,13 +152,21 @@ class AerialRecorder(RunRecorder[AerialLocations]):
 class PipelineRecorder(RunRecorder[FrameResult]):
     """The folder of `dddas run`: tables, overlay, log, and where targets are located maps and a report of them."""
 
-    found_files = ("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", LOG_TXT, REPORT, *RunRecorder.files)
+    found_files: ClassVar[tuple[str, ...]] = (
+        "detections.csv",
+        "detections.txt",
+        "tracks.csv",
+        "tracks.txt",
+        LOG_TXT,
+        REPORT,
+        *RunRecorder.files,
+    )
     """Files of a run that locates nothing."""
-    files = (
+    files: ClassVar[tuple[str, ...]] = (
         *(*found_files, "landmarks.csv", "confirmed.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
-    saved = ("overlay", *AerialRecorder.saved)
+    saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
 
     def begin(
         self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int], site: Site | None = None

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.io.output.track_tables import mot_lines
+from torchvision_dddas.io.output.tables import track_rows
+from torchvision_dddas.io.tables import MOT_TRACKS
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
@@ -18,8 +19,8 @@ def mot_rows(surveyed: FrameResult | None, people: TrackedFrame | None, most_byt
 
     One message a frame, or where that is longer than most_bytes several of whole lines. A box without end is no row.
     """
-    text = "" if surveyed is None else mot_lines(_told(surveyed.followed, 0))
-    text += "" if people is None else mot_lines(_told(people, PEOPLE_FROM))
+    text = "" if surveyed is None else MOT_TRACKS.format_rows(track_rows(_told(surveyed.followed, 0)))
+    text += "" if people is None else MOT_TRACKS.format_rows(track_rows(_told(people, PEOPLE_FROM)))
     messages = [b""]
     for line in text.encode("ascii").splitlines(keepends=True):
         if messages[-1] and 0 < most_bytes < len(messages[-1]) + len(line):

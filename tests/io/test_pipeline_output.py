@@ -11,9 +11,8 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.ground_tables import read_landmarks
-from torchvision_dddas.io.output.landmark_table import MarkTable
-from torchvision_dddas.io.output.pipeline_output import FoundOutput, SurveyOutput
-from torchvision_dddas.io.output.run_log import PROBLEM
+from torchvision_dddas.io.output import PROBLEM, PipelineRecorder, Site
+from torchvision_dddas.io.output.tables import landmark_table
 from torchvision_dddas.io.overlay import RunPictures
 from torchvision_dddas.io.overlay.layers import LANDMARK
 from torchvision_dddas.types import (
@@ -72,7 +71,7 @@ def rows(path):
 
 @pytest.mark.parametrize("geographic", [False, True])
 def test_the_landmarks_table_can_be_read_as_one(tmp_path, geographic):
-    table = MarkTable(tmp_path, NAMES, geographic)
+    table = landmark_table(tmp_path, NAMES, geographic)
     for frame in (1, 2):
         table.write(surveyed(frame, geographic=geographic))
     table.close(True)
@@ -86,11 +85,10 @@ def test_the_landmarks_table_can_be_read_as_one(tmp_path, geographic):
 
 
 def test_the_record_counts_identities_beside_what_was_located(tmp_path):
-    with SurveyOutput(tmp_path, ()) as output:
-        journal = output.begin({"input": "clip"}, NAMES, None)
-        output.also(journal, 10.0, (200, 120), NAMES, False)
+    with PipelineRecorder(tmp_path, ()) as output:
+        output.begin({"input": "clip"}, 10.0, (200, 120), Site(NAMES))
         for frame in (1, 2):
-            output.survey(surveyed(frame))
+            output.write(surveyed(frame))
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["identities"] == 3
     assert record["positions"] == 2
@@ -101,10 +99,9 @@ def test_the_record_counts_identities_beside_what_was_located(tmp_path):
 
 def test_a_run_that_fails_leaves_nothing_that_looks_whole(tmp_path):
     def failing():
-        with SurveyOutput(tmp_path / "out", ("overlay",)) as output:
-            journal = output.begin({"input": "clip"}, NAMES, None)
-            output.also(journal, 10.0, (200, 120), NAMES, False)
-            output.survey(surveyed(1))
+        with PipelineRecorder(tmp_path / "out", ("overlay",)) as output:
+            output.begin({"input": "clip"}, 10.0, (200, 120), Site(NAMES))
+            output.write(surveyed(1))
             raise InputError("the disk is full")
 
     with pytest.raises(InputError):
@@ -155,16 +152,15 @@ def moved(surveyed, *adjustments):
 
 def flown(folder, frames, save=("report",), events=(), score=None, geographic=False):
     """A run with all that is told of it; its record."""
-    with SurveyOutput(folder, save) as output:
+    with PipelineRecorder(folder, save) as output:
         origin = (-110.95, 32.23) if geographic else None
-        journal = output.begin({"input": "sim:two"}, NAMES, origin)
-        output.also(journal, 10.0, (200, 120), NAMES, geographic)
+        output.begin({"input": "sim:two"}, 10.0, (200, 120), Site(NAMES, origin))
         for event in events:
-            output.event(*event)
+            output.story.event(*event)
         for frame in frames:
-            output.survey(frame)
+            output.write(frame)
         if score:
-            output.scored(*score)
+            output.story.score(*score)
     return json.loads((folder / "run.json").read_text())
 
 
@@ -259,9 +255,9 @@ def test_an_interrupted_run_has_its_log_too(tmp_path):
 
 def test_a_run_that_locates_nothing_has_a_log_and_a_report_without_a_map(tmp_path):
     change = Adjustment(2, "interval.frames", 1, 2, "background flow 0.5 px a frame")
-    with FoundOutput(tmp_path, ("report",)) as output:
+    with PipelineRecorder(tmp_path, ("report",)) as output:
         output.begin({"input": "clip"}, 10.0, (200, 120))
-        output.event(3, "frame 3 could not be read", None, PROBLEM)
+        output.story.event(3, "frame 3 could not be read", None, PROBLEM)
         for k in (1, 2, 3):
             output.write(FrameResult(replace(surveyed(k).followed, adjustments=(change,) if k == 2 else ())))
     assert [line.split()[2] for line in log(tmp_path)] == ["adjusted", "problem"]
@@ -273,7 +269,7 @@ def test_a_run_that_locates_nothing_has_a_log_and_a_report_without_a_map(tmp_pat
 
 def test_a_report_that_is_not_wanted_is_not_made_and_an_old_one_goes(tmp_path):
     for save, there in ((("report",), True), ((), False)):
-        with FoundOutput(tmp_path, save) as output:
+        with PipelineRecorder(tmp_path, save) as output:
             output.begin({"input": "clip"}, 10.0, (200, 120))
             output.write(FrameResult(surveyed(1).followed))
         assert (tmp_path / "report.html").exists() is there

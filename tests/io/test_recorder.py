@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.output import Output, saved
+from torchvision_dddas.io.output import DetectionRecorder, parse_save
 from torchvision_dddas.io.output.run_record import Durations, finite
 
 
@@ -23,7 +23,7 @@ def visible(folder):
 
 
 def fill(folder, scenes, save=("masks", "overlay")):
-    with Output(folder, save) as output:
+    with DetectionRecorder(folder, save) as output:
         output.begin({"backend": "onboard", "settings": {"points": 5}}, rate_hz=10)
         for scene in scenes:
             output.write(scene)
@@ -144,7 +144,7 @@ def test_a_disk_that_fills_up_while_closing_leaves_no_table(tmp_path, scene, mon
 
 
 def test_a_run_that_was_killed_is_seen_to_be_unfinished(tmp_path, scene):
-    output = Output(tmp_path)
+    output = DetectionRecorder(tmp_path)
     output.begin({}, rate_hz=10)
     output.write(scene(1))
     assert run_json(tmp_path)["state"] == "running"
@@ -179,13 +179,13 @@ def test_masks_that_someone_else_made_are_not_replaced(tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks/000001.png").write_bytes(b"truth")
     with pytest.raises(InputError, match=r"000001\.png was not written by dddas"):
-        Output(tmp_path)
+        DetectionRecorder(tmp_path)
 
 
 def test_a_file_in_place_of_the_folder_is_one_line(tmp_path):
     (tmp_path / "out").write_text("")
     with pytest.raises(InputError, match=r"cannot write into .*out.*--out"):
-        Output(tmp_path / "out/deeper")
+        DetectionRecorder(tmp_path / "out/deeper")
 
 
 def test_a_folder_that_refuses_files_is_one_line(tmp_path, monkeypatch):
@@ -194,12 +194,12 @@ def test_a_folder_that_refuses_files_is_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(InputError, match="Permission denied"):
-        Output(tmp_path)
+        DetectionRecorder(tmp_path)
 
 
 def test_unknown_names_to_save_are_named_with_those_there_are():
-    with pytest.raises(InputError, match=r"'film'.*masks, overlay, all and none"):
-        saved("masks,film")
+    with pytest.raises(InputError, match=r"masks, overlay, all or none, got 'film'"):
+        parse_save("masks,film", DetectionRecorder.saved)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_unknown_names_to_save_are_named_with_those_there_are():
     ],
 )
 def test_names_to_save(names, expected):
-    assert saved(names) == expected
+    assert parse_save(names, DetectionRecorder.saved) == expected
 
 
 def test_median_of_durations_is_within_a_hundredth():

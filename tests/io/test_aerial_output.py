@@ -11,8 +11,8 @@ from torchvision_dddas import geometry
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.io.ground_tables import read_positions
-from torchvision_dddas.io.output.location_output import GroundedOutput
-from torchvision_dddas.io.output.location_tables import angles_deg, upper_edge_deg
+from torchvision_dddas.io.output import AerialRecorder, Site
+from torchvision_dddas.io.output.tables import angles_deg, upper_edge_deg
 from torchvision_dddas.types import Adjustment, CameraPose
 
 ALL = {
@@ -29,8 +29,8 @@ GOOD = [grounded(k) for k in range(1, 13)]
 
 
 def run(folder, frames=GOOD, origin=ORIGIN, start=START, save=("cot", "map", "report"), fail=None, **more):
-    with GroundedOutput(folder, save) as output:
-        output.begin({"input": "clip.mp4", "settings": {}}, NAMES, origin, start, 10.0, **more)
+    with AerialRecorder(folder, save) as output:
+        output.begin({"input": "clip.mp4", "settings": {}}, Site(NAMES, origin, start, 10.0, **more))
         for frame in frames:
             output.write(frame)
         if fail is not None:
@@ -130,7 +130,7 @@ def test_all_files_are_there_and_valid(tmp_path):
 
 
 def test_landmarks_are_on_the_maps_where_their_degrees_can_be_told(tmp_path):
-    run(tmp_path, degrees=lambda metres: geometry.lonlat(metres, ORIGIN))
+    run(tmp_path, to_degrees=lambda metres: geometry.lonlat(metres, ORIGIN))
     features = json.loads((tmp_path / "tracks.geojson").read_text())["features"]
     marked = {
         f["properties"]["landmark"]: f["geometry"]["coordinates"] for f in features if "landmark" in f["properties"]
