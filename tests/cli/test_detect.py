@@ -69,7 +69,7 @@ def test_knobs_are_set_and_recorded(dddas, engine, clip, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--save", "film"), "--save does not know 'film'; there are masks, overlay, all and none"),
+        (("--save", "film"), "--save must name some of masks, overlay, all or none, got 'film'"),
         (("--set", "registration.keypints=5"), "unknown parameter"),
         (("--set", "registration.keypoints=5"), "50 to 5000"),
         (("--config", "nosuch"), "nosuch"),

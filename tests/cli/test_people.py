@@ -191,7 +191,7 @@ def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, stub, clip, 
 
 
 MISTAKES = [
-    (("--save", "masks"), "--save does not know 'masks'; there are overlay, all and none"),
+    (("--save", "masks"), "--save must name some of overlay, all or none, got 'masks'"),
     (("--set", "people.serch=regions"), "unknown parameter"),
     (("--set", "people.search=somewhere"), "everywhere or regions"),
     (("--config", "nosuch"), "nosuch"),

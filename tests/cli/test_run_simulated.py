@@ -87,16 +87,16 @@ def test_the_record_says_how_good_it_was(made):
 
 
 def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dddas, monkeypatch):
-    from torchvision_dddas.simulation import SimulatedRunOutput
+    from torchvision_dddas.simulation import SimulatedRunRecorder
 
-    survey = SimulatedRunOutput.survey
+    survey = SimulatedRunRecorder.write
 
     def short(self, item):
         survey(self, item)
         if item.followed.number == 6:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(SimulatedRunOutput, "survey", short)
+    monkeypatch.setattr(SimulatedRunRecorder, "write", short)
     out = tmp_path / "out"
     path = scenario(tmp_path / "tiny.toml")
     result = dddas("run", f"sim:{path}", "--out", out, "--save", "truth", "--quiet", "--set", "steering.sampling=false")
@@ -131,7 +131,7 @@ def test_truth_that_is_not_asked_for_goes_with_the_earlier_run(made, dddas, tmp_
         (["sim:joining", "--set", "steering.oops=1"], "unknown parameter 'steering.oops'"),
         (["sim:joining", "--interval", "2"], "--interval is of no use with sim:joining"),
         (["sim:joining", "--landmarks", "ugvs.csv"], "--landmarks is of no use with sim:joining"),
-        (["sim:joining", "--save", "film"], "--save does not know 'film'; there are overlay, cot, map, report, truth"),
+        (["sim:joining", "--save", "film"], "--save must name some of overlay, cot, map, report, truth"),
         (["joining", "--scene", "uav.altitude_m=60"], "--scene and --seed change a simulated scenario"),
     ],
 )

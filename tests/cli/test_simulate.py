@@ -205,7 +205,7 @@ def test_without_a_name_it_lists_the_scenarios(dddas):
         ),
         (["joining", "--seed", "-1"], "seed = -1 will not do"),
         (["joining", "--frames", "0"], "--frames is 0; wanted 1 or more"),
-        (["joining", "--save", "film"], "--save does not know 'film'; there are frames, video, masks, ground"),
+        (["joining", "--save", "film"], "--save must name some of frames, video, masks, ground"),
     ],
 )
 def test_a_mistake_is_told_in_one_line(dddas, tmp_path, words, line):

@@ -152,7 +152,7 @@ MISTAKES = [
     (("--set", "track.mod=paper"), "unknown parameter"),
     (("--set", "track.mode=best"), "track.mode"),
     (("--config", "nosuch"), "nosuch"),
-    (("--save", "masks"), "--save does not know 'masks'; there are overlay, all and none"),
+    (("--save", "masks"), "--save must name some of overlay, all or none, got 'masks'"),
     (("--save", "overlay"), "--save overlay needs a clip"),
     (("--interval", "0"), "--interval is 0; wanted 1 or more"),
     (("--interval", "-2"), "--interval is -2"),
