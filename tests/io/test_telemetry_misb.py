@@ -11,7 +11,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.attitude import angles, axes, axes_of_quaternion
-from torchvision_dddas.io.telemetry.klv import imap, local_sets, mapped
+from torchvision_dddas.io.telemetry.misb import imap, local_sets, mapped
 
 START_US = 1_340_980_354_100_000
 PLACE = {13: spread(34.7211, 0, 90, 4, True), 14: spread(-86.6891, 0, 180, 4, True), 15: spread(3048, -900, 19000, 2)}

@@ -149,7 +149,7 @@ def test_no_fix_is_no_place_and_no_height_above_the_sea(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (timed("[iso: 100]", "[iso: 100]"), "tells a place, an altitude"),
+        (timed("[iso: 100]", "[iso: 100]"), "holds a place, an altitude"),
         (timed("[latitude: 118.2] [longitude: 34.1]"), r"line 2: latitude_deg is 118.2; .*swapped\?"),
         (timed("[latitude: 18.2] [longitude: 234.1]"), "line 2: longitude_deg is 234.1"),
         (timed(*["[latitude: 18.2] [longitude: 34.1]"] * 9) * 2, r"line \d+: time runs back from 8.000 to 0.000"),

@@ -1,8 +1,80 @@
-"""What the vehicle reports of itself, from whatever wrote it down, as one record.
+"""What the vehicle reports of itself, from whatever recorded it, as one record.
 
-Own tables, DJI's subtitles, MAVLink and PX4 logs, MISB ST 0601 inside MPEG-TS, NMEA 0183.
+Own tables, DJI's subtitles, MAVLink and PX4 logs, MISB ST 0601 inside MPEG-TS, NMEA 0183. The kind is found by the
+content of the file, then by its name.
 """
 
-from torchvision_dddas.io.telemetry.reading import read_telemetry
+import codecs
+import re
+from pathlib import Path
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
+from torchvision_dddas.io.telemetry.misb import KEY, read_misb
+from torchvision_dddas.io.telemetry.nmea import read_nmea
+from torchvision_dddas.io.telemetry.srt import read_subtitles
+from torchvision_dddas.io.telemetry.tables import read_telemetry_table
+from torchvision_dddas.io.telemetry.transport import spacing
+from torchvision_dddas.io.telemetry.ulog import MAGIC, read_ulog
+from torchvision_dddas.types import Telemetry
 
 __all__ = ["read_telemetry"]
+
+_STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 4)}
+_OTHERS = {
+    b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
+    b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
+}
+_SENTENCE = re.compile(r"\$[A-Z]{2}[A-Z]{3},")
+KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
+
+
+def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Path | None = None) -> Telemetry:
+    """What a vehicle reports of itself. clock_offset_s: added to its times to get those since the clip's first frame.
+
+    clip: the video that it belongs to; of use for a table that counts frames instead of telling times.
+    Raises InputError in one line where the file cannot be read or nothing in it can be used. What can be read of a
+    damaged file is returned, and its notes say what could not.
+    """
+    path, clip = Path(path), Path(clip) if clip is not None else None
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
+    suffix = path.suffix.lower()
+    if not head.strip() and suffix != ".csv":
+        raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
+    if head.startswith(MAGIC):
+        return read_ulog(path, clock_offset_s)
+    if head.startswith(KEY):
+        return read_misb(path, None, clock_offset_s)
+    # What is damaged at its beginning still has its name.
+    if (layout := spacing(head) or _STREAMS.get(suffix)) is not None:
+        return read_misb(path, layout, clock_offset_s)
+    if looks_like_tlog(head) or suffix == ".tlog":
+        return read_tlog(path, clock_offset_s)
+    text = _text(head)
+    if text is not None and _SENTENCE.search(text):
+        return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
+    if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
+        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
+    if suffix == ".csv" or (text is not None and "," in text):
+        return read_telemetry_table(path, clock_offset_s, clip)
+    if suffix == ".ulg":
+        raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
+    for mark, words in _OTHERS.items():
+        if mark in head[:12]:
+            raise InputError(f"telemetry {path} {words}")
+    raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
+
+
+def _text(content: bytes) -> str | None:
+    """The content as text; None where it is none. A few garbled letters do not make it something else."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
+    if content.count(b"\0") > len(content) // 1000 + 3:
+        return None
+    text = content.decode("utf-8-sig", errors="replace")
+    strange = sum(letter == "\ufffd" or (letter < " " and letter not in "\r\n\t") for letter in text[:4096])
+    return text if strange <= 0.1 * min(len(text), 4096) else None

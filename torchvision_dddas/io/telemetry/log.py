@@ -1,4 +1,4 @@
-"""What was read of a log so far: values at times, each with its place in the file, and what the user should know."""
+"""The samples of a log, checked and resampled at common times as one telemetry record."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,19 +6,39 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Telemetry
 
 OWN = "table"
-"""The kind of our own tables, which may leave out what they like."""
+"""The kind of own tables, which may lack a place."""
+
+# A barometer's zero drifts by metres in a flight; an altitude below this has another origin than the ground.
+_DEEP_M = -5.0
+# Values outside are damage.
+_POSSIBLE = {"altitude_m": (-1e4, 1e5), "above_sea_m": (-1e4, 1e5), "speed_m_s": (0.0, 1e3), "hfov_rad": (1e-3, np.pi)}
+# A pause of this many median sample intervals, and of this many seconds, is a gap: nothing is known within it.
+_GAP_SHARE, _GAP_S = 10.0, 5.0
+# A log with nothing but these is refused.
+_NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad"}
+_TURNING = ("heading_rad", "roll_rad", "vehicle_heading_rad")
+_FULL = {"longitude_deg": 360.0} | dict.fromkeys(_TURNING, 2 * np.pi)
+# Metres a degree of latitude; right to half a per cent, better than a smoothed speed.
+_DEGREE_M = 111_320.0
+# Half the time span over which a line is fitted to the places: lowest and highest.
+_LEAST_S, _MOST_S = 1.0, 10.0
+# Places are rounded: the span is long enough for a step of the last digit to change the speed by no more than this.
+_STEP_M_S = 0.5
+# A receiver's places drift by this even where more digits are written.
+_WANDER_M = 0.1
 
 
 @dataclass
 class Log:
-    """What was read so far. path: of the file. kind: in words, for messages. where: what samples are counted in.
+    """What was read so far. path: of the file. kind: in words, for messages. where: unit of places in the file.
 
-    bridge_s: how long a column may be silent beside others and still be taken to go on; 0 where silence means unknown.
+    bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
     jitter_s: how far time may run back; more is another recording, or damage.
-    said: time, value and place in the file of what was said of each quantity. moments: time and place of the rows of
-    a log that says everything at once, whether or not there was anything to say. columns: (N, 3), as in said.
+    samples: quantity -> (time, value, place in the file). columns: quantity -> the same as an array (N, 3).
+    moments: time and place of each row of a log whose rows hold all quantities, also of empty rows.
     """
 
     path: Path
@@ -27,23 +47,23 @@ class Log:
     bridge_s: float = 0.0
     jitter_s: float = 1.0
     notes: list[str] = field(default_factory=list)
-    said: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    samples: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
     moments: list[tuple[float, int]] = field(default_factory=list)
     columns: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def say(self, quantity: str, time_s: float, value: float, where: int) -> None:
-        """One value at a time; NaN says that it is unknown there. where: the line, or what `where` names.
+    def add(self, quantity: str, time_s: float, value: float, where: int) -> None:
+        """Add a value at a time, NaN where it is unknown. where: its place in the file.
 
-        quantity: a column of the record; of the place longitude_deg and latitude_deg, or east_m and north_m.
+        quantity: a column of the record; a place is longitude_deg and latitude_deg, or east_m and north_m.
         """
-        self.said.setdefault(quantity, []).append((time_s, value, where))
+        self.samples.setdefault(quantity, []).append((time_s, value, where))
 
-    def say_all(self, quantity: str, times: np.ndarray, values: np.ndarray, where: np.ndarray) -> None:
-        """Many at once."""
+    def add_all(self, quantity: str, times: np.ndarray, values: np.ndarray, where: np.ndarray) -> None:
+        """Add all samples of a quantity, each argument (N,)."""
         self.columns[quantity] = np.stack([times, values, where], axis=1).astype(float)
 
     def note(self, text: str) -> None:
-        """What the user should know, once."""
+        """Note what the user should know, once."""
         if text not in self.notes:
             self.notes.append(text)
 
@@ -51,3 +71,248 @@ class Log:
         """The error to raise, with the file and the place."""
         place = f", {self.where} {where}" if where is not None else ""
         return InputError(f"telemetry {self.path}{place}: {text}")
+
+
+def assemble(
+    log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float("nan"), from_first: bool = False
+) -> Telemetry:
+    """The record of a log: a row for each time of any sample, every column linear between its own samples.
+
+    start_utc_s: seconds since 1970 at the log's own time 0. from_first: whether times count from the first sample.
+    Raises InputError where neither altitude, place nor attitude is known, where a place is off the globe, and where
+    time runs back.
+    """
+    rows_of = {name: np.array(rows, float).reshape(-1, 3) for name, rows in log.samples.items()} | log.columns
+    samples = {name: _sort(log, rows) for name, rows in rows_of.items()}
+    moments = _sort(log, np.insert(np.array(log.moments, float).reshape(-1, 2), 1, 0.0, axis=1))
+    start = min((rows[0, 0] for rows in (*samples.values(), moments) if len(rows)), default=0.0) if from_first else 0.0
+    for rows in (*samples.values(), moments):
+        rows[:, 0] -= start
+    _drop_impossible(log, samples)
+    _check_globe(log, samples)
+    samples = {name: rows for name, rows in samples.items() if np.isfinite(rows[:, 1]).any()}
+    if not set(samples) - _NOT_ALONE:
+        raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
+    _note_missing(log, samples)
+    _note_silence(log, samples)
+    times = _with_gaps(log, np.unique(np.concatenate([moments[:, 0], *(rows[:, 0] for rows in samples.values())])))
+    columns = {name: _column(times, rows, log.bridge_s, _FULL.get(name)) for name, rows in samples.items()}
+    for name in _TURNING:
+        if name in columns:
+            around = np.pi if name == "roll_rad" else 0.0
+            columns[name] = (columns[name] + around) % (2 * np.pi) - around
+    unknown = np.full(len(times), np.nan)
+    geographic = "longitude_deg" in samples or "east_m" not in samples
+    pair = ("longitude_deg", "latitude_deg") if geographic else ("east_m", "north_m")
+    place = np.stack([columns.get(name, unknown) for name in pair], axis=1)
+    place[~np.isfinite(place).all(axis=1)] = np.nan
+    if "speed_m_s" not in columns and np.isfinite(place).all(axis=1).sum() > 2:
+        columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic)
+        if np.isfinite(columns["speed_m_s"]).any():
+            log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
+    return Telemetry(
+        times + clock_offset_s,
+        columns.get("altitude_m", unknown),
+        columns.get("speed_m_s", unknown),
+        place,
+        geographic,
+        **{name: columns.get(name, unknown) for name in (*_TURNING, "above_sea_m", "pitch_rad", "hfov_rad")},
+        start_utc_s=float(start_utc_s + start - clock_offset_s),
+        origin=f"{log.path.name} ({log.kind})",
+        notes=tuple(log.notes),
+    )
+
+
+def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
+    """The times, and one more within each gap, where nothing is known."""
+    if len(times) < 6:
+        return times
+    steps = np.diff(times)
+    most = max(_GAP_SHARE * float(np.median(steps)), _GAP_S, log.bridge_s)
+    gaps = np.flatnonzero(steps > most)
+    if len(gaps):
+        first = gaps[0]
+        log.note(
+            f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s without samples, the first after "
+            f"{times[first]:.1f} s for {steps[first]:.1f} s: nothing is known within"
+        )
+    return np.sort(np.concatenate([times, (times[gaps] + times[gaps + 1]) / 2]))
+
+
+def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | None) -> np.ndarray:
+    """One quantity at all times: linear between two samples that are near each other, else NaN.
+
+    A quantity that is sampled more rarely than others is interpolated; one with a long pause is unknown in it.
+    """
+    known, values = rows[:, 0], rows[:, 1]
+    if len(known) == len(times) and np.array_equal(known, times):
+        return values
+    steps = np.diff(known)
+    if len(steps) == 0:
+        return np.where(times == known[0], values[0], np.nan)
+    most = _longest_silence_s(known, bridge_s)
+    after = np.searchsorted(known, times).clip(1, len(known) - 1)
+    before = after - 1
+    share = (times - known[before]) / steps[before]
+    way = values[after] - values[before]
+    if full is not None:
+        way = (way + full / 2) % full - full / 2
+    found = values[before] + share * way
+    # Outside its span a column holds for bridge_s; on a sample it has the value of the sample.
+    found = np.where(share < 0, values[before], np.where(share > 1, values[after], found))
+    outside = np.maximum(known[0] - times, times - known[-1])
+    found[(outside > 0) & (outside > bridge_s)] = np.nan
+    found[(outside <= 0) & (steps[before] > most) & (share > 0) & (share < 1)] = np.nan
+    found = np.where(share == 0, values[before], np.where(share == 1, values[after], found))
+    if full == 360.0:
+        return (found + 180) % 360 - 180
+    return found
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Checks.
+
+
+def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
+    """Sorted by time; of samples at the same time the last. Single damaged times are left out."""
+    rows = rows[np.isfinite(rows[:, 0])]
+    rows = rows[~_stray(rows[:, 0], log.jitter_s)]
+    back = np.diff(rows[:, 0])
+    if len(back) and back.min() < -log.jitter_s:
+        i = int(np.argmax(back < -log.jitter_s))
+        raise log.refuse(
+            f"time runs back from {rows[i, 0]:.3f} to {rows[i + 1, 0]:.3f} s; are these two recordings in one file?",
+            int(rows[i + 1, 2]),
+        )
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return rows[np.append(np.diff(rows[:, 0]) > 0, True)] if len(rows) else rows
+
+
+def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
+    """Which times are out of order while their neighbours are in order: single damaged ones, not another recording."""
+    stray = np.zeros(len(times), bool)
+    if len(times) < 3 or not np.isfinite(jitter_s):
+        return stray
+    before, after = times[:-2], times[2:]
+    around = (before <= after) & ((times[1:-1] < before - jitter_s) | (times[1:-1] > after + jitter_s))
+    stray[1:-1] = around
+    stray[0] = times[0] > times[1] + jitter_s and times[1] <= times[2]
+    stray[-1] = times[-1] < times[-2] - jitter_s and times[-3] <= times[-2]
+    # A day without a sample, then one: its time is damaged.
+    stray[-1] |= times[-1] > times[-2] + 86_400
+    return stray
+
+
+def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Set impossible values to NaN."""
+    for name, rows in samples.items():
+        if (endless := np.isinf(rows[:, 1])).any():
+            where = int(rows[np.argmax(endless), 2])
+            log.note(f"{log.where} {where}: {name} is infinite, which cannot be; {endless.sum()} left out")
+            rows[endless, 1] = np.nan
+    for name, (least, most) in _POSSIBLE.items():
+        if name in samples:
+            rows = samples[name]
+            with np.errstate(invalid="ignore"):
+                wrong = ~((rows[:, 1] >= least) & (rows[:, 1] <= most)) & ~np.isnan(rows[:, 1])
+            if wrong.any():
+                _, value, where = rows[np.argmax(wrong)]
+                log.note(f"{log.where} {int(where)}: {name} is {value:g}, which cannot be; {wrong.sum()} left out")
+                rows[wrong, 1] = np.nan
+
+
+def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Raises InputError for degrees that are none; longitude and latitude 0 stand for no fix."""
+    for name, most in (("latitude_deg", 90.0), ("longitude_deg", 180.0)):
+        if name not in samples:
+            continue
+        wrong = np.abs(samples[name][:, 1]) > most
+        if wrong.any():
+            _, value, where = samples[name][np.argmax(wrong)]
+            hint = "; are longitude and latitude swapped?" if name == "latitude_deg" and abs(value) <= 180 else ""
+            raise log.refuse(f"{name} is {value:g}; wanted -{most:g} to {most:g}{hint}", int(where))
+    if {"longitude_deg", "latitude_deg"} <= set(samples):
+        longitude, latitude = samples["longitude_deg"], samples["latitude_deg"]
+        if len(longitude) == len(latitude):
+            nowhere = (longitude[:, 1] == 0) & (latitude[:, 1] == 0)
+            longitude[nowhere, 1] = latitude[nowhere, 1] = np.nan
+            if nowhere.any():
+                log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
+
+
+def _note_missing(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Note where there is no place or no altitude, or one below the ground."""
+    if not {"latitude_deg", "east_m"} & set(samples) and log.kind != OWN:
+        log.note("the log holds no place")
+    if "altitude_m" not in samples:
+        log.note("the log holds no altitude above ground")
+        return
+    deep = samples["altitude_m"][:, 1] < _DEEP_M
+    if deep.any():
+        _, value, where = samples["altitude_m"][np.argmax(deep)]
+        log.note(
+            f"{log.where} {int(where)}: the altitude above ground is {value:g} m, below the ground; "
+            f"{deep.sum()} of {len(deep)} are below {_DEEP_M:g} m; is its zero elsewhere?"
+        )
+
+
+def _longest_silence_s(known: np.ndarray, bridge_s: float) -> float:
+    """The longest pause between samples over which a quantity is interpolated."""
+    return max(1.5 * float(np.median(np.diff(known))), bridge_s) if len(known) > 1 else bridge_s
+
+
+def _note_silence(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Note long pauses between the samples of the place."""
+    for name in ("latitude_deg", "east_m"):
+        known = samples[name][np.isfinite(samples[name][:, 1]), 0] if name in samples else np.zeros(0)
+        steps = np.diff(known)
+        gaps = np.flatnonzero(steps > _longest_silence_s(samples[name][:, 0], log.bridge_s)) if len(steps) else steps
+        if len(gaps):
+            longest = gaps[np.argmax(steps[gaps])]
+            log.note(
+                f"the place is unknown for a while {len(gaps)} time{'s' * (len(gaps) > 1)}, the longest for "
+                f"{steps[longest]:.1f} s after {known[longest]:.1f} s"
+            )
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Speed over ground from places, where a log does not have it.
+
+
+def _speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) -> tuple[np.ndarray, float]:
+    """Speed as the slope of a line fitted to the places around each time, m/s, and the time span of the fit, s.
+
+    time_s: (N,) rising. place: (N, 2) degrees or metres, NaN where unknown: there the speed is NaN, and where
+    the places span too short a time.
+    """
+    known = np.isfinite(place).all(axis=1)
+    speed = np.full(len(time_s), np.nan)
+    times = time_s[known] - time_s[known][0]
+    metres = place[known] - place[known][0]
+    if geographic:
+        metres[:, 0] = (metres[:, 0] + 180) % 360 - 180
+        metres *= _DEGREE_M * np.array([np.cos(np.radians(place[known][0, 1])), 1.0])
+    wanted_s = min(_step_m(place[known], geographic) / _STEP_M_S, _MOST_S)
+    half_s = max(wanted_s, _LEAST_S, 2.0 * float(np.median(np.diff(times))))
+    low = np.searchsorted(times, times - half_s - 1e-6)
+    high = np.searchsorted(times, times + half_s + 1e-6)
+    count, span_s = high - low, times[high - 1] - times[low]
+    # Sums over each span are differences of running sums.
+    terms = np.column_stack([times, times**2, metres, metres * times[:, None]])
+    running = np.vstack([np.zeros((1, 6)), np.cumsum(terms, axis=0)])
+    total, squares, east, north, t_east, t_north = (running[high] - running[low]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = squares - total**2 / count
+        slope = np.stack([t_east - total * east / count, t_north - total * north / count]) / spread
+    speed[known] = np.where((count > 2) & (span_s >= 0.9 * wanted_s) & (spread > 1e-6), np.hypot(*slope), np.nan)
+    return speed, 2 * half_s
+
+
+def _step_m(place: np.ndarray, geographic: bool) -> float:
+    """The step of the last written digit of the places, m."""
+    metres, least = (_DEGREE_M, _WANDER_M) if geographic else (1.0, 0.0)
+    for digits in range(8):
+        shifted = place * 10.0**digits
+        if np.allclose(shifted, np.round(shifted), rtol=0, atol=1e-4):
+            return max(metres * 10.0**-digits, least)
+    return least

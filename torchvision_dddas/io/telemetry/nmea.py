@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry.log import Log
-from torchvision_dddas.io.telemetry.record import assembled
+from torchvision_dddas.io.telemetry.log import Log, assemble
 from torchvision_dddas.types import Telemetry
 
 _KNOT = 1852 / 3600
@@ -43,9 +42,9 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
             bad.append(number)
     if bad:
         log.note(f"line {bad[0]}: not a whole sentence or its checksum is wrong; {len(bad)} lines are left out")
-    if not log.said:
+    if not log.samples:
         raise log.refuse("no NMEA sentence tells a place or a heading together with a time")
-    return assembled(log, clock_offset_s, clock.utc_s)
+    return assemble(log, clock_offset_s, clock.utc_s)
 
 
 class _Clock:
@@ -80,14 +79,14 @@ def _say(log: Log, sentence: Any, time_s: float, line: int) -> None:
     if kind in ("GGA", "RMC", "GLL"):
         fixed = int(sentence.gps_qual or 0) > 0 if kind == "GGA" else sentence.status == "A"
         fixed = fixed and bool(sentence.lat) and bool(sentence.lon)
-        log.say("longitude_deg", time_s, sentence.longitude if fixed else math.nan, line)
-        log.say("latitude_deg", time_s, sentence.latitude if fixed else math.nan, line)
+        log.add("longitude_deg", time_s, sentence.longitude if fixed else math.nan, line)
+        log.add("latitude_deg", time_s, sentence.latitude if fixed else math.nan, line)
         if kind == "GGA":
             known = fixed and sentence.altitude is not None
-            log.say("above_sea_m", time_s, float(sentence.altitude) if known else math.nan, line)
+            log.add("above_sea_m", time_s, float(sentence.altitude) if known else math.nan, line)
         if kind == "RMC" and sentence.spd_over_grnd is not None:
-            log.say("speed_m_s", time_s, float(sentence.spd_over_grnd) * _KNOT if fixed else math.nan, line)
+            log.add("speed_m_s", time_s, float(sentence.spd_over_grnd) * _KNOT if fixed else math.nan, line)
     elif kind == "VTG" and sentence.spd_over_grnd_kmph is not None:
-        log.say("speed_m_s", time_s, float(sentence.spd_over_grnd_kmph) / 3.6, line)
+        log.add("speed_m_s", time_s, float(sentence.spd_over_grnd_kmph) / 3.6, line)
     elif kind in ("HDT", "THS") and sentence.heading:
-        log.say("vehicle_heading_rad", time_s, math.radians(float(sentence.heading)), line)
+        log.add("vehicle_heading_rad", time_s, math.radians(float(sentence.heading)), line)

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.io.telemetry.log import Log
-from torchvision_dddas.io.telemetry.names import dated, hfov_of_focal, quantity_of, understood
-from torchvision_dddas.io.telemetry.record import assembled
+from torchvision_dddas.io.telemetry.log import Log, assemble
+from torchvision_dddas.io.telemetry.quantities import dated, hfov_of_focal, quantity_of, understood
 from torchvision_dddas.types import Telemetry
 
 _TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
@@ -59,17 +58,17 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         said = _said(log, subtitle.text, tuples, swapped)
         log.moments.append((time_s, subtitle.line))
         for quantity, value in said.items():
-            log.say(quantity, time_s, value, subtitle.line)
+            log.add(quantity, time_s, value, subtitle.line)
         for name in said_so_far - set(said):
             lacking.setdefault(name, []).append(subtitle.line)
-            log.say(name, time_s, math.nan, subtitle.line)
+            log.add(name, time_s, math.nan, subtitle.line)
         said_so_far |= set(said)
     _note_lacking(log, lacking, subtitles)
     zoned = next((date for date in dates if date), (math.nan, False))
     if not zoned[1] and math.isfinite(zoned[0]):
         log.note("the dates are in an unknown zone of time, so the clock is not known")
     start = zoned[0] - log.moments[0][0] if zoned[1] and log.moments else math.nan
-    return assembled(log, clock_offset_s, start)
+    return assemble(log, clock_offset_s, start)
 
 
 def _subtitles(text: str) -> Iterator[Subtitle]:

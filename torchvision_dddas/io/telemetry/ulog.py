@@ -9,8 +9,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.attitude import angles, axes_of_quaternion, heading_at
-from torchvision_dddas.io.telemetry.log import Log
-from torchvision_dddas.io.telemetry.record import assembled
+from torchvision_dddas.io.telemetry.log import Log, assemble
 from torchvision_dddas.types import Telemetry
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -48,7 +47,7 @@ def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
         yaw = np.stack([_seconds(attitude), heading], axis=1)[np.isfinite(heading)]
         _say(log, "vehicle_heading_rad", yaw[:, 0], yaw[:, 1])
     _say_camera(log, topics, yaw)
-    return assembled(log, clock_offset_s, _clock(topics), from_first=True)
+    return assemble(log, clock_offset_s, _clock(topics), from_first=True)
 
 
 class _Onwards(io.BufferedReader):
@@ -130,7 +129,7 @@ def _valid(topic: Topic, name: str) -> np.ndarray:
 
 
 def _say(log: Log, quantity: str, times: np.ndarray, values: np.ndarray) -> None:
-    log.said.setdefault(quantity, []).extend(
+    log.samples.setdefault(quantity, []).extend(
         zip(times.tolist(), np.asarray(values, float).tolist(), range(1, len(times) + 1), strict=True)
     )
 
