@@ -285,7 +285,7 @@ def test_a_table_of_other_columns_in_utc_tells_the_clock(tmp_path: Path) -> None
 
 def test_a_table_that_counts_frames_needs_its_clip(tmp_path: Path) -> None:
     path = write(tmp_path, "frame,latitude,longitude,rel_alt\n1,48.1,11.5,50\n6,48.1,11.5,55\n")
-    with pytest.raises(InputError, match=r"counts frames.*give its clip"):
+    with pytest.raises(InputError, match=r"has frames.*give its clip"):
         read_telemetry(path)
     clip = tmp_path / "pictures"
     clip.mkdir()

@@ -154,7 +154,7 @@ def _said(log: Log, text: str, tuples: dict[str, list[tuple[float, str]]], swapp
         if (found := understood(key, float(number.replace(",", ".")), unit)) and found[0] not in said:
             said[found[0]] = found[1]
             if key.lower() in ("altitude", "alt"):
-                log.note("from where the altitude is counted is not told; it is taken as above the sea")
+                log.note("the file does not say where the altitude is zero; above the sea is assumed")
     if "focal_len" in plain:
         other = [float(plain[k].replace(",", ".")) if k in plain else math.nan for k in ("fnum", "dzoom_ratio")]
         if (hfov := hfov_of_focal(plain["focal_len"], *other)) is not None:

@@ -109,12 +109,14 @@ def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Pa
     names = [_plain(name) for name in text.header]
     timed = next((i for i, (name, _) in enumerate(names) if name in _TIMES), None)
     focal, fnum, zoom, frame = (_index(names, key) for key in ("focallen", "fnum", "dzoomratio", "frame"))
-    if timed is None and clip is None:
-        raise InputError(f"telemetry {log.path} counts frames and says no times; give its clip, or a column time_s")
-    rate_hz = _rate(clip) if timed is None and clip is not None else math.nan
-    telling = _telling(names)
-    if {names[i][0] for i in telling} & {"altitude", "alt"}:
-        log.note("from where the altitude is counted is not told; it is taken as above the sea")
+    rate_hz = math.nan
+    if timed is None:
+        if clip is None:
+            raise InputError(f"telemetry {log.path} has frames and no times; give its clip, or a column time_s")
+        rate_hz = open_source(clip).rate_hz
+    used = _best_columns(names)
+    if {names[i][0] for i in used} & {"altitude", "alt"}:
+        log.note("the file does not say where the altitude is zero; above the sea is assumed")
     first = begin = math.nan
     zoned = False
     for number, row in zip(text.line, text.rows, strict=True):
@@ -127,11 +129,11 @@ def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Pa
             begin = min(count, 1.0) if math.isnan(begin) else begin  # frames are counted from 0 or from 1
             moment = (count - begin) / rate_hz
         if not math.isfinite(moment):
-            text = cells[timed] if timed is not None else cells[frame or 0]
-            raise log.refuse(f"'{text}' is no time; wanted a date with a time, or seconds", number)
+            cell = cells[timed] if timed is not None else cells[frame or 0]
+            raise log.refuse(f"'{cell}' is no time; wanted a date with a time, or seconds", number)
         first = (moment if timed is not None else 0.0) if math.isnan(first) else first
         log.moments.append((moment - first, number))
-        for i in telling:
+        for i in used:
             value = _float(cells[i])
             if math.isfinite(value) and (said := understood(names[i][0], value, names[i][1])):
                 log.add(said[0], moment - first, said[1], number)
@@ -145,8 +147,8 @@ def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Pa
     return assemble(log, clock_offset_s, first if zoned else math.nan)
 
 
-def _telling(names: list[tuple[str, str]]) -> list[int]:
-    """Which columns tell something: for each quantity the one whose name tells it best."""
+def _best_columns(names: list[tuple[str, str]]) -> list[int]:
+    """For each quantity the column with the best of its names."""
     best: dict[str, tuple[int, int]] = {}
     for i, (name, _) in enumerate(names):
         if name in QUANTITY:
@@ -178,7 +180,3 @@ def _float(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def _rate(clip: Path) -> float:
-    return float(open_source(clip).rate_hz)
