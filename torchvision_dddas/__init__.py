@@ -19,6 +19,7 @@ _HOME = {
     "Detections": ("types", "Detections"),
     "Frame": ("types", "Frame"),
     "InputError": ("errors", "InputError"),
+    "MotionDetector": ("detection", "MotionDetector"),
     "Registration": ("types", "Registration"),
     "Scene": ("types", "Scene"),
     "Settings": ("config", "Settings"),

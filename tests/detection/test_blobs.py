@@ -1,11 +1,11 @@
-"""Labelling, gates, hulls."""
+"""Cleaning, labelling, gates, hulls and fragments."""
 
 import cv2
 import numpy as np
 import pytest
 
 from torchvision_dddas.config import MorphologyParameters
-from torchvision_dddas.detection.blobs import fill_hull, find_blobs, find_weak_blobs
+from torchvision_dddas.detection.blobs import find_blobs, find_weak_blobs, group_fragments
 
 SIZE = (101, 67)
 
@@ -19,10 +19,6 @@ def test_each_connected_region_is_a_blob_with_its_box_and_area(painted):
     assert [b.box for b in blobs] == [(3, 4, 10, 6), (50, 30, 7, 20)]
     assert [b.area_px for b in blobs] == [60, 140]
     np.testing.assert_array_equal(blobs[0].centre_px, [7.5, 6.5])
-
-
-def test_regions_that_touch_by_a_corner_are_one(painted):
-    assert len(found(painted(SIZE, (10, 10, 5, 5), (15, 15, 5, 5)))) == 1
 
 
 def test_a_blank_picture_has_no_blobs_and_a_full_one_has_one(painted):
@@ -53,23 +49,11 @@ def test_only_evidence_above_the_threshold_is_certain(painted):
     assert np.argwhere(blob.core).tolist() == [[2, 3], [2, 4]]
 
 
-def test_the_window_cuts_the_blob_out_of_the_picture(painted):
-    core = painted(SIZE, (20, 21, 6, 7))
-    (blob,) = found(core)
-    assert (core[blob.window] > 0).all() and core[blob.window].size == 42
-
-
 def test_a_hull_fills_the_notch_of_an_l_and_only_that(painted):
     core = painted(SIZE, (10, 10, 20, 5), (10, 10, 5, 20))
     (blob,) = found(core, hull=True)
     assert blob.mask[6, 6] and not blob.mask[18, 18]
     assert blob.mask[core[blob.window] > 0].all()
-
-
-def test_the_hull_of_a_convex_region_is_itself():
-    disc = cv2.circle(np.zeros((41, 41), np.uint8), (20, 20), 18, 1, -1) > 0
-    assert fill_hull(disc)[disc].all() and (fill_hull(disc) != disc).mean() < 0.03
-    assert not fill_hull(np.zeros((5, 7), bool)).any()
 
 
 def test_a_region_inside_another_ones_hull_is_swallowed(painted):
@@ -91,10 +75,6 @@ def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted
     assert not strong[0].weak
 
 
-def test_without_wide_evidence_there_are_no_find_weak_blobs(painted):
-    assert find_weak_blobs(painted(SIZE), [], 10, MorphologyParameters(), 1, 0) == []
-
-
 @pytest.mark.parametrize("hull", [False, True])
 def test_blobs_of_maps_at_half_the_size_are_those_of_the_maps_made_whole(hull):
     half = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (40, 60)).astype(np.uint8), (0, 0), 2)
@@ -106,3 +86,33 @@ def test_blobs_of_maps_at_half_the_size_are_those_of_the_maps_made_whole(hull):
         assert blob.box == other.box and blob.peak == other.peak
         np.testing.assert_array_equal(blob.mask, other.mask)
         np.testing.assert_array_equal(blob.core, other.core)
+
+
+TORSO, LEGS = (50, 20, 20, 40), (52, 64, 16, 30)
+
+
+def grouped(boxes, velocities):
+    return sorted(
+        sorted(g) for g in group_fragments(np.array(boxes, float).reshape(-1, 4), np.array(velocities, float))
+    )
+
+
+def test_fragments_near_each_other_that_move_alike_are_one():
+    assert grouped([TORSO, LEGS], [(3, 0), (3.3, 0.2)]) == [[0, 1]]
+
+
+@pytest.mark.parametrize("other", [(-3, 0), (0, 3), (4.5, 0), (np.nan, np.nan)])
+def test_neighbours_that_move_differently_or_unknown_stay_apart(other):
+    assert grouped([TORSO, LEGS], [(3, 0), other]) == [[0], [1]]
+
+
+@pytest.mark.parametrize("box", [(52, 75, 16, 30), (75, 20, 20, 40), (66, 64, 30, 30)])
+def test_movers_side_by_side_or_too_far_stay_apart(box):
+    assert grouped([TORSO, box], [(3, 0), (3, 0)]) == [[0], [1]]
+
+
+def test_a_chain_of_fragments_is_one_group_whatever_their_order():
+    boxes = [(10, 10, 20, 20), (11, 33, 20, 20), (12, 56, 20, 20), (200, 10, 20, 20)]
+    velocities = [(3, 0), (3, 0), (3, 0), (3, 0)]
+    assert grouped(boxes, velocities) == [[0, 1, 2], [3]]
+    assert grouped([boxes[i] for i in (2, 0, 3, 1)], velocities) == [[0, 1, 3], [2]]

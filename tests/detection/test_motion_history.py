@@ -1,14 +1,23 @@
-"""The motion history of one clip: its stamps, its gradient, and its agreement with the batched operations."""
+"""The motion history of a clip, and what the trails in it tell of blobs."""
 
 import math
 
 import numpy as np
 import pytest
 
-from torchvision_dddas.detection.motion_history import NEWEST, MotionHistory, motion_gradient, region_orientation
+from torchvision_dddas.config import HistoryParameters
+from torchvision_dddas.detection.blobs import find_blobs
+from torchvision_dddas.detection.motion_history import (
+    NEWEST,
+    MotionHistory,
+    flood_regions,
+    motion_gradient,
+    region_orientation,
+    split_by_trail,
+)
 
-SIZE = (67, 43)
-ALL = (0, 0, *SIZE)
+HISTORY_SIZE = (67, 43)
+ALL = (0, 0, *HISTORY_SIZE)
 
 
 def shift(u: float, v: float) -> np.ndarray:
@@ -19,23 +28,15 @@ def test_stamps_tell_how_many_frames_ago_a_place_moved_and_forget_after_the_dura
     history = MotionHistory(2.0)
     for number in range(1, 6):
         history.move(number, np.eye(3))
-        history.add(painted(SIZE, (10 * number, 5, 4, 4)))
+        history.add(painted(HISTORY_SIZE, (10 * number, 5, 4, 4)))
     stamps = history.stamps(ALL)
     assert [int(stamps[6, 10 * number + 1]) for number in range(1, 6)] == [0, 0, NEWEST - 2, NEWEST - 1, NEWEST]
-
-
-def test_the_newest_silhouette_wins_where_two_overlap(painted):
-    history = MotionHistory(6.0)
-    for number, x in ((1, 10), (2, 12)):
-        history.move(number, np.eye(3))
-        history.add(painted(SIZE, (x, 5, 6, 6)))
-    assert history.stamps((10, 7, 8, 1)).tolist() == [[NEWEST - 1] * 2 + [NEWEST] * 6]
 
 
 def test_a_frame_number_that_is_missing_ages_the_past_by_two(painted):
     history = MotionHistory(6.0)
     history.move(1, None)
-    history.add(painted(SIZE, (10, 5, 6, 6)))
+    history.add(painted(HISTORY_SIZE, (10, 5, 6, 6)))
     history.move(3, np.eye(3))
     assert history.stamps(ALL).max() == NEWEST - 2
 
@@ -43,7 +44,7 @@ def test_a_frame_number_that_is_missing_ages_the_past_by_two(painted):
 def test_a_cut_forgets_everything(painted):
     history = MotionHistory(6.0)
     history.move(1, None)
-    history.add(painted(SIZE, (10, 5, 6, 6)))
+    history.add(painted(HISTORY_SIZE, (10, 5, 6, 6)))
     history.move(2, None)
     assert not history.stamps(ALL).any()
 
@@ -52,19 +53,10 @@ def test_what_stands_on_the_ground_stays_there_under_a_camera_that_moves_by_frac
     """Warping the stamps on at every step would leave them where they were: 0.4 px rounds to 0."""
     history = MotionHistory(20.0)
     history.move(1, None)
-    history.add(painted(SIZE, (10, 5, 6, 6)))
+    history.add(painted(HISTORY_SIZE, (10, 5, 6, 6)))
     for number in range(2, 12):
         history.move(number, shift(0.4, 0.0))
     assert np.flatnonzero(history.stamps(ALL)[7]).tolist() == list(range(14, 20))
-
-
-def test_a_history_does_not_change_with_the_array_it_was_given(painted):
-    history = MotionHistory(6.0)
-    history.move(1, None)
-    silhouette = painted(SIZE, (10, 5, 6, 6))
-    history.add(silhouette)
-    silhouette[:] = 0
-    assert history.stamps(ALL).max() == NEWEST
 
 
 @pytest.mark.parametrize("box", [(0, 0, 20, 20), (33, 11, 34, 32), (5, 40, 3, 3)])
@@ -72,7 +64,7 @@ def test_stamps_in_a_box_are_those_of_the_whole_picture_cut_out(box, painted):
     history = MotionHistory(6.0)
     for number in range(1, 5):
         history.move(number, shift(1.3, -0.7))
-        history.add(painted(SIZE, (8 * number, 2 * number, 9, 30)))
+        history.add(painted(HISTORY_SIZE, (8 * number, 2 * number, 9, 30)))
     x, y, width, height = box
     np.testing.assert_array_equal(history.stamps(box), history.stamps(ALL)[y : y + height, x : x + width])
 
@@ -82,7 +74,7 @@ def test_the_orientation_of_a_trail_is_where_its_maker_went(velocity, painted):
     history = MotionHistory(6.0)
     for number in range(1, 6):
         history.move(number, np.eye(3))
-        history.add(painted(SIZE, (28 + velocity[0] * (number - 3), 16 + velocity[1] * (number - 3), 12, 12)))
+        history.add(painted(HISTORY_SIZE, (28 + velocity[0] * (number - 3), 16 + velocity[1] * (number - 3), 12, 12)))
     stamps = history.stamps(ALL)
     angle, valid = motion_gradient(stamps, 0.5, 4.0)
     direction, agreement = region_orientation(angle, valid, stamps, stamps > 0, 6.0)
@@ -91,20 +83,91 @@ def test_the_orientation_of_a_trail_is_where_its_maker_went(velocity, painted):
     assert agreement > 0.9
 
 
-def test_a_still_silhouette_has_no_direction(painted):
-    history = MotionHistory(6.0)
-    for number in range(1, 6):
-        history.move(number, np.eye(3))
-        history.add(painted(SIZE, (28, 16, 12, 12)))
-    stamps = history.stamps(ALL)
-    angle, valid = motion_gradient(stamps, 0.5, 4.0)
-    assert not valid.any()
-    direction, agreement = region_orientation(angle, valid, stamps, stamps > 0, 6.0)
-    assert math.isnan(direction) and agreement == 0
-
-
 def test_trails_that_point_opposite_ways_cancel():
     angle = np.array([[0.0, math.pi]], np.float32)
     stamps = np.full((1, 2), 254, np.uint8)
     every = np.ones((1, 2), bool)
     assert math.isnan(region_orientation(angle, every, stamps, every, 6.0)[0])
+
+
+SIZE = (161, 121)
+PARAMETERS = HistoryParameters()
+
+
+def film(painted, *movers, frames=6, step=None):
+    """The history of boxes (x, y, width, height, vx, vy), placed as in the last frame, and that frame's blobs."""
+    history = MotionHistory(PARAMETERS.duration_frames)
+    silhouette = painted(SIZE)
+    for number in range(1, frames + 1):
+        ago = frames - number
+        boxes = [(round(x - vx * ago), round(y - vy * ago), w, h) for x, y, w, h, vx, vy in movers]
+        silhouette = painted(SIZE, *boxes)
+        history.move(number, np.eye(3) if step is None else step)
+        history.add(silhouette)
+    return history, find_blobs(silhouette, silhouette, 20, 20, 0, hull=False)
+
+
+def test_flood_regions_join_stamps_within_the_threshold_and_part_those_beyond():
+    stamps = np.array([[250, 251, 252, 0, 254, 250, 249]], np.uint8)
+    everywhere = stamps > 0
+    assert [r[0].nonzero()[0].tolist() for r in flood_regions(stamps, everywhere, 1)] == [[0, 1, 2], [4], [5, 6]]
+    assert [r[0].nonzero()[0].tolist() for r in flood_regions(stamps, everywhere, 4)] == [[0, 1, 2], [4, 5, 6]]
+    assert len(flood_regions(stamps, everywhere, 0)) == 6
+
+
+@pytest.mark.parametrize("velocity", [(4, 0), (-2, 0), (0, 3), (0, -1)])
+def test_a_box_that_moves_has_its_heading_and_speed_and_stays_whole(velocity, painted):
+    history, (blob,) = film(painted, (70, 50, 24, 16, *velocity))
+    (part,) = split_by_trail(blob, history, SIZE, PARAMETERS)
+    assert part[0] is blob
+    np.testing.assert_allclose(part[1], velocity, atol=0.15)
+
+
+def test_a_box_that_moves_aslant_is_within_20_degrees_and_a_fifth_of_its_speed(painted):
+    history, (blob,) = film(painted, (70, 50, 20, 20, 3, 2))
+    (part,) = split_by_trail(blob, history, SIZE, PARAMETERS)
+    heading = np.degrees(np.arctan2(*part[1][::-1]))
+    assert heading == pytest.approx(np.degrees(np.arctan2(2, 3)), abs=20)
+    assert np.hypot(*part[1]) == pytest.approx(np.hypot(3, 2), rel=0.2)
+
+
+def test_the_velocity_is_the_movers_own_and_not_the_cameras(painted):
+    """The camera pans by 5 px a frame after a box that goes 3 px a frame over the ground."""
+    history, (blob,) = film(painted, (70, 50, 24, 16, -2, 0), step=np.array([[1, 0, -5], [0, 1, 0], [0, 0, 1.0]]))
+    (part,) = split_by_trail(blob, history, SIZE, PARAMETERS)
+    np.testing.assert_allclose(part[1], (3, 0), atol=0.15)
+
+
+def test_two_that_pass_each_other_and_touch_come_apart_along_their_seam(painted):
+    history, (blob,) = film(painted, (60, 40, 30, 14, 3, 0), (64, 54, 30, 14, -3, 0))
+    parts = sorted(split_by_trail(blob, history, SIZE, PARAMETERS), key=lambda part: part[0].box[1])
+    assert len(parts) == 2
+    np.testing.assert_allclose(parts[0][0].box, (60, 40, 30, 14), atol=2)
+    np.testing.assert_allclose(parts[1][0].box, (64, 54, 30, 14), atol=2)
+    assert parts[0][1][0] > 2 and parts[1][1][0] < -2
+    assert sum(part[0].area_px for part in parts) == blob.area_px
+
+
+def test_two_that_touch_and_go_the_same_way_stay_one(painted):
+    history, (blob,) = film(painted, (50, 40, 20, 14, 3, 0), (70, 44, 20, 14, 3, 0))
+    assert len(split_by_trail(blob, history, SIZE, PARAMETERS)) == 1
+
+
+def test_flicker_at_the_edges_parts_nothing(painted):
+    rng = np.random.default_rng(1)
+    history = MotionHistory(PARAMETERS.duration_frames)
+    silhouette = painted(SIZE)
+    for number in range(1, 9):
+        left, top, right, bottom = rng.integers(0, 4, 4)
+        silhouette = painted(SIZE, (50 - left, 40 - top, 30 + left + right, 24 + top + bottom))
+        history.move(number, np.eye(3))
+        history.add(silhouette)
+    (blob,) = find_blobs(silhouette, silhouette, 20, 20, 0, hull=False)
+    assert len(split_by_trail(blob, history, SIZE, PARAMETERS)) == 1
+
+
+@pytest.mark.parametrize("box", [(0, 0, 161, 121), (0, 0, 5, 5), (156, 116, 5, 5)])
+def test_without_a_past_a_blob_is_whole_and_its_velocity_unknown(box, painted):
+    history, (blob,) = film(painted, (*box, 0, 0), frames=1)
+    (part,) = split_by_trail(blob, history, SIZE, PARAMETERS)
+    assert part[0] is blob and np.isnan(part[1]).all()

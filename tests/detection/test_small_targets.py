@@ -46,21 +46,10 @@ def test_travel_of_less_than_a_quarter_of_its_own_length_is_not_enough():
     assert confirmed(follow(lambda k: (50 + 0.25 * k, 60), size=(40, 6))) == []
 
 
-def test_too_few_sightings_confirm_nothing():
-    assert confirmed(follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits - 1)) == []
-    assert len(confirmed(follow(lambda k: (50 + 3 * k, 60), frames=KNOBS.hits))) == 1
-
-
 def test_a_few_misses_are_bridged_and_more_end_the_track():
     assert len(follow(lambda k: (50 + 0.8 * k, 60), seen=lambda k: k % 3 != 1).tracks) == 1
     gone = follow(lambda k: (50 + 0.8 * k, 60), frames=25, seen=lambda k: k < 20)
     assert gone.tracks == []
-
-
-def test_a_cut_ends_all_tracks():
-    tracks = follow(lambda k: (50 + 0.8 * k, 60))
-    tracks.step(30, None, [(74, 60, 10, 6)])
-    assert confirmed(tracks) == [] and len(tracks.tracks) == 1
 
 
 def test_two_that_pass_near_each_other_keep_their_tracks():

@@ -30,12 +30,6 @@ def test_three_frames_that_hang_together_are_enough_for_a_window(name, first, la
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-@pytest.mark.parametrize(("first", "last"), [(20, 20), (20, 21), (19, 20)])
-def test_fewer_than_three_are_not(name, first, last):
-    assert windows.choose_pairs(20, 3, first, last, SHIPPED[name]) == ([], None, None)
-
-
-@pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.parametrize("interval", [1, 2, 3, 4, 6, 12])
 def test_reach_covers_all_that_a_window_looks_at(name, interval):
     """What comes after the reach must not matter, or a stream would give other results than a file."""
