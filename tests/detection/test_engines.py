@@ -152,8 +152,6 @@ def test_blank_frames_are_flagged_by_both_and_break_neither(engines, shape) -> N
 
 pytest.importorskip("torch")
 
-import torch
-
 
 @pytest.fixture(scope="module")
 def torch_images() -> list[np.ndarray]:
