@@ -92,7 +92,9 @@ def turned(moment: Moment) -> Moment:
     people = bodies.place_m[bodies.kind == "person", :2].mean(axis=0)
     away = people - bodies.place_m[bodies.kind == "ugv", :2]
     heading = np.arctan2(away[:, 0], away[:, 1])
-    return replace(moment, heading_rad=heading, said_heading_rad=heading, said_lonlat_deg=np.zeros((len(away), 2)))
+    return replace(
+        moment, heading_rad=heading, reported_heading_rad=heading, reported_lonlat_deg=np.zeros((len(away), 2))
+    )
 
 
 def measured(one: Callable[[], object]) -> tuple[float, float]:

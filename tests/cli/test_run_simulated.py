@@ -124,9 +124,15 @@ def test_truth_that_is_not_asked_for_goes_with_the_earlier_run(made, dddas, tmp_
             ["sim:joining", "--scene", "uav.altitud_m=3"],
             "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m",
         ),
-        (["sim:joining", "--scene", "team.ugvs=3"], "team.ugvs = 3 will not do: a clip located by landmarks needs 4"),
+        (
+            ["sim:joining", "--scene", "team.ugvs=3"],
+            "team.ugvs must be 4 or more in a clip located by landmarks",
+        ),
         (["sim:joining", "--scene", "clip.located_by='nothing'"], "scenario joining is located by nothing"),
-        (["sim:joining", "--scene", "world.origin_deg=[0, 95]"], "world.origin_deg = [0, 95] will not do"),
+        (
+            ["sim:joining", "--scene", "world.origin_deg=[0, 95]"],
+            "world.origin_deg must be a longitude from -180",
+        ),
         (["sim:joining", "--scene", "camera.exposure_s=0.4"], "camera.exposure_s = 0.4 is longer than from picture"),
         (["sim:joining", "--set", "steering.oops=1"], "unknown parameter 'steering.oops'"),
         (["sim:joining", "--interval", "2"], "--interval is of no use with sim:joining"),

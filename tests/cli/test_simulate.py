@@ -201,9 +201,9 @@ def test_without_a_name_it_lists_the_scenarios(dddas):
         (["joining", "--set", "uav.altitud_m=3"], "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
         (
             ["joining", "--set", "team.ugvs=3"],
-            "scenario joining: team.ugvs = 3 will not do: a clip located by landmarks",
+            "scenario joining: team.ugvs must be 4 or more in a clip located by landmarks",
         ),
-        (["joining", "--seed", "-1"], "seed = -1 will not do"),
+        (["joining", "--seed", "-1"], "seed must be a whole number from 0 to 2147483647, got -1"),
         (["joining", "--frames", "0"], "--frames is 0; wanted 1 or more"),
         (["joining", "--save", "film"], "--save must name some of frames, video, masks, ground"),
     ],

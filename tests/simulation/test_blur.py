@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.shutter import motion_blur, streak_kernel
+from torchvision_dddas.simulation.shutter import motion_blur
 
 
 def dot() -> np.ndarray:
@@ -36,17 +36,3 @@ def test_where_ways_differ_each_part_is_drawn_out_by_its_own():
     assert np.abs(after - before).max() < 0.6
     assert (now - own)[0] == pytest.approx(100 / 12, rel=0.15)
     assert (now - own)[1] < 0.1
-
-
-def test_a_way_shorter_than_the_lens_shows_changes_nothing():
-    assert motion_blur(dot(), np.full((3, 3, 2), 0.3, np.float32)) is not None
-    assert np.array_equal(motion_blur(dot(), np.full((3, 3, 2), 0.3, np.float32)), dot())
-
-
-@pytest.mark.parametrize("way", [(0.0, 0.0), (3.3, -8.1), (1.0, 0.0)])
-def test_a_streak_keeps_the_light_and_its_middle(way):
-    kernel = streak_kernel(np.array(way))
-    v, u = np.mgrid[: len(kernel), : len(kernel)] - len(kernel) // 2
-    assert kernel.sum() == pytest.approx(1)
-    assert abs((kernel * u).sum()) < 1e-5
-    assert abs((kernel * v).sum()) < 1e-5

@@ -29,26 +29,6 @@ def plain():
     return simulator, tuple(shots(simulator))
 
 
-def test_a_run_has_the_frames_that_its_length_asks_for():
-    simulator, run = plain()
-    assert [shot.frame.number for shot in run] == list(range(1, simulator.frames + 1)) == list(range(1, 21))
-    assert run[-1].frame.time_s == pytest.approx(1.9)
-    assert all(shot.frame.image.shape == (120, 160, 3) for shot in run)
-    assert all(shot.truth.mask.shape == shot.truth.people.shape == (120, 160) for shot in run)
-
-
-def test_a_run_started_anew_is_the_same_run():
-    simulator, run = plain()
-    again = shots(simulator)
-    for first, second in zip(run, again, strict=True):
-        np.testing.assert_array_equal(first.frame.image, second.frame.image)
-        np.testing.assert_array_equal(first.truth.mask, second.truth.mask)
-        np.testing.assert_array_equal(first.truth.bodies.place_m, second.truth.bodies.place_m)
-        assert [r.lonlat_deg.tolist() for m in first.said for r in m.reports] == [
-            r.lonlat_deg.tolist() for m in second.said for r in m.reports
-        ]
-
-
 def test_another_seed_is_another_run():
     other = Simulator(small(seed=4))
     shot = other.next()
@@ -68,18 +48,10 @@ def test_frames_that_are_left_out_change_nothing_in_those_that_are_not():
         np.testing.assert_allclose(shot.truth.bodies.place_m, same.truth.bodies.place_m)
 
 
-def test_what_is_said_in_frames_that_are_left_out_is_heard():
-    simulator, run = plain()
-    sparse = shots(simulator, {1: Command(every=4)})
-    heard = [(r.vehicle, r.frame) for shot in sparse for m in shot.said for r in m.reports]
-    assert heard == [(r.vehicle, r.frame) for shot in run[:17] for m in shot.said for r in m.reports]
-    assert [m.number for shot in sparse for m in shot.said] == list(range(1, 18))
-
-
 def test_an_order_moves_the_vehicle_that_it_names():
     simulator, run = plain()
     first = run[0].moment
-    goal = first.said_lonlat_deg[0] + (0.0, 5e-4)
+    goal = first.reported_lonlat_deg[0] + (0.0, 5e-4)
     far = shots(simulator, {1: Command(orders=(Order("ugv1", goal, 3.0),))})[-1].truth.bodies
     own = np.flatnonzero(far.kind == "ugv")[0]
     before = run[0].truth.bodies.place_m[own]
@@ -108,23 +80,6 @@ def test_dropped_frames_are_missing_and_their_truth_is_not():
     assert missing == [6, 7, 8, 9]
     assert [shot.truth.frame for shot in run] == list(range(1, 21))
     assert run[9].frame.skipped == 0
-
-
-def test_faults_are_told_as_events():
-    run = shots(Simulator(small(fault=({"what": "gps_jump", "time_s": 0.5, "seconds": 0.5, "size": 5.0},))))
-    assert any("ugv1" in event for shot in run for event in shot.truth.events)
-
-
-def test_a_ground_vehicle_sees_the_frame_taken_last():
-    simulator, _ = plain()
-    simulator.restart()
-    assert simulator.picture("ugv1") is None
-    simulator.next()
-    simulator.next()
-    seen = simulator.picture("ugv2")
-    assert (seen.vehicle, seen.frame, seen.image.shape) == ("ugv2", 2, (120, 160, 3))
-    assert seen.camera.geographic
-    np.testing.assert_allclose(seen.camera.place, (-110.95, 31.6), atol=1e-3)
 
 
 def test_looking_from_the_ground_changes_nothing_in_the_air():

@@ -10,7 +10,7 @@ from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry, open_video
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation import SimulatorSource
-from torchvision_dddas.simulation.source import KEPT, Rows
+from torchvision_dddas.simulation.source import KEPT
 from torchvision_dddas.types import Command, Order
 
 
@@ -62,15 +62,6 @@ def test_every_kth_frame_is_the_same_as_among_all(source):
             np.testing.assert_array_equal(frame.image, some[frame.number])
 
 
-def test_what_is_known_grows_with_the_frames(source):
-    counts = []
-    for frame in source:
-        counts.append((len(source.telemetry()), int((~source.landmarks().planned).sum())))
-        if frame.number == 4:
-            break
-    assert counts == [(1, 4), (2, 8), (3, 12), (4, 16)]
-
-
 def test_reports_are_true_to_the_world_where_receivers_are_exact(source):
     frames = read(source, 4)
     bodies = source.truths()[-1].bodies
@@ -101,16 +92,6 @@ def test_of_two_plans_for_one_frame_the_newer_counts(source):
     assert (np.diff(landmarks.frame) >= 0).all()
 
 
-def test_a_table_that_grows_keeps_every_row_and_replaces_by_key():
-    table = Rows(2)
-    for k in range(1000):
-        table.add((k, 0.0), k % 900)
-    assert len(table.rows) == 900
-    assert table.rows[99].tolist() == [999, 0]
-    table.add((1.0, 2.0))
-    assert table.rows[-1].tolist() == [1, 2]
-
-
 def test_a_command_leaves_frames_out_and_says_so(source):
     seen = []
     for frame in source:
@@ -134,14 +115,6 @@ def test_a_command_leaves_frames_out_and_says_so(source):
         (19, 0),
         (20, 0),
     ]
-
-
-def test_frames_left_out_before_a_dropped_one_are_not_missing(source):
-    seen = []
-    for frame in source:
-        seen.append((frame.number, frame.skipped))
-        source.steer(Command(every=2))
-    assert seen[:4] == [(1, 0), (3, 1), (5, 1), (9, 2)]  # 7 was dropped: of 6, 7, 8 two were left out
 
 
 def test_an_order_for_a_picture_gives_one_and_no_more(source):

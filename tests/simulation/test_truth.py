@@ -9,7 +9,6 @@ import pytest
 from torchvision_dddas.evaluation.metrics import truth as read
 from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.simulation import TruthOutput
-from torchvision_dddas.simulation.truth import FEWEST_PX, gather_targets, label_boxes
 from torchvision_dddas.types import Bodies, CameraPose, Truth
 
 
@@ -84,28 +83,11 @@ def test_what_stands_is_in_no_mask_and_its_box_does_not_count(tmp_path):
     assert set(np.unique(read.read_mask(folder / "masks" / "000001.png"))) == {0, 2}
 
 
-def test_a_crowd_of_which_one_moves_moves(tmp_path):
-    folder = written(tmp_path, truth(speeds=(0.0, 1.0, 5.0, 0.5)))
-    assert {(r[1], r[6]) for r in rows(folder / "gt.txt")} == {(1, 1), (2, 1)}
-    np.testing.assert_array_equal(read.read_mask(folder / "masks" / "000001.png"), truth().mask)
-
-
-def test_a_sliver_at_the_border_does_not_count(tmp_path):
-    item = truth()
-    item.mask[item.mask == 2] = 0
-    item.mask[0, : FEWEST_PX - 1] = 2
-    assert {(r[1], r[6]) for r in rows(written(tmp_path, item) / "gt.txt")} == {(1, 1), (2, 0)}
-
-
 def test_masks_of_many_targets_keep_their_numbers(tmp_path):
     item = truth()
     item.mask[item.mask == 1] = 700
     folder = written(tmp_path, item)
     assert set(np.unique(read.read_mask(folder / "masks" / "000001.png"))) == {0, 2, 3, 700}
-
-
-def test_masks_are_left_out_where_nobody_wants_them(tmp_path):
-    assert not (written(tmp_path, truth(), masks=False) / "masks").exists()
 
 
 def test_a_crowds_place_is_the_middle_of_its_people(tmp_path):
@@ -137,25 +119,6 @@ def test_a_run_that_fails_leaves_no_tables(tmp_path):
     sink.write(truth())
     sink.discard()
     assert [p.name for p in (tmp_path / "truth").iterdir()] == ["masks"]
-
-
-def test_a_world_without_anything_that_moves_has_empty_tables(tmp_path):
-    none = bodies()
-    nobody = Bodies(*(getattr(none, name)[:0] for name in none.__dataclass_fields__))
-    item = Truth(1, 0.0, np.zeros((4, 6), np.uint16), np.zeros((4, 6), np.uint16), nobody, truth().pose)
-    folder = written(tmp_path, item)
-    assert (folder / "gt.txt").read_text() == ""
-    assert len((folder / "positions.csv").read_text().splitlines()) == 1
-    assert len(gather_targets(nobody).target) == 0
-
-
-def test_boxes_hold_every_pixel_of_a_number():
-    labels = np.random.default_rng(0).integers(0, 5, (30, 40)) * (np.random.default_rng(1).random((30, 40)) > 0.9)
-    found = label_boxes(labels)
-    for number, (x, y, w, h, px) in found.items():
-        v, u = np.nonzero(labels == number)
-        assert (x, y, x + w - 1, y + h - 1, px) == (u.min(), v.min(), u.max(), v.max(), len(u))
-    assert set(found) == set(np.unique(labels)) - {0}
 
 
 @pytest.mark.parametrize("after", [0, 2])

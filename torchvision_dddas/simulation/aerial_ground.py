@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.agents import Moment
+from torchvision_dddas.simulation.drawing import halved_levels
 from torchvision_dddas.simulation.shutter import Shutter, meet_ground
 from torchvision_dddas.simulation.world import World
 
@@ -70,12 +71,7 @@ class StandingSurface:
     def __init__(self, world: World) -> None:
         self._side_m, self._to_sun = world.side_m, world.to_sun
         self._texel_m = world.surface_texel_m
-        self._levels = [np.ascontiguousarray(world.surface, np.float32)]
-        while len(self._levels) < _HEIGHT_LEVELS and min(self._levels[-1].shape) >= 4:
-            size = (self._levels[-1].shape[1] + 1) // 2, (self._levels[-1].shape[0] + 1) // 2
-            self._levels.append(
-                np.asarray(cv2.resize(self._levels[-1], size, interpolation=cv2.INTER_AREA), np.float32)
-            )
+        self._levels = halved_levels(np.ascontiguousarray(world.surface, np.float32), _HEIGHT_LEVELS)
         cells = max(int(np.ceil(world.side_m / _CELL_M)), 1)
         # A reach of one cell from wherever in its own cell a place lies, and a texel for what is interpolated.
         wide = 2 * int(np.ceil(1.5 * _CELL_M / world.surface_texel_m + 1)) + 1
@@ -266,11 +262,7 @@ class Terrain:
     def __init__(self, world: World, shutter: Shutter) -> None:
         self._world, self._shutter = world, shutter
         self._standing = StandingSurface(world)
-        self._levels = [world.albedo]
-        while len(self._levels) < _LEVELS and min(self._levels[-1].shape[:2]) >= 4:
-            above = self._levels[-1]
-            size = (above.shape[1] + 1) // 2, (above.shape[0] + 1) // 2
-            self._levels.append(cv2.resize(above, size, interpolation=cv2.INTER_AREA))
+        self._levels = halved_levels(world.albedo, _LEVELS)
         rough = np.random.default_rng(_GRAIN_PX).standard_normal((_GRAIN_PX, _GRAIN_PX), np.float32)
         rough = np.tile(rough, (3, 3))
         rough = (cv2.GaussianBlur(rough, (0, 0), 0.7) - cv2.GaussianBlur(rough, (0, 0), 3))[_GRAIN_PX : 2 * _GRAIN_PX]

@@ -1,17 +1,17 @@
 """One moment of a simulated world: where everything is, and what the vehicles say of it."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.simulation.crowds import Crowds
 from torchvision_dddas.simulation.ground_vehicles import CAR_HALF_M, UGV_HALF_M, Cars, Team, marker_plates
-from torchvision_dddas.simulation.movement import Obstacles, Things
+from torchvision_dddas.simulation.movement import Obstacles
 from torchvision_dddas.simulation.scenario import Scenario
 from torchvision_dddas.simulation.sensor_errors import ActiveFaults, Faults, Receivers
 from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, rotation_matrix
+from torchvision_dddas.simulation.world import World
 from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
 
 
@@ -35,11 +35,11 @@ class Report:
 class Moment:
     """The world at a frame of the aerial camera.
 
-    pose: of the camera in the middle of the exposure of the picture's middle row, true; velocity_m_s, turn_rad_s: (3,)
-    its rates about east, north, up. flight: what the UAV reports of itself, longitude and latitude; None while silent.
-    reports: of the ground vehicles since the frame before. The ground vehicles' own cameras: heading_rad (K,) whither
-    they truly look; said_lonlat_deg (K, 2), NaN where silent, and said_heading_rad (K,) what they say of it. Their
-    places are those of the bodies of kind ugv, in the same order. picture: "", frozen or dropped. events: in words.
+    pose: of the camera in the middle of the exposure of the picture's middle row, true. velocity_m_s, turn_rad_s: (3,)
+    its rates about east, north, up. flight: what the UAV reports of itself, in longitude and latitude; None while it is
+    silent. reports: of the ground vehicles since the frame before. heading_rad (K,): where their own cameras truly
+    point. reported_lonlat_deg (K, 2), NaN where silent, and reported_heading_rad (K,): what they report. Their places
+    are those of the bodies of kind ugv, in the same order. picture: "", frozen or dropped. events: in words.
     """
 
     number: int
@@ -51,8 +51,8 @@ class Moment:
     flight: Flight | None
     reports: tuple[Report, ...]
     heading_rad: np.ndarray
-    said_lonlat_deg: np.ndarray
-    said_heading_rad: np.ndarray
+    reported_lonlat_deg: np.ndarray
+    reported_heading_rad: np.ndarray
     picture: str = ""
     events: tuple[str, ...] = ()
 
@@ -62,20 +62,9 @@ class Moment:
 
 _TICK_S = 0.1
 _PLANNED_S = 5
-_STRAYS_M = 0.1
-"""How well a vehicle keeps to what it plans, a second ahead; standard deviation along each axis."""
+_STRAYS_M = 0.1  # how well a vehicle keeps to what it plans, a second ahead; standard deviation along each axis
 _UGV_BGR = (70.0, 74.0, 72.0)
 _GUST_S = 1.5
-
-
-class Ground(Protocol):
-    """What the agents need to know of a world: its size, heights (N,) of places (N, 2), and what stands there."""
-
-    @property
-    def side_m(self) -> float: ...  # noqa: D102
-    @property
-    def things(self) -> Things: ...  # noqa: D102
-    def up_m(self, east_north: np.ndarray, /) -> np.ndarray: ...  # noqa: D102
 
 
 class Agents:
@@ -85,7 +74,7 @@ class Agents:
     does not depend on that.
     """
 
-    def __init__(self, scenario: Scenario, world: Ground) -> None:
+    def __init__(self, scenario: Scenario, world: World) -> None:
         self._scenario, self._world, seed = scenario, world, scenario.seed
         obstacles = Obstacles(world.things, world.side_m)
         many, cars, ugvs = len(scenario.crowd), len(scenario.car), scenario.team.ugvs

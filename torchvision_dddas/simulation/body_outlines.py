@@ -6,7 +6,7 @@ import numpy as np
 
 from torchvision_dddas.simulation.aerial_ground import equal_runs
 from torchvision_dddas.simulation.agents import Moment
-from torchvision_dddas.simulation.people_shapes import Dress, choose_dress, pose_figures
+from torchvision_dddas.simulation.people_shapes import Wardrobe, limb_capsules
 from torchvision_dddas.simulation.relief import SHADE_BGR
 from torchvision_dddas.simulation.shutter import Shutter
 from torchvision_dddas.simulation.vehicle_shapes import COVERED_BGR, car_faces, place_faces, ugv_faces
@@ -40,8 +40,7 @@ class Shapes:
     """Gives bodies their shape: limbs or faces, as lit by the sun."""
 
     def __init__(self, world: World, shutter: Shutter, seed: int) -> None:
-        self._world, self._shutter, self._seed = world, shutter, seed
-        self._dress: dict[int, Dress] = {}
+        self._world, self._shutter, self._wardrobe = world, shutter, Wardrobe(seed)
 
     def outlines(
         self, moment: Moment, rows: np.ndarray, scale_px_m: float, shaded: np.ndarray
@@ -79,17 +78,20 @@ class Shapes:
         points = 5 if scale_px_m < 30 else 7
         if scale_px_m < _PLAIN_PX_M:
             people_seen = Outlines(
-                limb_body, _capsules(ends_px[0], radius_px[0], points), limb_colour * (0.45 * dark + 0.55 * bright), up
+                limb_body,
+                limb_capsules(ends_px[0], radius_px[0], points),
+                limb_colour * (0.45 * dark + 0.55 * bright),
+                up,
             )
         else:
-            whole = _capsules(ends_px[0], radius_px[0], points)
-            part = _capsules(ends_px[0] + radius_px[0, ..., None] * sun[:2] * 0.35, radius_px[0] * 0.72, points)
+            whole = limb_capsules(ends_px[0], radius_px[0], points)
+            part = limb_capsules(ends_px[0] + radius_px[0, ..., None] * sun[:2] * 0.35, radius_px[0] * 0.72, points)
             both = np.stack([whole, part], axis=1).reshape(2 * len(whole), *whole.shape[1:])
             tones = np.stack([limb_colour * dark, limb_colour * bright], axis=1).reshape(-1, 3)
             people_seen = Outlines(limb_body.repeat(2), both, tones, up.repeat(2))
         thick = radius.max(axis=1) > (_THIN_M if scale_px_m >= _PLAIN_PX_M else _THICK_M)
         people_shade = Outlines(
-            limb_body[thick], _capsules(ends_px[1][thick], radius_px[1][thick], points),
+            limb_body[thick], limb_capsules(ends_px[1][thick], radius_px[1][thick], points),
             np.zeros((thick.sum(), 3)), np.zeros(thick.sum()),
         )  # fmt: skip
         middle_up = corners[..., 2].mean(axis=1) - bodies.place_m[face_body, 2]
@@ -103,17 +105,9 @@ class Shapes:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The limbs of people, far ones first: body (M,), ends (M, 2, 3), radii (M, 2), colour (M, 3)."""
         bodies = moment.bodies
-        for row in rows:
-            number = int(bodies.number[row])
-            if number not in self._dress:
-                self._dress[number] = choose_dress(bodies.colour[row], self._seed, number)
         if not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 3))
-        shape = pose_figures(
-            bodies.place_m[rows], bodies.facing_rad[rows], bodies.height_m[rows],
-            np.linalg.norm(bodies.velocity_m_s[rows], axis=1), bodies.phase[rows],
-            [self._dress[int(n)] for n in bodies.number[rows]],
-        )  # fmt: skip
+        shape = self._wardrobe.figures_of(bodies, rows)
         # What is not worn has no size.
         thin = _THIN_M if scale_px_m < _PLAIN_PX_M else 0.0
         person, limb = np.nonzero(np.isfinite(shape.radius_m).all(axis=2) & (shape.radius_m.max(axis=2) > thin))
@@ -177,16 +171,3 @@ def _filled(outlines: np.ndarray, corners: int) -> np.ndarray:
     """Outlines (M, C, n) with the last corner repeated until they have so many."""
     missing = corners - outlines.shape[1]
     return outlines if missing == 0 else np.concatenate([outlines, outlines[:, -1:].repeat(missing, axis=1)], axis=1)
-
-
-def _capsules(ends_px: np.ndarray, radius_px: np.ndarray, points: int) -> np.ndarray:
-    """(N, 2 * points, 2) outlines of thick lines (N, 2, 2) with round ends of these radii (N, 2)."""
-    way = ends_px[:, 1] - ends_px[:, 0]
-    length = np.linalg.norm(way, axis=1, keepdims=True)
-    ahead = np.where(length > 1e-9, way / np.maximum(length, 1e-9), (1.0, 0.0))
-    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-    turn = np.linspace(0, np.pi, points)[:, None]
-    # Half a circle about each end, turned away from the other.
-    half = np.cos(turn) * aside[:, None] - np.sin(turn) * ahead[:, None]
-    circles = radius_px[:, :, None, None] * np.stack([half, -half], axis=1)
-    return (ends_px[:, :, None] + circles).reshape(len(ends_px), 2 * points, 2)

@@ -11,25 +11,20 @@ import numpy as np
 from torchvision_dddas.simulation.movement import Obstacles, near_pairs
 from torchvision_dddas.simulation.scenario import CrowdPlan, Happening
 
+# The source's time unit, which it does not give in seconds: with two, 1.11 to 3.34 m a unit is a walker's speed.
 UNIT_S = 2.0
-"""The source's time unit, which it does not give in seconds: with two, 1.11 to 3.34 m a unit is a walker's speed."""
-SLOWEST_M, FASTEST_M = 1.11, 3.34
-"""Metres a unit, along east and along north each, of a crowd that goes at random."""
-BODY_M = 0.5
-"""Middles of two people are no nearer."""
-_ROUNDS = 8
-"""So often places are moved apart in a step, at most."""
+SLOWEST_M, FASTEST_M = 1.11, 3.34  # metres a unit, along east and along north each, of a crowd that goes at random
+BODY_M = 0.5  # middles of two people are no nearer
+_ROUNDS = 8  # so often places are moved apart in a step, at most
 _MARGIN_M = 10.0
 _PERSONAL_M = 0.8
-_WARY_M, _TOUCH_M = 2.0, 0.3
-"""People turn away from vehicles that are so near, and are never nearer than the second."""
-_LOOSE_S = 2.5
-"""Time in which somebody comes back to the own place in the crowd."""
+_WARY_M, _TOUCH_M = 2.0, 0.3  # people turn away from vehicles that are so near, and are never nearer than the second
+_LOOSE_S = 2.5  # time in which somebody comes back to the own place in the crowd
+# How fast one strays, walking and standing, along each axis, and for how long the same way.
 _STRAY_M_S, _STRAY_S = (0.2, 0.03), 3.0
-"""How fast one strays, walking and standing, along each axis, and for how long the same way."""
 _PATIENCE_S = 120.0
+# Speeds of those who run off, and the time in which they fall into a walk.
 _RUN_M_S, _TIRED_S, _WALK_M_S = (2.5, 4.0), 20.0, 1.4
-"""Speeds of those who run off, and the time in which they fall into a walk."""
 _STAND, _HEADING, _WAY, _RANDOM, _MEET = range(5)
 _SHIRTS = np.array(
     [

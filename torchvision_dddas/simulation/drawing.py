@@ -7,11 +7,9 @@ import numpy as np
 
 from torchvision_dddas.types import Camera, CameraPose
 
-SUBPIXEL_BITS = 4
-"""OpenCV draws with corners in sixteenths of a pixel."""
+SUBPIXEL_BITS = 4  # OpenCV draws with corners in sixteenths of a pixel
 
-NEAR_M = 0.4
-"""What is nearer to a camera on the ground, in depth, is not drawn."""
+NEAR_M = 0.4  # what is nearer to a camera on the ground, in depth, is not drawn
 
 
 @dataclass(frozen=True)
@@ -84,3 +82,12 @@ def fill_outline(points_m: np.ndarray, colour: np.ndarray, value: int, view: Vie
     if (high > 0).all() and low[0] < width and low[1] < height:
         # OpenCV counts pixels in 16 bits where it counts them in sixteenths.
         canvas.fill(np.clip(px, -3e4, 3e4), colour, value)
+
+
+def halved_levels(texture: np.ndarray, most: int) -> list[np.ndarray]:
+    """A texture (H, W, ...) and its reductions, each half as large as the one before, `most` at most."""
+    levels = [texture]
+    while len(levels) < most and min(levels[-1].shape[:2]) >= 4:
+        size = (levels[-1].shape[1] + 1) // 2, (levels[-1].shape[0] + 1) // 2
+        levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA)))
+    return levels

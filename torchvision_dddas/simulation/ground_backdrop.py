@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.aerial_ground import equal_runs
-from torchvision_dddas.simulation.drawing import View
+from torchvision_dddas.simulation.drawing import View, halved_levels
 from torchvision_dddas.simulation.world import World
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
@@ -46,11 +46,7 @@ class Backdrop:
 
     def __init__(self, world: World, seed: int) -> None:
         self._world = world
-        self._levels = [world.albedo]
-        while len(self._levels) < _LEVELS and min(self._levels[-1].shape[:2]) >= 4:
-            above = self._levels[-1]
-            size = (above.shape[1] + 1) // 2, (above.shape[0] + 1) // 2
-            self._levels.append(cv2.resize(above, size, interpolation=cv2.INTER_AREA))
+        self._levels = halved_levels(world.albedo, _LEVELS)
         rng = np.random.default_rng([seed, 60])
         self._pebbles = _pebbles(rng)
         self._maps: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}

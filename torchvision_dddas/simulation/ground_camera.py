@@ -15,14 +15,7 @@ from torchvision_dddas.simulation.ground_objects import (
     draw_plants,
     draw_vehicle,
 )
-from torchvision_dddas.simulation.people_shapes import (
-    Dress,
-    Figures,
-    choose_dress,
-    draw_figure,
-    limb_shadows,
-    pose_figures,
-)
+from torchvision_dddas.simulation.people_shapes import Figures, Wardrobe, draw_figure, limb_shadows
 from torchvision_dddas.simulation.scenario import CameraParameters, Scenario
 from torchvision_dddas.simulation.sensor import Sensor
 from torchvision_dddas.simulation.sensor_errors import SIGMAS_95
@@ -30,11 +23,9 @@ from torchvision_dddas.simulation.vehicle_shapes import car_faces, place_faces, 
 from torchvision_dddas.simulation.world import World
 from torchvision_dddas.types import Bodies, Camera, CameraPose, GroundPicture
 
-SHAKE_RAD = float(np.radians(0.3))
-"""Standard deviation of the camera's pitch and roll about level."""
+SHAKE_RAD = float(np.radians(0.3))  # standard deviation of the camera's pitch and roll about level
 
-HEADING_SIGMA_RAD = float(np.radians(2.0))
-"""How well a vehicle knows whither its camera looks."""
+HEADING_SIGMA_RAD = float(np.radians(2.0))  # how well a vehicle knows whither its camera looks
 
 _LEAST_SIGMA_M = 0.02
 _SENSOR = CameraParameters(sharpness_px=0.7, shot_noise=0.12, read_noise=1.2, drift=0.03, quality=90)
@@ -76,7 +67,7 @@ class GroundCamera:
         self._backdrop = Backdrop(world, scenario.seed)
         self._plants = draw_plants(scenario.seed)
         self._foot_m = world.up_m(world.things.east_north_m) if len(world.things) else np.zeros(0)
-        self._dress: dict[int, Dress] = {}
+        self._wardrobe = Wardrobe(scenario.seed)
         self._sensors: dict[int, Sensor] = {}
 
     def take(self, moment: Moment, vehicle: int) -> GroundPicture | None:
@@ -84,7 +75,7 @@ class GroundCamera:
 
         None where the vehicle is silent: nobody would know from where the picture was taken.
         """
-        said = moment.said_lonlat_deg[vehicle]
+        said = moment.reported_lonlat_deg[vehicle]
         if not np.isfinite(said).all():
             return None
         name = f"ugv{vehicle + 1}"
@@ -95,7 +86,7 @@ class GroundCamera:
             self.centre_px,
             (float(said[0]), float(said[1])),
             geographic=True,
-            heading_rad=float(np.mod(moment.said_heading_rad[vehicle], 2 * np.pi)),
+            heading_rad=float(np.mod(moment.reported_heading_rad[vehicle], 2 * np.pi)),
             height_m=self._scenario.team.camera_m,
             heading_sigma_rad=HEADING_SIGMA_RAD,
             position_sigma_m=max(self._scenario.gps.error95_m / SIGMAS_95, _LEAST_SIGMA_M),
@@ -150,7 +141,7 @@ class GroundCamera:
         moves[np.flatnonzero(bodies.kind == "ugv")[vehicle]] = False
         moving = np.flatnonzero(moves)
         people = moving[bodies.kind[moving] == "person"]
-        limbs = self._limbs(bodies, people)
+        limbs = self._wardrobe.figures_of(bodies, people)
         row_of = {int(k): row for row, k in enumerate(people)}
         shadows = self._shadows(bodies, moving, limbs, row_of, view, away)
 
@@ -232,20 +223,6 @@ class GroundCamera:
             ground = inverse_m[np.clip(row, 0, height - 1), u]
             nearer.append((row >= 0) & (row < height) & (ground > 1 / distance_m + self._slack))
         return nearer[0], nearer[0] & nearer[1]
-
-    def _limbs(self, bodies: Bodies, rows: np.ndarray) -> Figures:
-        for k in rows:
-            number = int(bodies.number[k])
-            if number not in self._dress:
-                self._dress[number] = choose_dress(bodies.colour[k], self._scenario.seed, number)
-        return pose_figures(
-            bodies.place_m[rows],
-            bodies.facing_rad[rows],
-            bodies.height_m[rows],
-            np.hypot(*bodies.velocity_m_s[rows].T),
-            bodies.phase[rows],
-            [self._dress[int(n)] for n in bodies.number[rows]],
-        )
 
     def _draw_thing(self, k: int, box_px: np.ndarray, view: View, canvas: Canvas, haze: float) -> None:
         things, sun = self._world.things, self._world.to_sun

@@ -12,21 +12,16 @@ from torchvision_dddas.simulation.vehicle_shapes import UGV_LENGTH_M, UGV_WIDTH_
 from torchvision_dddas.types import Colours
 
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
-UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)
-"""Half the length and half the width."""
-_APART_M, _ROOM_M = 2.1, 3.0
-"""How near another's middle they can be, and how far from it they mean to pass."""
-_KEPT_OFF_M = 6.0
-"""How far from people they mean to pass while nobody tells them where to go."""
-_LOOK_S = 0.25
-"""Steps in which they think ahead."""
+UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)  # half the length and half the width
+_APART_M, _ROOM_M = 2.1, 3.0  # how near another's middle they can be, and how far from it they mean to pass
+_KEPT_OFF_M = 6.0  # how far from people they mean to pass while nobody tells them where to go
+_LOOK_S = 0.25  # steps in which they think ahead
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
-_STOP_M = UGV_HALF_M[0] + 1.0
-"""They stop so far from those before them, middle to middle."""
+_STOP_M = UGV_HALF_M[0] + 1.0  # they stop so far from those before them, middle to middle
+# Gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring.
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
-"""gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring."""
+# In OpenCV's units; those furthest from sand and scrub come first.
 _HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
-"""In OpenCV's units; those furthest from sand and scrub come first."""
 
 
 def marker_plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
@@ -223,15 +218,12 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 # Vehicles that are no landmarks: they drive their way, turn as wide as they must, and brake for who is ahead.
 
 
-CAR_HALF_M = (2.2, 0.9)
-"""Half the length and half the width."""
-RADIUS_M = 6.0
-"""The narrowest that they turn."""
+CAR_HALF_M = (2.2, 0.9)  # half the length and half the width
+RADIUS_M = 6.0  # the narrowest that they turn
 _ACCELERATION_M_S2, _BRAKE_M_S2 = 1.5, 4.0
-_ASIDE_M_S2 = 2.5
-"""They slow down in turns so that no more pushes aside."""
+_ASIDE_M_S2 = 2.5  # they slow down in turns so that no more pushes aside
+# They pass those whom they see at a distance of _WIDE_M, and brake for those less than _NARROW_M aside.
 _SEEN_M, _WIDE_M, _NARROW_M, _LONG_M, _CREEP_M_S = 25.0, 2.6, 1.5, 2.8, 0.6
-"""They pass those whom they see at a distance of _WIDE_M, and brake for those less than _NARROW_M aside."""
 # No paint and no shirt is as bright as a plate: a team chooses colours that nothing around it has.
 _PAINTS = np.array([[230, 230, 228], [40, 38, 36], [150, 150, 148], [95, 90, 88], [105, 88, 76], [78, 76, 108]], float)
 

@@ -1,26 +1,13 @@
 """What stands in the way: how those who move go round it."""
 
-from typing import Protocol
-
 import numpy as np
+
+from torchvision_dddas.simulation.cover import StandingObjects
 
 _CELL_M = 4.0
 _REACH_M = 8.0
-_NEAREST = 6
-"""So many things, those whose edges are nearest, are looked at from a cell."""
-_TOUCHING = 3
-"""And so many of them by who may be inside."""
-
-
-class Things(Protocol):
-    """What stands in a world, one row a thing. kind: str; east_north_m: (K, 2); radius_m: (K,)."""
-
-    @property
-    def kind(self) -> np.ndarray | tuple[str, ...]: ...  # noqa: D102
-    @property
-    def east_north_m(self) -> np.ndarray: ...  # noqa: D102
-    @property
-    def radius_m(self) -> np.ndarray: ...  # noqa: D102
+_NEAREST = 6  # so many things, those whose edges are nearest, are looked at from a cell
+_TOUCHING = 3  # and so many of them by who may be inside
 
 
 class Obstacles:
@@ -29,7 +16,7 @@ class Obstacles:
     Bushes are gone round where there is room, and trodden down where there is none.
     """
 
-    def __init__(self, things: Things, side_m: float) -> None:
+    def __init__(self, things: StandingObjects, side_m: float) -> None:
         self.place = np.asarray(things.east_north_m, float).reshape(-1, 2)
         self.radius = np.asarray(things.radius_m, float).reshape(-1)
         self.hard = np.array([str(kind) != "bush" for kind in things.kind], bool)

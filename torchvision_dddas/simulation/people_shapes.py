@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.drawing import SUBPIXEL_BITS, Canvas, View
+from torchvision_dddas.types import Bodies
 
 _TROUSERS = ((92, 66, 48), (40, 38, 36), (70, 70, 72), (84, 112, 132), (56, 74, 96), (120, 124, 128), (62, 48, 40))
 _SKIN = ((142, 172, 214), (104, 140, 188), (78, 108, 156), (52, 74, 112))
 _HAIR = ((22, 24, 28), (34, 48, 66), (60, 82, 110), (110, 112, 116))
 _SHOES = np.array([34.0, 36, 42])
-_ROUND = np.stack([np.cos(np.linspace(0, np.pi, 8)), np.sin(np.linspace(0, np.pi, 8))], axis=1)
 _UP = np.array([0.0, 0.0, 1.0])
 _LEAST_WRINKLED_PX = 30
 
@@ -63,6 +63,26 @@ def choose_dress(colour: np.ndarray, seed: int, number: int) -> Dress:
         float(np.abs(rng.normal(0, 0.07))),
         *(bool(chance[k] < share) for k, share in enumerate((0.6, 0.1, 0.12, 0.4, 0.4, 0.35, 0.25))),
     )
+
+
+class Wardrobe:
+    """What the people of a world wear, chosen when somebody is first seen."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._dress: dict[int, Dress] = {}
+
+    def figures_of(self, bodies: Bodies, rows: np.ndarray) -> Figures:
+        """The limbs of the people in rows of bodies."""
+        for row in rows:
+            number = int(bodies.number[row])
+            if number not in self._dress:
+                self._dress[number] = choose_dress(bodies.colour[row], self._seed, number)
+        return pose_figures(
+            bodies.place_m[rows], bodies.facing_rad[rows], bodies.height_m[rows],
+            np.linalg.norm(bodies.velocity_m_s[rows], axis=1), bodies.phase[rows],
+            [self._dress[int(number)] for number in bodies.number[rows]],
+        )  # fmt: skip
 
 
 def pose_figures(
@@ -154,16 +174,17 @@ def limb_outlines(
     depth = seen[..., 2]
     size = radius_m * np.linalg.norm(view.image_from_world[0, :3]) / depth
     px = seen[..., :2] / depth[..., None] + size[..., None] * aside
-    return _hulls(px, widen * size)
+    return limb_capsules(px, widen * size)
 
 
-def _hulls(px: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Outlines (L, 16, 2) of limbs with ends (L, 2, 2) and radii (L, 2), px: half a circle about each end."""
+def limb_capsules(px: np.ndarray, size: np.ndarray, points: int = 8) -> np.ndarray:
+    """Outlines (L, 2 * points, 2) of limbs with ends (L, 2, 2) and radii (L, 2), px: half a circle about each end."""
     way = px[:, 1] - px[:, 0]
     length = np.hypot(way[:, 0], way[:, 1])[:, None]
     ahead = np.where(length > 1e-9, way / np.maximum(length, 1e-9), (1.0, 0.0))
     aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-    half = _ROUND[:, :1] * aside[:, None] - _ROUND[:, 1:] * ahead[:, None]
+    turn = np.linspace(0, np.pi, points)[:, None]
+    half = np.cos(turn) * aside[:, None] - np.sin(turn) * ahead[:, None]
     circles = px[:, :, None] + size[:, :, None, None] * np.stack([half, -half], axis=1)
     return circles.reshape(len(px), -1, 2)
 
@@ -238,7 +259,7 @@ def limb_shadows(ends_m: np.ndarray, radius_m: np.ndarray, up_m: float, to_sun: 
     worn = np.isfinite(radius_m).all(axis=1)
     reach = -to_sun[:2] / max(float(to_sun[2]), 0.15)
     flat = ends_m[worn][..., :2] + (ends_m[worn][..., 2:] - up_m) * reach
-    outline = _hulls(flat, radius_m[worn])
+    outline = limb_capsules(flat, radius_m[worn])
     return np.concatenate([outline, np.full((*outline.shape[:2], 1), up_m)], axis=2)
 
 

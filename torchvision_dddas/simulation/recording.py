@@ -22,11 +22,9 @@ from torchvision_dddas.simulation.source import open_simulator
 from torchvision_dddas.simulation.truth import LonLat, TruthOutput, moving_mask
 from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
 
-RECORDED = ("frames", "video", "masks", "ground")
-"""What --save may name. The tables are always written."""
+RECORDED = ("frames", "video", "masks", "ground")  # what --save may name. The tables are always written
 
-PLAIN = ("frames", "masks", "ground")
-"""What is saved where --save is not given."""
+PLAIN = ("frames", "masks", "ground")  # what is saved where --save is not given
 
 TELEMETRY = (
     *("time_s", "altitude_m", "speed_m_s", "longitude_deg", "latitude_deg", "above_sea_m"),

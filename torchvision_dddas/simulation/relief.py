@@ -122,8 +122,7 @@ def _about_origin(up_m: np.ndarray, side_m: float, step_m: float, base_m: float)
 # How the sun lies on the world: slopes towards it and away from it, and the shadows of all that stands.
 
 
-SHADE_BGR = np.array([0.46, 0.39, 0.35], np.float32)
-"""What is left of a colour where only the blue sky lights it."""
+SHADE_BGR = np.array([0.46, 0.39, 0.35], np.float32)  # what is left of a colour where only the blue sky lights it
 
 
 def sun_direction(azimuth_deg: float, height_deg: float) -> np.ndarray:

@@ -123,20 +123,16 @@ def _tuples(value: Any) -> Any:
 # What of a scenario cannot be, whatever the world looks like: told in one line before anything is made.
 
 
-FEWEST = 4
-"""Landmarks that lay a picture on the ground."""
+FEWEST = 4  # landmarks that lay a picture on the ground
 
 
-HIGHEST_DEG = 85.0
-"""Near the poles longitudes run together."""
+HIGHEST_DEG = 85.0  # near the poles longitudes run together
 
 
-MARGIN_M = 2.0
-"""What moves begins and goes so far inside the world."""
+MARGIN_M = 2.0  # what moves begins and goes so far inside the world
 
 
-OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")
-"""Faults of one ground vehicle."""
+OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")  # faults of one ground vehicle
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -146,8 +142,8 @@ def check_scenario(scenario: Scenario) -> None:
     _check_times(scenario)
     if scenario.clip.located_by == "landmarks" and scenario.team.ugvs < FEWEST:
         raise InputError(
-            f"team.ugvs = {scenario.team.ugvs} will not do: a clip located by landmarks needs {FEWEST}; add vehicles, "
-            'or set clip.located_by = "telemetry"'
+            f"team.ugvs must be {FEWEST} or more in a clip located by landmarks, got {scenario.team.ugvs}; "
+            'add vehicles, or set clip.located_by = "telemetry"'
         )
     if scenario.camera.exposure_s * scenario.clip.rate_hz > 1:
         raise InputError(
@@ -170,8 +166,8 @@ def _check_origin(scenario: Scenario) -> None:
     longitude, latitude = scenario.world.origin_deg
     if abs(longitude) > 180 or abs(latitude) > HIGHEST_DEG:
         raise InputError(
-            f"world.origin_deg = [{longitude:g}, {latitude:g}] will not do; wanted a longitude of -180 to 180 and a "
-            f"latitude of -{HIGHEST_DEG:g} to {HIGHEST_DEG:g} degrees"
+            f"world.origin_deg must be a longitude from -180 to 180 and a latitude from -{HIGHEST_DEG:g} to "
+            f"{HIGHEST_DEG:g} degrees, got [{longitude:g}, {latitude:g}]"
         )
 
 
@@ -206,7 +202,7 @@ def _check_times(scenario: Scenario) -> None:
                 there = f"there {'is' if crowds == 1 else 'are'} {crowds or 'none'}"
                 raise InputError(f"{name}.crowds names crowd {which}, of which {there}")
         if happening.what == "join" and len(set(happening.crowds)) < 2:
-            raise InputError(f"{name}.crowds = {list(happening.crowds)} will not do; to join takes two or more")
+            raise InputError(f"{name}.crowds must name two or more crowds to join, got {list(happening.crowds)}")
         if len(set(happening.crowds)) < len(happening.crowds):
             raise InputError(f"{name}.crowds = {list(happening.crowds)} names a crowd twice")
         if happening.what == "split":
@@ -252,14 +248,14 @@ def explain_error(loc: tuple[int | str, ...], kind: str, said: str, value: objec
         name = f"settings.{loc[1]}"
     if field is None or _group(field) is not None or name.startswith("settings"):
         wanted = "a list of tables" if listed or name in ("crowd", "car", "happening", "fault") else "a table"
-        return f"{name} = {_shown(value)} will not do; wanted {wanted}"
+        return f"{name} must be {wanted}, got {_shown(value)}"
     if name == "seed":
-        return f"seed = {value!r} will not do; wanted a whole number, 0 to {2**31 - 1}"
+        return f"seed must be a whole number from 0 to {2**31 - 1}, got {value!r}"
     annotation: Any = field.annotation
     if annotation == Place:
-        return f"{name} = {_shown(value)} will not do; wanted two numbers, [east, north]"
+        return f"{name} must be two numbers, [east, north], got {_shown(value)}"
     if annotation == tuple[Place, ...]:
-        return f"{name} = {_shown(value)} will not do; wanted a list of places, [[east, north], ...]"
+        return f"{name} must be a list of places, [[east, north], ...], got {_shown(value)}"
     return will_not_do(name, _shown(value) if isinstance(value, (tuple, dict)) else value, field)
 
 
@@ -277,7 +273,7 @@ def nearest_parameter(name: str) -> str:
 def example(kind: str) -> str:
     """A parameter of an entry of a list."""
     group = _group(Scenario.model_fields[kind]) if kind in Scenario.model_fields else None
-    return next(iter(group.model_fields)) if group else "knob"
+    return next(iter(group.model_fields)) if group else "value"
 
 
 def _shown(value: object) -> str:
@@ -291,10 +287,7 @@ def _group(field: FieldInfo) -> type[Group] | None:
     return kind if isinstance(kind, type) and issubclass(kind, Group) else None
 
 
-# A scenario as a file that is read as the same one.
-
-
 def scenario_toml(scenario: Scenario) -> str:
-    """The whole scenario as a file that `load` reads."""
+    """The whole scenario as a file that `load_scenario` reads."""
     content = scenario.model_dump(mode="json")
     return format_toml({key: value for key, value in content.items() if value not in ([], {})})

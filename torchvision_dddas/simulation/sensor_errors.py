@@ -6,8 +6,7 @@ import numpy as np
 
 from torchvision_dddas.simulation.scenario import Fault
 
-SIGMAS_95 = 2.4477
-"""Radius that holds 95 % of a circular normal distribution, in standard deviations along each axis."""
+SIGMAS_95 = 2.4477  # radius that holds 95 % of a circular normal distribution, in standard deviations along each axis
 
 
 class Receivers:
@@ -120,8 +119,7 @@ class Faults:
         return [words for _, words in sorted(said)]
 
 
-_EARLY_S = 1e-9
-"""Times of frames are rounded; a fault begins at the frame of its time, not one later."""
+_EARLY_S = 1e-9  # times of frames are rounded; a fault begins at the frame of its time, not one later
 
 
 def _on(fault: Fault, time_s: float) -> bool:

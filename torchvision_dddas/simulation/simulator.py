@@ -103,13 +103,12 @@ class Simulator:
     def picture(self, vehicle: str) -> GroundPicture | None:
         """What a ground vehicle sees at the frame taken last; None while nothing is heard of it."""
         moment, row = self._now, self.names.index(vehicle)
-        if moment is None or not np.isfinite(moment.said_lonlat_deg[row]).all():
+        if moment is None or not np.isfinite(moment.reported_lonlat_deg[row]).all():
             return None
         return self._ground.take(moment, row)
 
 
-CLEAR_M = 4.0
-"""Nothing stands nearer to where something that moves begins."""
+CLEAR_M = 4.0  # nothing stands nearer to where something that moves begins
 
 
 def start_places_m(scenario: Scenario) -> np.ndarray:
@@ -127,8 +126,7 @@ def start_places_m(scenario: Scenario) -> np.ndarray:
 # Whether a UAV can fly its way through a world, and see what it means to see.
 
 
-FLIGHT_CLEAR_M = 1.0
-"""Nothing that stands below it comes nearer: gusts push it about by less."""
+FLIGHT_CLEAR_M = 1.0  # nothing that stands below it comes nearer: gusts push it about by less
 
 _STEP_M = 1.0
 _PARTS = 64

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-COARSE = 8
-"""Pixels of the texture to a cell of the broad patterns."""
+COARSE = 8  # pixels of the texture to a cell of the broad patterns
 
 _TILE = 512  # columns that are coloured at once
 

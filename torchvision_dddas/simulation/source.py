@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,6 @@ from torchvision_dddas.types import (
     Colours,
     Command,
     Elevation,
-    Flight,
     Frame,
     GroundPicture,
     Landmarks,
@@ -30,8 +30,7 @@ from torchvision_dddas.types import (
     is_sampled,
 )
 
-KEPT = 100
-"""Pictures and truths that nobody asked for yet: a megabyte each."""
+KEPT = 100  # pictures and truths that nobody asked for yet: a megabyte each
 
 
 class SimulatorSource:
@@ -164,7 +163,7 @@ class SimulatorSource:
             row = (r.frame, r.vehicle, *np.asarray(r.lonlat_deg).tolist(), r.sigma_m, r.planned)
             self._reports.add(row, (r.vehicle, round(r.frame, 6), r.planned))
         if moment.flight is not None:
-            self._flown.add((moment.time_s, *_row(moment.flight)))
+            self._flown.add(np.hstack([moment.time_s, *astuple(moment.flight)]).tolist())
 
 
 class Rows:
@@ -216,17 +215,3 @@ def name_scenario_in_errors(spec: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"scenario {spec}: {error}") from None
-
-
-def _row(flight: Flight) -> tuple[float, ...]:
-    return (
-        flight.altitude_m,
-        flight.speed_m_s,
-        *flight.place,
-        flight.above_sea_m,
-        flight.heading_rad,
-        flight.pitch_rad,
-        flight.roll_rad,
-        flight.hfov_rad,
-        flight.vehicle_heading_rad,
-    )

@@ -22,11 +22,9 @@ COLUMNS = (
     *("east_m_s", "north_m_s", "visible_px"),
 )
 
-STANDS_M_S = 0.1
-"""What is slower stands: nothing shows that it could move."""
+STANDS_M_S = 0.1  # what is slower stands: nothing shows that it could move
 
-FEWEST_PX = 6
-"""A target of which less shows counts for nothing."""
+FEWEST_PX = 6  # A target of which less shows counts for nothing
 
 LonLat = Callable[[np.ndarray], np.ndarray]
 

@@ -10,14 +10,12 @@ from torchvision_dddas.simulation.sensor_errors import Receivers
 from torchvision_dddas.types import CameraPose
 
 ACCELERATION_M_S2 = 3.0
+# How fast the gimbal moves the middle of the picture, and turns the picture. With the flight below 60 deg/s.
 _AIM_RAD_S, _TURN_RAD_S = np.radians(35.0), np.radians(15.0)
-"""How fast the gimbal moves the middle of the picture, and turns the picture. With the flight below 60 deg/s."""
+# Where the camera looks further from below it than this share of its height, the picture's upper edge turns away.
 _SLANTED = 0.35
-"""Where the camera looks further from below it than this share of its height, the picture's upper edge turns away."""
-_GUST_S, _SHAKE_S = 1.5, 0.5
-"""Time constants of the place and of the angles."""
-_HELD = 0.3
-"""Share of a gust's speed with which a vehicle moves that holds its place."""
+_GUST_S, _SHAKE_S = 1.5, 0.5  # time constants of the place and of the angles
+_HELD = 0.3  # share of a gust's speed with which a vehicle moves that holds its place
 
 
 class Swaying:

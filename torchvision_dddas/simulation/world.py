@@ -21,8 +21,7 @@ from torchvision_dddas.simulation.scenario import WorldParameters
 from torchvision_dddas.simulation.soil import COARSE, draw_patterns, enlarge_rows, soil_rows
 from torchvision_dddas.types import Elevation, Ortho
 
-MOST_TEXELS = 12_000
-"""Pixels along a side of the largest texture."""
+MOST_TEXELS = 12_000  # pixels along a side of the largest texture
 
 _AT_ONCE = 1 << 20  # pixels of the texture that are made at once, in whole rows
 _ROWS_OF_SURFACE = 6000
