@@ -14,7 +14,7 @@ def draw(found: Figures, folder: Path) -> None:
     try:
         import matplotlib as mpl
     except ModuleNotFoundError:
-        print("no plots: they need matplotlib, the extra `report`", file=sys.stderr)
+        print("no plots: they need matplotlib, the extra `dev`", file=sys.stderr)
         return
     mpl.use("Agg")
     for study, draw_one in (("weight", _weight), ("threshold", _threshold), ("dispersion", _dispersion)):

@@ -10,7 +10,7 @@ dispersion  the dispersions and the chosen weight over time (Fig. 4b and 5)
 cuts        AR_2 by the dispersions, with clusters that end earlier or later
 readings    AR_K in every reading of the gate, of the dummy and of the histograms
 
-Prints Markdown: mean / standard deviation over the windows, in percent. `--out` gets the plots (extra `report`) and
+Prints Markdown: mean / standard deviation over the windows, in percent. `--out` gets the plots (extra `dev`) and
 figures.json. Gated windows of three frames take up to a second each: `--every 10` takes one in ten of them.
 """
 

@@ -12,7 +12,7 @@ def draw(rows: list[Row], path: Path) -> None:
     try:
         import matplotlib as mpl
     except ModuleNotFoundError:
-        raise SystemExit("no plot: it needs matplotlib, the extra `report`") from None
+        raise SystemExit("no plot: it needs matplotlib, the extra `dev`") from None
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 

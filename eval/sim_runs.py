@@ -143,7 +143,7 @@ def pyplot() -> Any:
     try:
         import matplotlib as mpl
     except ModuleNotFoundError:
-        raise SystemExit("no plot: it needs matplotlib, the extra `report`") from None
+        raise SystemExit("no plot: it needs matplotlib, the extra `dev`") from None
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 

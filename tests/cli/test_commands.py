@@ -119,7 +119,8 @@ def test_metrics_that_cannot_be_written_are_one_line(dddas, engine, clip, tmp_pa
 
 
 def test_demo_films_detects_and_scores_twice_into_the_same_folder(dddas, engine, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.simulation.film_clip", partial(film_into, frames=3, size=(160, 120)))
+    small = partial(film_into, frames=3, size=(160, 120))
+    monkeypatch.setattr("torchvision_dddas.simulation.film_clip", lambda folder, tick: small(folder))
     for _ in range(2):
         result = dddas("demo", "--out", tmp_path / "demo")
         assert result.exit_code == 0, result.output

@@ -1,6 +1,7 @@
 """The team, its receivers and colours, and the UAV: where they go, and how true what they say is."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np

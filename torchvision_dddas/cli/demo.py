@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.progress import progress
 
 
 @explained
@@ -18,11 +19,11 @@ def demo(
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import DetectionRecorder
-    from torchvision_dddas.simulation import film_clip
+    from torchvision_dddas.simulation import film_clip, load_scenario
 
-    if not quiet:
-        typer.echo(f"filming the scenario demo into {out / 'clip'}", err=True)
-    clip = film_clip(out / "clip")
+    length = load_scenario("demo").clip
+    with progress("filming", round(length.seconds * length.rate_hz), quiet) as tick:
+        clip = film_clip(out / "clip", tick=tick)
     journal = detect_clip(str(clip / "frames"), out, load_config(), "auto", DetectionRecorder.saved, quiet=quiet)
     report = score(clip / "masks", out, None, out)
     if not quiet:

@@ -186,7 +186,7 @@ def limb_capsules(px: np.ndarray, size: np.ndarray, points: int = 8) -> np.ndarr
     turn = np.linspace(0, np.pi, points)[:, None]
     half = np.cos(turn) * aside[:, None] - np.sin(turn) * ahead[:, None]
     circles = px[:, :, None] + size[:, :, None, None] * np.stack([half, -half], axis=1)
-    return circles.reshape(len(px), -1, 2)
+    return circles.reshape(len(px), 2 * points, 2)
 
 
 def draw_figure(

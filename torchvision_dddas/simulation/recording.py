@@ -1,7 +1,7 @@
 """What the instruments of a simulated run give, as files that the tools take: pictures, telemetry, reports, poses."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -272,10 +272,12 @@ def film_clip(
     frames: int | None = None,
     size_px: tuple[int, int] | None = None,
     scenario: str = "demo",
+    tick: Callable[[], object] = lambda: None,
 ) -> Path:
     """Film a scenario into frames/000001.jpg ... and masks/000001.png ... of a folder, which is returned.
 
-    The rest as in `film`. Raises InputError if there is no such scenario or the disk refuses.
+    The rest as in `film`; tick is called after each frame. Raises InputError if there is no such scenario or the disk
+    refuses.
     """
     try:
         for part in ("frames", "masks"):
@@ -284,6 +286,7 @@ def film_clip(
             png = cv2.imencode(".png", mask.astype(np.uint8))[1]
             write_whole(folder / "frames" / f"{number:06d}.jpg", encode_jpeg(image))
             write_whole(folder / "masks" / f"{number:06d}.png", png.tobytes())
+            tick()
     except OSError as error:
         raise cannot_write(Path(error.filename or folder), error) from error
     return folder

@@ -1,6 +1,5 @@
-"""What a newcomer meets first: the demo with the true engine, and a README whose words hold."""
+"""The README: its code runs, its commands, files and settings exist."""
 
-import json
 import re
 import shlex
 from pathlib import Path
@@ -20,17 +19,6 @@ COMMANDS = [line.partition("#")[0] for line in README.splitlines() if line.start
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-
-
-def test_the_demo_finds_most_movers_and_leaves_the_parked_car_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr("torchvision_dddas.simulation.film_clip.__defaults__", (None, 16, (480, 360), "demo"))
-    result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "demo")])
-    assert result.exit_code == 0, result.output
-    scores = json.loads((tmp_path / "demo/metrics.json").read_text())["clips"]["demo"]
-    assert scores["pixels"]["f"] > 0.6
-    assert scores["pixels"]["precision"] > 0.6
-    film = cv2.VideoCapture(str(tmp_path / "demo/overlay.mp4"))
-    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 16
 
 
 def test_the_python_of_the_readme_runs_and_finds_targets(tmp_path, monkeypatch, capsys):
