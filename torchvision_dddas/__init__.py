@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchvision_dddas.types import Source
 
-__version__ = "0.1.0"
-
 # Public name -> the module that holds it, and its name there.
 _HOME = {
+    "__version__": ("runtime", "VERSION"),
     "Adjustment": ("types", "Adjustment"),
     "Detections": ("types", "Detections"),
     "Frame": ("types", "Frame"),
@@ -27,7 +26,7 @@ _HOME = {
     "load_settings": ("config", "load_config"),
 }
 
-__all__ = ["__version__", "open_source", "open_video", *_HOME]
+__all__ = ["open_source", "open_video", *_HOME]
 
 
 def open_video(spec: str | Path, **options: Any) -> "Source":

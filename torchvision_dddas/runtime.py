@@ -13,8 +13,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas import __version__
 from torchvision_dddas.errors import InputError
+
+VERSION = "0.1.0"
+"""Of this package."""
 
 SHIPPED = Path(__file__).parent / "graphs"
 MANIFEST = "manifest.json"
@@ -77,12 +79,12 @@ def _checked(path: Path, text: bytes) -> dict[str, Any]:
         made_by = held["package"]
         intact = isinstance(held["graphs"], dict) and held["seal"] == seal(held)
     except (ValueError, KeyError, TypeError, RecursionError):
-        intact, held, made_by = False, {}, __version__
+        intact, held, made_by = False, {}, VERSION
     # Before the seal, which another version may make in another way.
-    if isinstance(made_by, str) and made_by != __version__:
+    if isinstance(made_by, str) and made_by != VERSION:
         raise InputError(
             f"the graphs in {path.parent} were made by torchvision-dddas {made_by}, "
-            f"and this is {__version__}; {_again(path.parent)}"
+            f"and this is {VERSION}; {_again(path.parent)}"
         )
     if not intact:
         raise InputError(f"{path} is not as `dddas export` wrote it: damaged or changed; {_again(path.parent)}")

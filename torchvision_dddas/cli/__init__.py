@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from torchvision_dddas import __version__
 from torchvision_dddas.cli.calibrate import calibrate
 from torchvision_dddas.cli.colours import colours
 from torchvision_dddas.cli.compare import compare
@@ -24,6 +23,7 @@ from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 from torchvision_dddas.cli.tune import tune
+from torchvision_dddas.runtime import VERSION
 
 app = typer.Typer(
     name="dddas",
@@ -42,7 +42,7 @@ app.add_typer(locate, name="locate")
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"dddas {__version__}")
+        typer.echo(f"dddas {VERSION}")
         raise typer.Exit
 
 

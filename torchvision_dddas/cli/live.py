@@ -7,12 +7,12 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchvision_dddas import __version__
 from torchvision_dddas.cli import live_words
 from torchvision_dddas.cli.aerial import about
 from torchvision_dddas.cli.live_path import path
 from torchvision_dddas.cli.mistakes import INTERRUPTED
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, prepare_run
+from torchvision_dddas.runtime import VERSION
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import LiveParameters, Settings
@@ -73,7 +73,7 @@ def run_live(
         keeping = _kept(stack, folder, facts, health, streams, live.status_s, quiet)
         watchdog = Watchdog(health, live.watchdog_s, supervisor)
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
-        pages |= served(health, watchdog, streams, keeping, without_secrets(clip), __version__, patience_s)
+        pages |= served(health, watchdog, streams, keeping, without_secrets(clip), VERSION, patience_s)
 
         feed = Feed(source, health, watchdog, ready.flight)
         stopping = stack.enter_context(Stopping(_ending(feed, source)))

@@ -10,10 +10,9 @@ import onnx
 import onnxruntime
 import torch
 
-from torchvision_dddas import __version__
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
-from torchvision_dddas.runtime import MANIFEST, manifest, seal
+from torchvision_dddas.runtime import MANIFEST, VERSION, manifest, seal
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def refuse_failed(files: dict[str, ExportedGraph]) -> None:
 
 
 def _manifest_json(graphs: dict[str, dict[str, Any]]) -> bytes:
-    content: dict[str, Any] = {"package": __version__, "graphs": dict(sorted(graphs.items()))}
+    content: dict[str, Any] = {"package": VERSION, "graphs": dict(sorted(graphs.items()))}
     return (json.dumps({**content, "seal": seal(content)}, indent=1) + "\n").encode()
 
 

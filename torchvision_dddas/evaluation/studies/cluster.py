@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Any
 
-from torchvision_dddas import __version__
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies import digests
 from torchvision_dddas.evaluation.studies.cache import Cache, Carried
 from torchvision_dddas.evaluation.studies.jobs import TRIES, Event
 from torchvision_dddas.evaluation.studies.working import Done, Job, Keys, work
+from torchvision_dddas.runtime import VERSION
 
 CONNECT_S = 5.0
 """So long a scheduler may take to answer."""
@@ -43,7 +43,7 @@ def spread(jobs: Sequence[Job], client: Any, cache: Cache, alone_s: float = ALON
 
 def identity(backend: str) -> Identity:
     """What this package is: workers that say the same find the same."""
-    return __version__, digests.of(digests.code(digests.FINDS, backend), digests.code(digests.SCORES))
+    return VERSION, digests.of(digests.code(digests.FINDS, backend), digests.code(digests.SCORES))
 
 
 def remote(job: Job, known: dict[str, bytes]) -> tuple[list[Done], dict[str, bytes]]:
@@ -116,7 +116,7 @@ class _Cluster:
                 since = time.monotonic()
             elif time.monotonic() - since > self.alone_s:
                 raise InputError(
-                    f"{self.scheduler} has had no worker with this version of the package ({__version__}) for "
+                    f"{self.scheduler} has had no worker with this version of the package ({VERSION}) for "
                     f"{self.alone_s:g} s; start `dask worker {self.scheduler} --nthreads 1` in this environment"
                 )
             while waiting and (worker := self._free()):

@@ -12,9 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas import __version__
 from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.overlay.layers import LIKELY
+from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -153,7 +153,7 @@ def finite(value: Any) -> Any:
 
 def versions() -> dict[str, str]:
     """Versions of this package, of Python, and of those libraries that the run has loaded."""
-    found = {"torchvision_dddas": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    found = {"torchvision_dddas": VERSION, "python": platform.python_version(), "machine": platform.machine()}
     for name in ("numpy", "scipy", "cv2", "torch", "kornia", "onnxruntime", "av"):
         version = getattr(sys.modules.get(name), "__version__", None)
         if version:
