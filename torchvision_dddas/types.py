@@ -37,6 +37,56 @@ class Table:
         joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
+    def to_columns(self) -> dict[str, np.ndarray]:
+        """One array (N,) a column: an array (N, 2) or more is split, as box_px into x_px, y_px, width_px, height_px."""
+        columns = {}
+        for name, values in _columns(self).items():
+            flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+            names = _SPLIT.get(name, tuple(f"{name}_{k}" for k in range(flat.shape[1])))
+            columns |= {name: values} if values.ndim == 1 else dict(zip(names, flat.T, strict=True))
+        return columns
+
+    def to_pandas(self) -> Any:
+        """The columns of to_columns as a pandas DataFrame. Raises InputError where pandas is not installed."""
+        try:
+            import pandas
+        except ImportError:
+            raise InputError("to_pandas needs pandas: pip install pandas; to_columns gives plain arrays") from None
+        return pandas.DataFrame(self.to_columns())
+
+
+# Names of the columns of arrays that have several.
+_SPLIT = {
+    "box_px": ("x_px", "y_px", "width_px", "height_px"),
+    "window_px": ("window_x_px", "window_y_px", "window_width_px", "window_height_px"),
+    "middle_px": ("middle_u_px", "middle_v_px"),
+    "image_px": ("u_px", "v_px"),
+    "east_north_m": ("east_m", "north_m"),
+    "lonlat_deg": ("longitude_deg", "latitude_deg"),
+    "covariance_m2": ("var_east_m2", "cov_east_north_m2", "cov_north_east_m2", "var_north_m2"),
+}
+
+
+class Boxes(Table):
+    """A table with boxes, box_px (N, 4), and scores."""
+
+    box_px: np.ndarray
+    score: np.ndarray
+
+    @property
+    def xyxy(self) -> np.ndarray:
+        """(N, 4) left, top, right and bottom edge in pixels, as torchvision and supervision have boxes."""
+        return np.concatenate([self.box_px[:, :2], self.box_px[:, :2] + self.box_px[:, 2:]], axis=1)
+
+    def to_supervision(self) -> Any:
+        """A supervision.Detections of the boxes. Raises InputError where supervision is not installed."""
+        try:
+            import supervision
+        except ImportError:
+            raise InputError("to_supervision needs supervision: pip install supervision") from None
+        identity = getattr(self, "identity", None)
+        return supervision.Detections(xyxy=self.xyxy, confidence=self.score, tracker_id=identity)
+
 
 def _columns(table: Any) -> dict[str, np.ndarray]:
     values = {column.name: getattr(table, column.name) for column in fields(table)}
@@ -252,7 +302,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Detections(Table):
+class Detections(Boxes):
     """The moving targets of one frame, one row a target.
 
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
@@ -276,6 +326,27 @@ class Detections(Table):
 
     def __len__(self) -> int:
         return len(self.box_px)
+
+    @classmethod
+    def from_supervision(cls, detections: Any) -> Self:
+        """Detections of another detector: an object with `xyxy` (N, 4) and `confidence` (N,) or None, in pixels.
+
+        Raises InputError for other shapes and for boxes without width or height.
+        """
+        corners = np.asarray(getattr(detections, "xyxy", None), np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 4:
+            raise InputError(f"detections.xyxy must have the shape (N, 4), got {corners.shape}")
+        box_px = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
+        if not (np.isfinite(box_px).all() and (box_px[:, 2:] > 0).all()):
+            raise InputError(
+                "detections.xyxy must hold finite left, top, right and bottom edges, right of left, below top"
+            )
+        confidence = getattr(detections, "confidence", None)
+        score = np.ones(len(box_px)) if confidence is None else np.asarray(confidence, np.float64)
+        if score.shape != (len(box_px),):
+            raise InputError(f"detections.confidence must have the shape ({len(box_px)},), got {score.shape}")
+        unknown = np.full(len(box_px), np.nan)
+        return cls(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
 
 
 # How many boxes may lie beyond the extent of a table, and from how many rows on the extent is estimated.
@@ -775,7 +846,7 @@ class Confirmation:
 
 
 @dataclass(frozen=True)
-class Tracks(Table):
+class Tracks(Boxes):
     """The targets of one frame with their identities, one row a target.
 
     frame: 1-based number. identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
@@ -790,6 +861,11 @@ class Tracks(Table):
 
     def __len__(self) -> int:
         return len(self.identity)
+
+    @property
+    def id(self) -> np.ndarray:
+        """(N,) the identities."""
+        return self.identity
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A georeferenced raster laid on a grid of local metres."""
+"""Rasters of the ground, georeferenced: its heights, and photos of it from straight above, on grids of local metres."""
 
 import math
 import warnings
@@ -11,10 +11,95 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Elevation, Ortho
+
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Heights outside do not exist on Earth: they are holes that the raster does not declare."""
+
+MOST_CELLS = 2000
+"""Highest number of heights along a side of the grid; a finer raster is averaged."""
+
+MOST_PX = 1600
+"""Highest number of pixels along a side; a finer photo is averaged."""
+
+
+def read_elevation(
+    path: str | Path, places: np.ndarray, origin_deg: tuple[float, float] | None, margin_m: float = 500.0
+) -> Elevation:
+    """Heights about places (N, 2), relative to that at east = north = 0.
+
+    places: local metres; margin_m: how far around them. origin_deg: (longitude, latitude) of the local metres; None
+    where there is none: then they are taken for the raster's own coordinates.
+    Where the raster does not cover the origin, up = 0 is the mean height at those places that it does cover.
+    Raises InputError where rasterio is missing, the file is no raster, of several bands, without CRS, not in metres, or
+    covers none of the places.
+    """
+    where = _known_places(places)
+    if not len(where):
+        raise InputError(f"elevation {path}: no place is known to look it up at; give landmarks with places")
+    with _open_raster(path, "elevation", origin_deg is not None) as raster:
+        if raster.count != 1:
+            raise InputError(f"elevation {path} has {raster.count} bands; wanted one, of heights in metres")
+        unit = (raster.units[0] or "m").lower()
+        if unit not in ("m", "metre", "meter", "metres", "meters"):
+            raise InputError(f"elevation {path} has heights in {unit}; wanted metres")
+        grid = _resample(raster, 1, where, origin_deg, margin_m, MOST_CELLS, (LOWEST_M, HIGHEST_M))
+        covers = _covered_text(raster, origin_deg is not None)
+    heights = grid.values
+    cells = np.rint((np.vstack([np.zeros((1, 2)), where]) - grid.corner_m) / grid.step_m).astype(int)
+    inside = ((cells >= 0) & (cells < heights.shape[::-1])).all(axis=1)
+    known = np.full(len(cells), np.nan)
+    known[inside] = heights[cells[inside, 1], cells[inside, 0]]
+    if not np.isfinite(known[1:]).any():
+        raise InputError(
+            f"elevation {path} covers {covers}, the landmarks lie at {_places_text(where, origin_deg)}; "
+            "it has no height there"
+        )
+    base = float(known[0] if np.isfinite(known[0]) else np.nanmean(known[1:]))
+    return Elevation(heights - base, grid.corner_m, grid.step_m, base)
+
+
+def read_ortho(
+    path: str | Path, places: np.ndarray, origin_deg: tuple[float, float] | None, margin_m: float = 100.0
+) -> Ortho:
+    """A photo about places (N, 2); arguments and errors as for read_elevation, but one band of grey or three of colour.
+
+    Where it shows nothing it is white.
+    """
+    where = _known_places(places)
+    with _open_raster(path, "background", origin_deg is not None) as raster:
+        if raster.count not in (1, 3, 4) or raster.dtypes[0] != "uint8":
+            raise InputError(
+                f"background {path} has {raster.count} bands of {raster.dtypes[0]}; wanted a photo of red, green and "
+                "blue, or grey, in 8 bits"
+            )
+        bands = [1, 1, 1] if raster.count == 1 else [3, 2, 1]
+        grid = _resample(raster, bands, where, origin_deg, margin_m, MOST_PX)
+        covers = _covered_text(raster, origin_deg is not None)
+    if not np.isfinite(grid.values).any():
+        raise InputError(
+            f"background {path} covers {covers}, the landmarks lie at {_places_text(where, origin_deg)}; none shows"
+        )
+    picture = np.nan_to_num(grid.values, nan=255.0).round().clip(0, 255).astype(np.uint8)[:, ::-1]
+    top = grid.corner_m[1] + (picture.shape[1] - 1) * grid.step_m
+    step = grid.step_m
+    return Ortho(
+        np.ascontiguousarray(picture.transpose(1, 2, 0)),
+        np.array([[step, 0.0, grid.corner_m[0]], [0.0, -step, top]]),
+    )
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Rasters.
+
+
+def _known_places(places: np.ndarray) -> np.ndarray:
+    where = np.asarray(places, float).reshape(-1, 2)
+    return where[np.isfinite(where).all(axis=1)]
 
 
 @dataclass(frozen=True)
-class Laid:
+class _Grid:
     """values: (R, C) or (B, R, C), rows to the north, NaN where the raster has none. corner_m: of the first; step_m."""
 
     values: np.ndarray
@@ -23,7 +108,7 @@ class Laid:
 
 
 @contextmanager
-def opened(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
+def _open_raster(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
     """An open raster. geographic: whether local metres have a geographic origin, so that a CRS is needed.
 
     Raises InputError where rasterio is missing, the file is no raster, or its CRS does not fit.
@@ -60,7 +145,7 @@ def opened(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
         raise InputError(f"{what} {path} cannot be read as a raster: {' '.join(str(error).split())}") from None
 
 
-def laid(
+def _resample(
     raster: Any,
     bands: int | list[int],
     where: np.ndarray,
@@ -68,7 +153,7 @@ def laid(
     margin_m: float,
     most_cells: int,
     within: tuple[float, float] = (-math.inf, math.inf),
-) -> Laid:
+) -> _Grid:
     """Bands of a raster about places (N, 2) in local metres; a finer one is averaged down to most_cells a side.
 
     within: values beyond are holes that the raster does not declare. origin_deg: (longitude, latitude) of the local
@@ -92,7 +177,7 @@ def laid(
         bounds = transform_bounds(local, own, *bounds)
     shape = (rows, columns) if isinstance(bands, int) else (len(bands), rows, columns)
     values = np.full(shape, np.nan)
-    source, transform = _part(raster, bands, bounds, 2 * most_cells)
+    source, transform = _read_part(raster, bands, bounds, 2 * most_cells)
     if source is not None:
         # Before they are mixed with their neighbours.
         source[~((source >= within[0]) & (source <= within[1]))] = np.nan
@@ -108,10 +193,10 @@ def laid(
             dst_nodata=np.nan,
             resampling=Resampling.bilinear,
         )
-    return Laid(values[..., ::-1, :], (float(low[0]), float(low[1])), step)
+    return _Grid(values[..., ::-1, :], (float(low[0]), float(low[1])), step)
 
 
-def area(raster: Any, geographic: bool) -> str:
+def _covered_text(raster: Any, geographic: bool) -> str:
     """Where a raster lies, in words."""
     if not geographic or raster.crs is None:
         west, south, east, north = raster.bounds
@@ -122,7 +207,7 @@ def area(raster: Any, geographic: bool) -> str:
     return f"longitude {west:.5f} to {east:.5f}, latitude {south:.5f} to {north:.5f}"
 
 
-def lie(where: np.ndarray, origin_deg: tuple[float, float] | None) -> str:
+def _places_text(where: np.ndarray, origin_deg: tuple[float, float] | None) -> str:
     """Where places lie, in words."""
     low, high = where.min(axis=0), where.max(axis=0)
     text = f"east {low[0]:.0f} to {high[0]:.0f} m, north {low[1]:.0f} to {high[1]:.0f} m"
@@ -131,7 +216,9 @@ def lie(where: np.ndarray, origin_deg: tuple[float, float] | None) -> str:
     return f"{text} of longitude {origin_deg[0]:.5f}, latitude {origin_deg[1]:.5f}"
 
 
-def _part(raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: int) -> tuple[np.ndarray | None, Any]:
+def _read_part(
+    raster: Any, bands: int | list[int], bounds: tuple[float, ...], most: int
+) -> tuple[np.ndarray | None, Any]:
     """What of the bands is within bounds, float64, NaN where there is none, and its transform; None if nothing is."""
     from rasterio.enums import Resampling
     from rasterio.transform import Affine

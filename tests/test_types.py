@@ -1,0 +1,43 @@
+"""Records: rows, columns, and the boxes of other libraries."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types import Detections, Positions, Tracks
+
+CORNERS = np.array([[10.0, 20, 40, 80], [0, 0, 5, 5]])
+
+
+def test_boxes_of_another_detector_come_back_as_they_were():
+    found = Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=np.array([0.5, 0.9])))
+    assert found.box_px.tolist() == [[10, 20, 30, 60], [0, 0, 5, 5]] and found.score.tolist() == [0.5, 0.9]
+    assert (found.xyxy == CORNERS).all() and found.kind == "given" and np.isnan(found.heading_rad).all()
+    assert Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=None)).score.tolist() == [1, 1]
+    assert len(Detections.from_supervision(SimpleNamespace(xyxy=np.zeros((0, 4)), confidence=np.zeros(0)))) == 0
+
+
+@pytest.mark.parametrize(
+    ("xyxy", "confidence", "message"),
+    [
+        (np.zeros((2, 3)), None, r"xyxy must have the shape \(N, 4\), got \(2, 3\)"),
+        (np.array([[5.0, 5, 5, 9]]), None, "must hold finite left, top, right and bottom edges"),
+        (np.array([[5.0, 5, np.nan, 9]]), None, "must hold finite"),
+        (CORNERS, np.zeros(3), r"confidence must have the shape \(2,\), got \(3,\)"),
+    ],
+)
+def test_boxes_of_wrong_shapes_are_refused(xyxy, confidence, message):
+    with pytest.raises(InputError, match=message):
+        Detections.from_supervision(SimpleNamespace(xyxy=xyxy, confidence=confidence))
+
+
+def test_arrays_of_several_columns_are_split_by_name():
+    tracks = Tracks(3, np.array([7]), np.array([[1.0, 2, 3, 4]]), np.array([0.5]), np.array([0]))
+    columns = tracks.to_columns()
+    assert list(columns) == ["identity", "x_px", "y_px", "width_px", "height_px", "score", "row"]
+    assert columns["width_px"].tolist() == [3] and tracks.id.tolist() == [7] and tracks.xyxy.tolist() == [[1, 2, 4, 6]]
+    assert {"east_m", "north_m", "var_north_m2"} <= set(Positions().to_columns())
+    frame = pytest.importorskip("pandas").DataFrame(columns)
+    assert tracks.to_pandas().equals(frame)
