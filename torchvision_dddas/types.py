@@ -39,7 +39,7 @@ class Table:
 
     def to_columns(self) -> dict[str, np.ndarray]:
         """One array (N,) a column: an array (N, 2) or more is split, as box_px into x_px, y_px, width_px, height_px."""
-        columns = {}
+        columns: dict[str, np.ndarray] = {}
         for name, values in _columns(self).items():
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
             names = _SPLIT.get(name, tuple(f"{name}_{k}" for k in range(flat.shape[1])))
