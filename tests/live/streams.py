@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.live.clock import Clock
+from torchvision_dddas.live.frame_queue import Clock
 
 # Nothing that a test waits for takes this long: a hang becomes a failure.
 PATIENCE_S = 30.0

@@ -43,7 +43,7 @@ class Camera:
     def begun(self) -> None:
         assert self.built.wait(PATIENCE_S)
         assert self.source is not None
-        inbox = self.source._inbox
+        inbox = self.source._queue
         with inbox.changed:
             assert inbox.changed.wait_for(lambda: inbox.begun or inbox.closed, PATIENCE_S)
 
@@ -416,7 +416,7 @@ def test_a_recording_that_is_left_in_the_middle_leaves_no_thread(tmp_path: Path)
 def test_a_network_stream_that_is_cut_is_read_on_by_a_new_connection(tmp_path: Path) -> None:
     clip = write_by_av(tmp_path / "clip.ts", "mpeg4", [100 * k for k in range(40)])
     listener = socket.create_server(("127.0.0.1", 0))
-    served: list[int] = []
+    health_pages: list[int] = []
 
     def serve() -> None:
         while True:
@@ -425,7 +425,7 @@ def test_a_network_stream_that_is_cut_is_read_on_by_a_new_connection(tmp_path: P
             except OSError:
                 return
             with connection:
-                served.append(1)
+                health_pages.append(1)
                 connection.sendall(clip.read_bytes())
 
     server = threading.Thread(target=serve)
@@ -436,7 +436,7 @@ def test_a_network_stream_that_is_cut_is_read_on_by_a_new_connection(tmp_path: P
     assert source.size == (64, 48)
     for frame in source:
         assert frame.image.shape == (48, 64, 3)
-        if len(served) > 2 and health.snapshot().counts.get("reconnects", 0) > 1:
+        if len(health_pages) > 2 and health.snapshot().counts.get("reconnects", 0) > 1:
             break
     listener.shutdown(socket.SHUT_RDWR)
     listener.close()

@@ -7,7 +7,7 @@ import pytest
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output.live_session import SessionLog, claim
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.status import Keeping
+from torchvision_dddas.live.status import StatusWriter
 
 
 class Disk:
@@ -36,7 +36,7 @@ class Flow:
 
 def test_events_are_written_and_said_once_each_in_order():
     health, disk, said = Health(), Disk(), []
-    keeping = Keeping(health, disk, [], 1.0, lambda event: said.append(event.text))
+    keeping = StatusWriter(health, disk, [], 1.0, lambda event: said.append(event.text))
     health.event("run", "one")
     health.event("stream", "two")
     keeping.events()
@@ -48,7 +48,7 @@ def test_events_are_written_and_said_once_each_in_order():
 
 def test_a_disk_that_refuses_is_told_once_and_gets_everything_later():
     health, disk, said = Health(), Disk(), []
-    keeping = Keeping(health, disk, [], 1.0, lambda event: said.append(event.text))
+    keeping = StatusWriter(health, disk, [], 1.0, lambda event: said.append(event.text))
     disk.full = True
     for words in ("one", "two", "three"):
         health.event("run", words)
@@ -64,7 +64,7 @@ def test_a_disk_that_refuses_is_told_once_and_gets_everything_later():
 
 def test_the_last_word_is_written_and_results_are_put_on_the_disk():
     health, disk, flow = Health(), Disk(), Flow()
-    with Keeping(health, disk, [flow], 1000.0) as keeping:
+    with StatusWriter(health, disk, [flow], 1000.0) as keeping:
         health.result()
         health.event("run", "the end")
         keeping.state = "complete"
@@ -75,7 +75,7 @@ def test_the_last_word_is_written_and_results_are_put_on_the_disk():
 
 def test_a_run_that_ends_by_an_error_of_ours_counts_as_failed():
     disk = Disk()
-    with pytest.raises(ZeroDivisionError), Keeping(Health(), disk, [], 1000.0):
+    with pytest.raises(ZeroDivisionError), StatusWriter(Health(), disk, [], 1000.0):
         raise ZeroDivisionError
     assert disk.states[-1][0] == "failed"
 

@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 import pytest
 
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.pages import health_json, html_page, metrics, trouble_of
-from torchvision_dddas.live.status import now_of
+from torchvision_dddas.live.pages import find_trouble, health_json, html_page, metrics
+from torchvision_dddas.live.status import snapshot_facts
 
 # The text exposition format, version 0.0.4.
 _NAME, _LABEL = r"[a-zA-Z_:][a-zA-Z0-9_:]*", r'[a-zA-Z_][a-zA-Z0-9_]*="(?:[^"\\\n]|\\[\\"n])*"'
@@ -80,7 +80,7 @@ def test_the_page_is_whole_fetches_nothing_and_loads_itself_again(health):
     assert any(attrs.get("name") == "viewport" for _, attrs in tags)
     assert "://" not in page.replace("rtsp://x", "")
     assert "@import" not in page and "url(" not in page
-    assert "a&lt;i&gt;&quot;&amp;" in page
+    assert "a&lt;i&gt;&#34;&amp;" in page
 
 
 def test_the_page_shows_the_latest_events_first_and_what_is_wrong(health):
@@ -94,7 +94,7 @@ def test_json_is_strict_even_where_a_number_is_not_finite(health):
     def refuse(name):
         raise AssertionError(name)
 
-    read = json.loads(health_json(now_of(health.snapshot()), ""), parse_constant=refuse)
+    read = json.loads(health_json(snapshot_facts(health.snapshot()), ""), parse_constant=refuse)
     assert read["ok"] is True
     assert read["gauges"] == {"every": 2, "rate_hz": None}
     assert read["seconds"]["latency"]["p99"] == pytest.approx(0.09801)
@@ -103,6 +103,6 @@ def test_json_is_strict_even_where_a_number_is_not_finite(health):
 
 def test_no_result_for_long_or_a_hung_step_is_trouble(health):
     now = health.snapshot()
-    assert trouble_of(now, 60.0) == ""
-    assert trouble_of(now, 60.0, "the work on frame 3 has taken 40 s").startswith("the work")
-    assert trouble_of(now, -1.0) == "no result for 0:00"
+    assert find_trouble(now, 60.0) == ""
+    assert find_trouble(now, 60.0, "the work on frame 3 has taken 40 s").startswith("the work")
+    assert find_trouble(now, -1.0) == "no result for 0:00"

@@ -7,7 +7,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.runner import Failing, Feed, hand_on, results, told
+from torchvision_dddas.live.runner import Feed, RepeatedFailure, results, send_result, told
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Detections, Frame, FrameResult, Telemetry, TrackedFrame, Tracks
 
@@ -86,7 +86,7 @@ def test_identities_after_an_error_are_new_ones():
 
 
 def test_it_fails_where_no_result_comes_any_more():
-    with pytest.raises(Failing, match=r"25 times in a row .* ZeroDivisionError: that frame"):
+    with pytest.raises(RepeatedFailure, match=r"25 times in a row .* ZeroDivisionError: that frame"):
         list(results(path(broken=range(5, 100)), feed_of(100), Health()))
 
 
@@ -169,7 +169,7 @@ def test_a_stream_that_cannot_write_a_frame_keeps_no_other_from_it():
             raise ValueError("no such digit")
 
     health, good = Health(), Good()
-    hand_on(result_of(Frame(3, 0.0, PICTURE)), [Bad(), good], health)
+    send_result(result_of(Frame(3, 0.0, PICTURE)), [Bad(), good], health)
     assert good.got == 1
     (event,) = health.snapshot().events
     assert (event.kind, event.frame) == ("sink", 3)

@@ -6,7 +6,7 @@ import pytest
 from tests.live.streams import FakeClock
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.live import Health, Shedding
+from torchvision_dddas.live import Health, LoadShedding
 from torchvision_dddas.types import Adjustment, Frame
 
 BASE = with_parameters(
@@ -25,7 +25,7 @@ class Source:
         self.every = every
 
 
-def fed(shedding: Shedding, source: Source, costs_s: list[float], clock: FakeClock) -> list[Adjustment]:
+def fed(shedding: LoadShedding, source: Source, costs_s: list[float], clock: FakeClock) -> list[Adjustment]:
     moved: list[Adjustment] = []
     for number, cost_s in enumerate(costs_s, start=1):
         _, some = shedding(Frame(number, 0.0, np.zeros((2, 2), np.uint8)))
@@ -37,14 +37,14 @@ def fed(shedding: Shedding, source: Source, costs_s: list[float], clock: FakeClo
 
 def test_a_single_long_look_sheds_nothing() -> None:
     source, clock = Source(), FakeClock()
-    shedding = Shedding(source, BASE, clock=clock)
+    shedding = LoadShedding(source, BASE, clock=clock)
     assert fed(shedding, source, [0.02] * 20 + [2.0] + [0.02] * 20, clock) == []
     assert shedding.settings is BASE
 
 
 def test_long_looks_change_settings_and_the_source_and_are_told() -> None:
     source, clock, health = Source(), FakeClock(), Health()
-    shedding = Shedding(source, BASE, health, clock=clock)
+    shedding = LoadShedding(source, BASE, health, clock=clock)
     moved = fed(shedding, source, [0.1] * 7, clock)
     assert {(a.parameter, a.new) for a in moved} == {("registration.keypoints", 100), ("sampling.every", 4)}
     assert shedding.settings.registration.keypoints == 100
@@ -59,14 +59,14 @@ def test_long_looks_change_settings_and_the_source_and_are_told() -> None:
 
 def test_what_was_measured_before_a_change_does_not_count_after_it() -> None:
     source, clock = Source(), FakeClock()
-    shedding = Shedding(source, BASE, clock=clock)
+    shedding = LoadShedding(source, BASE, clock=clock)
     moved = fed(shedding, source, [0.036] * 6 + [0.02] * 30, clock)
     assert [(a.parameter, a.new) for a in moved] == [("registration.keypoints", 200)]
 
 
 def test_a_burst_is_over_and_all_is_as_it_was() -> None:
     source, clock = Source(), FakeClock()
-    shedding = Shedding(source, BASE, clock=clock)
+    shedding = LoadShedding(source, BASE, clock=clock)
     fed(shedding, source, [0.1] * 10, clock)
     assert source.every == 4
     fed(shedding, source, [0.01] * 800, clock)
@@ -77,7 +77,7 @@ def test_a_burst_is_over_and_all_is_as_it_was() -> None:
 def test_people_are_searched_for_less_widely_before_pictures_are_left_out() -> None:
     settings = with_parameters(BASE, {"people.search": "regions"})
     source, clock = Source(), FakeClock()
-    shedding = Shedding(source, settings, people=True, clock=clock)
+    shedding = LoadShedding(source, settings, people=True, clock=clock)
     moved = fed(shedding, source, [0.036] * 22, clock)
     assert [(a.parameter, a.new) for a in moved if a.parameter.startswith("people")][:1] == [("people.look_share", 0.5)]
     assert source.every == 1

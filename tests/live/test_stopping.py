@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from torchvision_dddas.live.shutdown import Stopping
+from torchvision_dddas.live.watchdog import StopSignals
 
 PATIENCE_S = 60.0
 
@@ -19,7 +19,7 @@ def test_the_first_signal_asks_and_the_second_ends_at_once(number):
         codes.append(code)
         ended.set()
 
-    with Stopping(lambda number: asked.set(), at_once) as stopping:
+    with StopSignals(lambda number: asked.set(), at_once) as stopping:
         os.kill(os.getpid(), number)
         assert asked.wait(PATIENCE_S)
         assert stopping.signal == number
@@ -31,7 +31,7 @@ def test_the_first_signal_asks_and_the_second_ends_at_once(number):
 
 def test_nothing_is_asked_without_a_signal_and_handlers_are_given_back():
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with Stopping(lambda number: pytest.fail("nobody asked")) as stopping:
+    with StopSignals(lambda number: pytest.fail("nobody asked")) as stopping:
         assert signal.getsignal(signal.SIGINT) is not before[0]
     assert stopping.signal is None
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
@@ -42,7 +42,7 @@ def test_in_another_thread_signals_stay_as_they_are():
     before, seen = signal.getsignal(signal.SIGTERM), []
 
     def inside():
-        with Stopping(lambda number: None):
+        with StopSignals(lambda number: None):
             seen.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=inside)

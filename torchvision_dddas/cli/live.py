@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.io.streams import About, Stream
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
-    from torchvision_dddas.live.server import Serving
-    from torchvision_dddas.live.status import Keeping
+    from torchvision_dddas.live.server import HealthServer
+    from torchvision_dddas.live.status import StatusWriter
 
 _COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
 
@@ -47,11 +47,9 @@ def run_live(
     from torchvision_dddas.io.output.live_session import RESULTS, claim
     from torchvision_dddas.io.video import without_secrets
     from torchvision_dddas.live import LiveSource
-    from torchvision_dddas.live.routes import served
-    from torchvision_dddas.live.runner import Failing, Feed
-    from torchvision_dddas.live.server import Page, Serving, address_of
-    from torchvision_dddas.live.shutdown import Stopping
-    from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
+    from torchvision_dddas.live.runner import Feed, RepeatedFailure
+    from torchvision_dddas.live.server import HealthServer, Page, address_of, health_pages
+    from torchvision_dddas.live.watchdog import HUNG, StopSignals, Supervisor, Watchdog
 
     address = None if serve is None else address_of(serve)
     health, supervisor, live = _health(), Supervisor(), settings.live
@@ -65,7 +63,7 @@ def run_live(
         said, opened = _about(ready), stack.enter_context(ExitStack())
         streams = _opened(opened, emit, said, health, live, "--emit")
         pages = dict[str, Page]()
-        serving = None if address is None else Serving(address, pages)
+        serving = None if address is None else HealthServer(address, pages)
 
         folder = claim(out)
         streams = _opened(opened, [f"json:{folder / RESULTS}"], said, health, live, "--out") + streams
@@ -73,10 +71,10 @@ def run_live(
         keeping = _kept(stack, folder, facts, health, streams, live.status_s, quiet)
         watchdog = Watchdog(health, live.watchdog_s, supervisor)
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
-        pages |= served(health, watchdog, streams, keeping, without_secrets(clip), VERSION, patience_s)
+        pages |= health_pages(health, watchdog, streams, keeping, without_secrets(clip), VERSION, patience_s)
 
         feed = Feed(source, health, watchdog, ready.flight)
-        stopping = stack.enter_context(Stopping(_ending(feed, source)))
+        stopping = stack.enter_context(StopSignals(_ending(feed, source)))
         stack.enter_context(keeping)
         stack.enter_context(watchdog)
         if serving is not None:
@@ -88,7 +86,7 @@ def run_live(
         try:
             _work(begin, feed, source, streams, said, health, live.deadline_ms)
             keeping.state = "complete" if stopping.signal is None else "stopped"
-        except Failing as error:
+        except RepeatedFailure as error:
             failed, keeping.state = str(error), "failed"
             health.event("run", failed)
         supervisor.say("STOPPING=1")
@@ -141,16 +139,16 @@ def _kept(
     streams: "Sequence[Stream]",
     status_s: float,
     quiet: bool,
-) -> "Keeping":
+) -> "StatusWriter":
     """What keeps the folder's record, written a first time. Raises InputError where that cannot be."""
     from torchvision_dddas.io.atomic_files import cannot_write
     from torchvision_dddas.io.output.live_session import SessionLog
-    from torchvision_dddas.live.status import Keeping
+    from torchvision_dddas.live.status import StatusWriter
 
     log = SessionLog(folder, facts)
     stack.callback(log.close)
     say, show = (live_words.say_nothing,) * 2 if quiet else (live_words.say_event, live_words.show)
-    keeping = Keeping(health, log, streams, status_s, say, show)
+    keeping = StatusWriter(health, log, streams, status_s, say, show)
     try:
         keeping.begin()
     except OSError as error:
@@ -194,7 +192,7 @@ def _ending(feed: "Feed", source: "LiveSource") -> Callable[[int], None]:
     return end
 
 
-def _say_start(source: "LiveSource", folder: Path, serving: "Serving | None", notes: Sequence[str]) -> None:
+def _say_start(source: "LiveSource", folder: Path, serving: "HealthServer | None", notes: Sequence[str]) -> None:
     width, height = source.size
     live_words.say(f"{source.name}, {width}x{height} at {source.rate_hz:g} Hz; into {folder}")
     if serving is not None:
@@ -212,10 +210,10 @@ def _work(
     health: "Health",
     deadline_ms: float,
 ) -> None:
-    """Hand on results until the pictures end. Raises Failing where none come any more."""
-    from torchvision_dddas.live.runner import hand_on, results, told
+    """Hand on results until the pictures end. Raises RepeatedFailure where none come any more."""
+    from torchvision_dddas.live.runner import results, send_result, told
 
     for result in results(begin, feed, health):
         said.start_utc_s = source.start_utc_s
-        hand_on(result, streams, health)
+        send_result(result, streams, health)
         told(result, feed, health, deadline_ms)

@@ -18,7 +18,7 @@ def path(
     """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
     from torchvision_dddas.config import with_parameters
     from torchvision_dddas.detection import load_engine
-    from torchvision_dddas.live.load_shedding import Shedding
+    from torchvision_dddas.live.load_shedding import LoadShedding
     from torchvision_dddas.pipeline import survey
 
     settings, recognizer = ready.settings, None
@@ -31,7 +31,7 @@ def path(
         settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
         recognizer = recognizer_of(settings.people, backend)
         Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
-    shedding = Shedding(source, settings, health, people)
+    shedding = LoadShedding(source, settings, health, people)
     visions = iter([ready.engine])
 
     def begin(feed: "Feed") -> "Iterator[Result]":

@@ -2,6 +2,6 @@
 
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Event, Health, Snapshot
-from torchvision_dddas.live.load_shedding import Shedding
+from torchvision_dddas.live.load_shedding import LoadShedding
 
-__all__ = ["Event", "Health", "LiveSource", "Shedding", "Snapshot"]
+__all__ = ["Event", "Health", "LiveSource", "LoadShedding", "Snapshot"]

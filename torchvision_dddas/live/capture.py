@@ -1,21 +1,24 @@
 """A camera, a stream or a recording as a run meets it live: pictures come whether or not anyone has time for them."""
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from torchvision_dddas import open_video
 from torchvision_dddas.config import LiveParameters
-from torchvision_dddas.io.video import OpenedStream, Stream, stream_target, without_secrets
-from torchvision_dddas.live.capture_log import Diary
-from torchvision_dddas.live.clock import Clock
-from torchvision_dddas.live.frame_queue import Inbox
+from torchvision_dddas.io.images import ImageSource
+from torchvision_dddas.io.video import OpenedStream, Stream, VideoSource, stream_target, without_secrets
+from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.playback import Player
 from torchvision_dddas.live.receiver import OPENING, Receiver
-from torchvision_dddas.types import Frame, Problem
+from torchvision_dddas.types import Frame, Problem, Source
 
 # How long a thread is waited for that was told to end.
 _JOIN_S = 1.0
+# A reader that is later than this is not waited for by the clock: its pictures would come in one burst.
+_LATE_S = 1.0
 
 
 class LiveSource:
@@ -53,9 +56,9 @@ class LiveSource:
         text = str(spec)
         self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
         self.parameters, self.health, self._clock = parameters or LiveParameters(), health or Health(), clock or Clock()
-        self._inbox = Inbox(self.parameters.queue_frames, self.health, self._clock)
-        self._diary = Diary(self.health, self._clock)
-        told = (self._inbox, self._diary, self.health, self._clock)
+        self._queue = FrameQueue(self.parameters.queue_frames, self.health, self._clock)
+        self._log = CaptureLog(self.health, self._clock)
+        told = (self._queue, self._log, self.health, self._clock)
         target = stream_target(text)
         self._feed: Player | Receiver
         self.recorded: int | None = None
@@ -79,17 +82,17 @@ class LiveSource:
     @property
     def start_utc_s(self) -> float:
         """Seconds since 1970 at time_s = 0; NaN before the first picture."""
-        return self._diary.start_utc_s
+        return self._log.start_utc_s
 
     @property
     def problems(self) -> list[Problem]:
         """The latest."""
-        return self._diary.problems
+        return self._log.problems
 
     def look_at(self, every: int) -> None:
         """From now on every so many-th picture is handed on; the others are left out on purpose."""
-        with self._inbox.changed:
-            self._inbox.every = max(int(every), 1)
+        with self._queue.changed:
+            self._queue.every = max(int(every), 1)
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Each `interval`-th picture alone."""
@@ -98,10 +101,10 @@ class LiveSource:
 
     def __iter__(self) -> Iterator[Frame]:
         """The pictures, the newest where the run is late; a second iteration goes on where the first one ended."""
-        if self._inbox.begin():
+        if self._queue.begin():
             self._feed.begin()
-        while not self._inbox.over:
-            frame = self._inbox.take(self._feed.check())
+        while not self._queue.over:
+            frame = self._queue.take(self._feed.check())
             if frame is None:
                 continue
             frame = replace(frame, skipped=frame.number - self.last - 1)
@@ -114,7 +117,7 @@ class LiveSource:
 
     def stop(self) -> None:
         """No more pictures: the iteration ends. May be called from anywhere, a signal's handler too."""
-        self._inbox.close()
+        self._queue.close()
 
     def close(self) -> None:
         """Stop, and let go of the camera; a thread that hangs in its driver is left behind."""
@@ -122,3 +125,67 @@ class LiveSource:
         for thread in self._feed.threads:
             if thread.is_alive():
                 thread.join(timeout=_JOIN_S)
+
+
+class Player:
+    """Plays a recording `pace` times as fast as it was filmed; 0: as fast as it is taken."""
+
+    def __init__(
+        self, recording: Source, pace: float, queue: FrameQueue, log: CaptureLog, health: Health, clock: Clock
+    ) -> None:
+        self._recording, self._pace, self._queue, self._log = recording, pace, queue, log
+        self._health, self._clock = health, clock
+        if isinstance(recording, (VideoSource, ImageSource)):
+            recording.tolerant = True  # a picture of another size is left out as one that cannot be decoded
+        self._thread = threading.Thread(target=self._play, name="playing", daemon=True)
+
+    @property
+    def apart_s(self) -> float:
+        """Seconds from picture to picture; 0 where they wait."""
+        return 1 / (self._recording.rate_hz * self._pace) if self._pace else 0.0
+
+    @property
+    def threads(self) -> list[threading.Thread]:
+        """Those that may be alive."""
+        return [self._thread]
+
+    def begin(self) -> None:
+        """Somebody takes pictures from now on."""
+        self._thread.start()
+
+    def check(self) -> float | None:
+        """Nothing is to be looked after."""
+        return None
+
+    def _play(self) -> None:
+        queue, start_s = self._queue, float("nan")
+        try:
+            for frame in self._recording:
+                self._report()
+                start_s = self._clock.now() if np.isnan(start_s) else start_s
+                if self._pace:
+                    due_s = start_s + frame.time_s / self._pace
+                    if (late_s := self._clock.now() - due_s) > _LATE_S:
+                        self._log.tell(f"reading is slower than playing: {late_s:.1f} s late", topic="late")
+                        start_s += late_s
+                    queue.sleep(due_s)
+                else:
+                    queue.make_room()
+                if queue.closed:
+                    return
+                taken_s = self._clock.now()
+                self._health.count("undecoded", frame.number - self._log.number - 1)
+                self._log.number = frame.number
+                self._log.captured(taken_s)
+                if queue.wanted(frame.number):
+                    queue.put(Frame(frame.number, frame.time_s, frame.image, 0, taken_s))
+        except Exception as error:  # told, and the end of the recording: the run settles what it has
+            self._log.tell(f"the recording cannot be read further: {error}")
+        finally:
+            self._report()
+            queue.end()
+
+    def _report(self) -> None:
+        for problem in self._recording.problems:
+            self._log.tell(problem.what, problem.frame, topic="damage")
+        self._recording.problems.clear()

@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.control import rules as control
-from torchvision_dddas.live.clock import Clock
+from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.types import Adjustment, Frame
 
@@ -33,7 +33,7 @@ class Paced(Protocol):
         """Of so many pictures one is handed on."""
 
 
-class Shedding:
+class LoadShedding:
     """Asked before each frame, as `run.run` does: the settings that keep up with the source, and what changed.
 
     settings: those in force. people: whether people are searched for, so that their search can be narrowed.

@@ -4,45 +4,27 @@ import json
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from html import escape
 from typing import Any
 
+from torchvision_dddas.io.report import render_page
 from torchvision_dddas.live.health import Snapshot
-
-_STYLE = """
-:root{color-scheme:light dark;--soft:#8884;--bad:#c33;--good:#2a7}
-body{font:16px/1.4 system-ui,sans-serif;margin:0 auto;padding:1rem;max-width:60rem}
-h1{font-size:1.1rem;margin:0 0 .2rem;overflow-wrap:anywhere}
-p{margin:.2rem 0 1rem}.ok{color:var(--good)}.bad{color:var(--bad)}
-dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(9.5rem,1fr));gap:.5rem;margin:0 0 1rem}
-dl div{border:1px solid var(--soft);border-radius:.4rem;padding:.4rem .6rem}
-dt{font-size:.8rem;opacity:.75}dd{margin:0;font-size:1.25rem;font-variant-numeric:tabular-nums}
-h2{font-size:1rem;margin:1rem 0 .3rem}
-ol{list-style:none;margin:0;padding:0}
-li{border-top:1px solid var(--soft);padding:.3rem 0;overflow-wrap:anywhere}
-li span{opacity:.7;font-size:.85rem;font-variant-numeric:tabular-nums;margin-right:.6em}
-"""
 
 _EVENTS = 20
 
 
 def html_page(now: Snapshot, name: str, state: str, trouble: str, links: tuple[str, ...], refresh_s: int = 2) -> str:
-    """One page without scripts that loads itself again; nothing is fetched from elsewhere."""
-    tiles = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in _tiles(now))
-    events = "".join(
-        f"<li><span>{_clock(event.utc_s)}{f' · frame {event.frame}' if event.frame else ''}</span>"
-        f"{escape(event.text)}</li>"
-        for event in list(reversed(now.events))[:_EVENTS]
-    )
-    verdict = f'<p class="bad">{escape(trouble)}</p>' if trouble else '<p class="ok">all is well</p>'
-    more = " · ".join(f'<a href="{link}">{link}</a>' for link in links)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f'<meta http-equiv="refresh" content="{refresh_s}"><title>{escape(state)} · {escape(name)}</title>'
-        f"<style>{_STYLE}</style></head><body><h1>{escape(name)}</h1>{verdict}<dl>{tiles}</dl>"
-        f"<h2>What happened</h2><ol>{events or '<li>nothing worth a word</li>'}</ol>"
-        f"<p>{escape(_clock(datetime.now(UTC).timestamp()))} UTC · {more}</p></body></html>\n"
+    """A page without scripts that loads itself again; nothing is fetched from elsewhere."""
+    latest = list(reversed(now.events))[:_EVENTS]
+    return render_page(
+        "live.html",
+        title=f"{state} · {name}",
+        name=name,
+        trouble=trouble,
+        figures=_tiles(now),
+        events=[(_clock(event.utc_s), event.frame, event.text) for event in latest],
+        now=_clock(datetime.now(UTC).timestamp()),
+        links=links,
+        refresh_s=refresh_s,
     )
 
 
@@ -159,7 +141,7 @@ def _value(value: float) -> str:
     return ("+Inf" if value > 0 else "-Inf") if math.isinf(value) else f"{value:.12g}"
 
 
-def trouble_of(now: Snapshot, patience_s: float, hung: str = "") -> str:
+def find_trouble(now: Snapshot, patience_s: float, hung: str = "") -> str:
     """In words, what is wrong; empty where all is well. patience_s: no result for longer is wrong."""
     if hung:
         return hung

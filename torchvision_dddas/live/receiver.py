@@ -9,9 +9,7 @@ import numpy as np
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.video import Stream, first_picture, scaled
-from torchvision_dddas.live.capture_log import Diary
-from torchvision_dddas.live.clock import Clock
-from torchvision_dddas.live.frame_queue import Inbox
+from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.types import Frame
 
@@ -49,13 +47,13 @@ class Receiver:
         opener: Callable[[], Stream],
         rate_hz: float | None,
         parameters: LiveParameters,
-        inbox: Inbox,
-        diary: Diary,
+        queue: FrameQueue,
+        log: CaptureLog,
         health: Health,
         clock: Clock,
     ) -> None:
         self.name, self.rate_hz, self.size = name, rate_hz or 0.0, (0, 0)
-        self._opener, self._parameters, self._inbox, self._diary = opener, parameters, inbox, diary
+        self._opener, self._parameters, self._queue, self._log = opener, parameters, queue, log
         self._health, self._clock = health, clock
         self._failure: InputError | None = None
         self._ready = False
@@ -73,20 +71,20 @@ class Receiver:
         try:
             self._await_first()
         except BaseException:
-            inbox.close()
+            queue.close()
             raise
 
     @property
     def apart_s(self) -> float:
         """Seconds from picture to picture, as they really come."""
-        return 1 / (self._diary.sent_hz or self.rate_hz)
+        return 1 / (self._log.sent_hz or self.rate_hz)
 
     def begin(self) -> None:
         """Nothing: it reads already, so that the first picture taken is a fresh one."""
 
     def check(self) -> float:
         """Asked by who waits for a picture: gives up a thread that hangs. Returns when to ask again."""
-        with self._inbox.changed:
+        with self._queue.changed:
             now_s = self._clock.now()
             if self._call is not None:
                 since_s, allowed_s = self._call
@@ -112,14 +110,14 @@ class Receiver:
 
     def _await_first(self) -> None:
         allowed_s = 2 * _GRACE * OPENING * self._parameters.stall_s
-        with self._inbox.changed:
+        with self._queue.changed:
             until_s = self._clock.now() + allowed_s
             while not self._ready and self._failure is None:
                 if (left := until_s - self._clock.now()) <= 0:
                     self._turn += 1
                     self._failure = InputError(f"{self.name} sends nothing for {allowed_s:.0f} s; is it there?")
                     break
-                self._clock.wait(self._inbox.changed, left)
+                self._clock.wait(self._queue.changed, left)
         if self._failure is not None:
             raise self._failure
 
@@ -138,11 +136,11 @@ class Receiver:
 
     def _work(self, turn: int) -> None:
         try:
-            while not self._inbox.closed and turn == self._turn:
+            while not self._queue.closed and turn == self._turn:
                 if self._ready:
-                    self._inbox.sleep(self._clock.now() + self._pause_s)
+                    self._queue.sleep(self._clock.now() + self._pause_s)
                     self._pause_s = min(2 * self._pause_s, self._parameters.retry_most_s)
-                    if self._inbox.closed or turn != self._turn:
+                    if self._queue.closed or turn != self._turn:
                         return
                 self._connected(turn)
         except _GivenUp:
@@ -159,9 +157,9 @@ class Receiver:
             if not self._ready:
                 # The driver's own limits apply; who waits for the first picture has one for all of it.
                 self._first(stream)
-                with self._inbox.changed:
+                with self._queue.changed:
                     self._ready = turn == self._turn
-                    self._inbox.changed.notify_all()
+                    self._queue.changed.notify_all()
             why = self._read(stream, turn)
         except _GivenUp:
             raise
@@ -169,10 +167,10 @@ class Receiver:
             why = f"{error}"
             if not self._ready:
                 failure = error if isinstance(error, InputError) else InputError(f"{self.name} cannot be read: {error}")
-                with self._inbox.changed:
+                with self._queue.changed:
                     self._turn += 1
                     self._failure = failure
-                    self._inbox.changed.notify_all()
+                    self._queue.changed.notify_all()
                 raise _GivenUp from None
         finally:
             if stream is not None:
@@ -180,19 +178,19 @@ class Receiver:
                     stream.release()
         if self._clock.now() - since_s > max(self._parameters.stall_s, self._pause_s):
             self._pause_s = self._parameters.retry_s  # it held
-        if not self._inbox.closed:
+        if not self._queue.closed:
             self._lost(why)
 
     @contextmanager
     def _driver(self, turn: int, times: float = 1.0) -> Iterator[None]:
         """A call that may never return."""
-        with self._inbox.changed:
+        with self._queue.changed:
             if turn == self._turn:
                 self._call = (self._clock.now(), _GRACE * times * self._parameters.stall_s)
         try:
             yield
         finally:
-            with self._inbox.changed:
+            with self._queue.changed:
                 mine = turn == self._turn
                 if mine:
                     self._call = None
@@ -203,7 +201,7 @@ class Receiver:
         """Read until the stream is lost; returns why it is."""
         failed, came_s = 0, self._clock.now()
         good_s = came_s
-        while not self._inbox.closed:
+        while not self._queue.closed:
             with self._driver(turn):
                 came = stream.grab()
             if not came:
@@ -222,27 +220,27 @@ class Receiver:
 
     def _picture(self, stream: Stream, taken_s: float) -> bool:
         """Number the picture that was grabbed, and hand it on if it is wanted. Returns whether it was well."""
-        if not self._inbox.begun:
+        if not self._queue.begun:
             return True
-        diary, rate_hz = self._diary, self.rate_hz
+        log, rate_hz = self._log, self.rate_hz
         self._start_s = taken_s if np.isnan(self._start_s) else self._start_s
         place = (taken_s - self._start_s) * rate_hz
-        diary.captured(taken_s, self._compare)
-        if diary.number - place > max(_AHEAD_S * rate_hz, 2):
+        log.captured(taken_s, self._compare)
+        if log.number - place > max(_AHEAD_S * rate_hz, 2):
             self._health.count("dropped")
             return True
         # Never before its time, so that what comes in bursts is not numbered back and forth.
-        diary.number = max(diary.number + 1, 1 + round(place))
-        if not self._inbox.wanted(diary.number):
+        log.number = max(log.number + 1, 1 + round(place))
+        if not self._queue.wanted(log.number):
             return True
         image = stream.retrieve()
         if image is None:
             self._health.count("undecoded")
-            diary.tell(f"frame {diary.number} could not be decoded and was left out", topic="undecoded")
+            log.tell(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
             return False
         if (fitted := self._fitted(image, taken_s)) is not None:
             self._found()
-            self._inbox.put(Frame(diary.number, taken_s - self._start_s, fitted, 0, taken_s))
+            self._queue.put(Frame(log.number, taken_s - self._start_s, fitted, 0, taken_s))
         return True
 
     def _fitted(self, image: np.ndarray, taken_s: float) -> np.ndarray | None:
@@ -255,22 +253,22 @@ class Receiver:
         what = f"pictures are {image.shape[1]}x{image.shape[0]} in place of {width}x{height}"
         if self._odd is None or self._odd[0] != image.shape:
             self._odd = (image.shape, taken_s)
-            self._diary.tell(f"{what}: they are left out", topic="size")
+            self._log.tell(f"{what}: they are left out", topic="size")
         # One is a slip; a camera that was set otherwise is another matter, as long as it shows the same.
         same = abs(image.shape[1] * height - image.shape[0] * width) <= 0.02 * image.shape[1] * height
         if taken_s - self._odd[1] < self._parameters.stall_s or not same:
             return None
-        self._diary.tell(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
+        self._log.tell(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
         return scaled(image, self.size)
 
     # -- what is told ------------------------------------------------------------------------------------------------
 
     def _lost(self, why: str) -> None:
-        self._diary.restart()
+        self._log.restart()
         if self._lost_s is None:
             self._lost_s, self._tries = self._clock.now(), 0
             self._health.gauge("connected", 0)
-            self._diary.tell(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
+            self._log.tell(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
 
     def _found(self) -> None:
         self._health.gauge("connected", 1)
@@ -279,10 +277,10 @@ class Receiver:
         gone_s, self._lost_s = self._clock.now() - self._lost_s, None
         self._health.count("reconnects")
         tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
-        self._diary.tell(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
+        self._log.tell(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
 
     def _compare(self, sent_hz: float) -> None:
         """Tell once where it sends many more or fewer pictures than it announced."""
         if not self._off and abs(sent_hz / self.rate_hz - 1) > _OFF:
             self._off = True
-            self._diary.tell(f"{self.name} sends {sent_hz:.1f} pictures a second, not {self.rate_hz:g}")
+            self._log.tell(f"{self.name} sends {sent_hz:.1f} pictures a second, not {self.rate_hz:g}")

@@ -36,7 +36,7 @@ class LiveFrames(Clip, Protocol):
 
 
 class Stream(Protocol):
-    """Where results go; see sinks.streams."""
+    """Where results go; see io.streams."""
 
     @property
     def name(self) -> str:
@@ -47,7 +47,7 @@ class Stream(Protocol):
         """Send a frame."""
 
 
-class Failing(Exception):
+class RepeatedFailure(Exception):
     """The work fails again and again. Its words are for the user."""
 
 
@@ -148,7 +148,7 @@ class _Renumbered:
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
     """What `begin(feed)` yields; an error in it is an event, and it is begun anew with the frames that follow.
 
-    Raises Failing where that happens again and again without a result between.
+    Raises RepeatedFailure where that happens again and again without a result between.
     """
     renumbered, in_vain = _Renumbered(), 0
     while True:
@@ -164,7 +164,9 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
             number = feed.newest.number if feed.newest is not None else 0
             words = f"{type(error).__name__}: {error} ({_where(error)})"
             if in_vain >= _IN_VAIN:
-                raise Failing(f"{in_vain} times in a row the work on a frame failed, at last: {words}") from error
+                raise RepeatedFailure(
+                    f"{in_vain} times in a row the work on a frame failed, at last: {words}"
+                ) from error
             health.event("run", f"{words}; begun anew with the next frame", number)
             health.count("begun_anew")
         if feed.ended:
@@ -173,7 +175,7 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
         renumbered.anew()
 
 
-def hand_on(result: Result, streams: Iterable[Stream], health: Health) -> None:
+def send_result(result: Result, streams: Iterable[Stream], health: Health) -> None:
     """To all streams; what one of them cannot write is left out of it, and told."""
     for stream in streams:
         try:

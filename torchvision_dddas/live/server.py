@@ -1,14 +1,19 @@
 """A small page, Prometheus text and JSON about a live run, for whoever looks after the vehicle."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.pages import find_trouble, health_json, html_page, metrics
+from torchvision_dddas.live.status import snapshot_facts
+from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"
+_LINKS = ("/metrics", "/health.json")
 
 Page = Callable[[], tuple[int, str, str]]
 """Gives (status, type, text); called in a thread of its own."""
@@ -25,7 +30,30 @@ def address_of(spec: str) -> tuple[str, int]:
     return host.strip("[]") or LOOPBACK, int(port)
 
 
-class Serving:
+class Losing(Protocol):
+    """A stream that counts what nobody will get, as io.streams.Stream."""
+
+    @property
+    def name(self) -> str:
+        """As the user wrote it."""
+        ...
+
+    @property
+    def lost(self) -> int:
+        """Messages that nobody will get."""
+        ...
+
+
+class Going(Protocol):
+    """What tells how far the run is, as StatusWriter: running, complete, stopped or failed."""
+
+    @property
+    def state(self) -> str:
+        """One word."""
+        ...
+
+
+class HealthServer:
     """A context in which the pages are there. address: (host, port), where.
 
     pages: by their paths; may be filled until it begins.
@@ -53,6 +81,36 @@ class Serving:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+def health_pages(
+    health: Health,
+    watchdog: Watchdog,
+    streams: Sequence[Losing],
+    run: Going,
+    name: str,
+    version: str,
+    patience_s: float,
+) -> dict[str, Page]:
+    """The pages. patience_s: no result for longer is trouble."""
+
+    def human() -> tuple[int, str, str]:
+        now = health.snapshot()
+        trouble = find_trouble(now, patience_s, watchdog.hung)
+        return 200, "text/html", html_page(now, name, run.state, trouble, _LINKS)
+
+    def prometheus() -> tuple[int, str, str]:
+        now = health.snapshot()
+        trouble, lost = find_trouble(now, patience_s, watchdog.hung), {stream.name: stream.lost for stream in streams}
+        return 200, "text/plain; version=0.0.4", metrics(now, version, trouble, lost)
+
+    def program() -> tuple[int, str, str]:
+        now = health.snapshot()
+        trouble = find_trouble(now, patience_s, watchdog.hung)
+        facts = {"state": run.state, "input": name, "version": version, **snapshot_facts(now)}
+        return (503 if trouble else 200), "application/json", health_json(facts, trouble)
+
+    return {"/": human, "/metrics": prometheus, "/health.json": program}
 
 
 class _Server(ThreadingHTTPServer):

@@ -17,7 +17,7 @@ _KEPT = 1000  # events that wait for a disk that refuses them
 
 
 class Log(Protocol):
-    """Where it is written, as sinks.session.SessionLog; its methods raise OSError and may be tried again."""
+    """Where it is written, as io.output.live_session.SessionLog; its methods raise OSError and may be tried again."""
 
     def tell(self, events: Iterable[Event]) -> None:
         """Append events."""
@@ -30,10 +30,10 @@ class Synced(Protocol):
     """A stream that can put what it wrote on the disk; it never raises."""
 
     def sync(self) -> None:
-        """As sinks.streams.Stream has it."""
+        """As io.streams.Stream has it."""
 
 
-class Keeping:
+class StatusWriter:
     """A context: a thread writes within it, and the last word is written when it is left.
 
     The work itself never waits for it, and a disk that refuses is an event, not an end.
@@ -60,7 +60,7 @@ class Keeping:
 
     def begin(self) -> None:
         """Write the state for the first time. Raises OSError where that cannot be."""
-        self._log.state(self.state, now_of(self._health.snapshot()))
+        self._log.state(self.state, snapshot_facts(self._health.snapshot()))
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -96,7 +96,7 @@ class Keeping:
         now = self._health.snapshot()
         self._show(now)
         try:
-            self._log.state(self.state, now_of(now))
+            self._log.state(self.state, snapshot_facts(now))
             self._trouble = ""
         except OSError as error:
             self._refused(error)
@@ -126,7 +126,7 @@ class Keeping:
                 self.status()
 
 
-def now_of(now: Snapshot) -> dict[str, Any]:
+def snapshot_facts(now: Snapshot) -> dict[str, Any]:
     """What run.json and /health.json say of how it goes."""
     return {
         "since_s": round(now.since_s, 3),
