@@ -6,8 +6,8 @@ from pathlib import Path
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Source, Task
 from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.spec import Source, Task
 from torchvision_dddas.evaluation.studies.stages import find
 from torchvision_dddas.evaluation.studies.summary import measures
 

@@ -12,7 +12,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -21,10 +21,11 @@ import machine
 import numpy as np
 from films import scene
 
-from torchvision_dddas.evaluation.studies.jobs import share
-from torchvision_dddas.evaluation.studies.record import Source, Spec
-from torchvision_dddas.evaluation.studies.running import order, plan, run_study
-from torchvision_dddas.evaluation.studies.working import Job
+from torchvision_dddas.evaluation.studies.jobs import Event, Job
+from torchvision_dddas.evaluation.studies.runner import plan_study, run_jobs, run_study
+from torchvision_dddas.evaluation.studies.spec import Source, Spec
+from torchvision_dddas.evaluation.studies.storage import Cache
+from torchvision_dddas.evaluation.studies.workers import Workers
 
 SIZE = (640, 480)
 SHORT = 60
@@ -57,18 +58,24 @@ def study(folder: Path, task: str) -> Spec:
 
 def timed(spec: Spec, workers: int, cache: Path) -> tuple[float, float]:
     """Seconds with the start of the workers, and from the first clip done to the last per clip done since."""
-    jobs = order(plan(spec, Path()).jobs)
+    jobs = plan_study(spec, Path()).jobs
     start = time.perf_counter()
-    done = list(_done(jobs, workers, cache))
+    done = _done(jobs, workers, cache)
     first, last = done[min(workers, len(done)) - 1], done[-1]
     return last - start, (last - first) / (len(done) - workers)
 
 
-def _done(jobs: list[Job], workers: int, cache: Path) -> Iterator[float]:
-    for event in share(jobs, workers, cache):
+def _done(jobs: Sequence[Job], count: int, cache: Path) -> list[float]:
+    ends: list[float] = []
+
+    def tell(event: Event) -> None:
         if event.done is not None:
             assert all(not part.cause for part in event.done), event.done
-            yield time.perf_counter()
+            ends.append(time.perf_counter())
+
+    with Workers(count) as workers:
+        run_jobs(jobs, workers, Cache(cache), tell)
+    return ends
 
 
 def main() -> None:
@@ -90,7 +97,7 @@ def main() -> None:
             print(f"one {one[0]:.1f} s, two {two[0]:.1f} s: {turns[-1][0]:.2f}, without the start {turns[-1][1]:.2f}")
         table(root / "tables")
         start = time.perf_counter()
-        results = run_study(study(root / "tables", "association"), root, jobs=0, cache=root / "cache")
+        results = run_study(study(root / "tables", "association"), root, cache=root / "cache")
         spent = time.perf_counter() - start
         stages = sum(sum(case.found.seconds.values()) for case in results.cases if case.found is not None)
     whole, steady = (median(turn[k] for turn in turns) for k in (0, 1))

@@ -21,9 +21,9 @@ from typing import Any
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.evaluation.studies import sweep as sweeping
-from torchvision_dddas.evaluation.studies.axes import Range, possible
+from torchvision_dddas.evaluation.studies.search_space import Range, why_impossible
 from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.evaluation.studies.tried import Tried
+from torchvision_dddas.evaluation.studies.sweep import StudyMeasure
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Prepared, prepare
 from torchvision_dddas.tuning.parameters import TUNABLE
@@ -42,7 +42,7 @@ def main() -> None:
         prepared_s = time.perf_counter() - began
         settings = load_config(spec.config, spec.overrides)
         rows: dict[str, Any] = {}
-        judge = Tried(ready.spec, base, replace(ready.goal, by="mean"), 0, None, Path(place) / "judge")
+        judge = StudyMeasure(ready.spec, base, replace(ready.goal, by="mean"), cache=Path(place) / "judge")
         rows["as it was"] = _judged(judge, {}, ready, 0, 0.0)
         for way in ("gradient", "random", "optuna"):
             for seed in range(args.seeds):
@@ -82,17 +82,17 @@ def prepare_parameters(ready: Prepared) -> Any:
 
 
 def _search(
-    way: str, tried: Tried, ready: Prepared, settings: Settings, factor: float, seed: int, seconds: float
+    way: str, tried: StudyMeasure, ready: Prepared, settings: Settings, factor: float, seed: int, seconds: float
 ) -> tuple[dict[str, object], int]:
     """The best point that was measured in so many seconds; the point under way at the end still counts."""
     axes = [_axis(name, settings, factor) for name in ready.parameters.names]
 
     def measure(parameters: Mapping[str, object]) -> sweeping.Measured:
-        return tried.measured(parameters, ready.tuned)
+        return tried.measure(parameters, ready.tuned)
 
-    least = ready.goal.least
+    least = ready.goal.minimize
     trials = (
-        sweeping.proposed(axes, settings, measure, MOST, seed, least)
+        sweeping.search_ranges(axes, settings, measure, MOST, seed, least)
         if way == "optuna"
         else _random(axes, settings, measure, seed)
     )
@@ -113,7 +113,7 @@ def _random(axes: Sequence[Range], settings: Settings, measure: Any, seed: int) 
         for axis in axes:
             value = math.exp(chance.uniform(math.log(axis.low), math.log(axis.high)))
             parameters[axis.parameter] = TUNABLE[axis.parameter].rounded(value)
-        if not possible(settings, parameters):
+        if not why_impossible(settings, parameters):
             yield sweeping.Trial(number, parameters, *measure(parameters))
 
 
@@ -128,10 +128,10 @@ def _axis(name: str, settings: Settings, factor: float) -> Range:
 
 
 def _judged(
-    judge: Tried, parameters: Mapping[str, object], ready: Prepared, count: int, spent: float
+    judge: StudyMeasure, parameters: Mapping[str, object], ready: Prepared, count: int, spent: float
 ) -> dict[str, Any]:
     with_parameters(load_config(judge.spec.config, judge.spec.overrides), parameters)
-    tuned, held = (judge.measured(parameters, clips)[0] for clips in (ready.tuned, ready.held))
+    tuned, held = (judge.measure(parameters, clips)[0] for clips in (ready.tuned, ready.held))
     return {"tuned": tuned, "held_out": held, "points": count, "seconds": spent, "knobs": dict(parameters)}
 
 

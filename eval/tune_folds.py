@@ -23,9 +23,8 @@ import report
 
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Spec
-from torchvision_dddas.evaluation.studies.running import plan, run_study
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.runner import plan_study, run_study
+from torchvision_dddas.evaluation.studies.spec import Spec, read_spec
 from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.motion import Masks
@@ -42,7 +41,7 @@ def main() -> None:
     spec = replace(spec, config=given.config) if given.config else spec
     settings, names = load_config(spec.config, spec.overrides), chosen(given.parameters.split(","))
     judged = Judge(spec, given.study.parent, given.jobs)
-    clips = {job.clip.name: job.clip for job in plan(spec, given.study.parent, []).jobs}
+    clips = {job.clip.name: job.clip for job in plan_study(spec, given.study.parent, []).jobs}
     learned = {name: Masks().examples([thinned(clip, given.frames)], settings) for name, clip in clips.items()}
     before, alarmed = judged.f({})
     rows: list[dict[str, Any]] = [{"held_out": "", "knobs": _values(settings, names), "f": before, "alarmed": alarmed}]
@@ -76,7 +75,7 @@ class Judge:
         changed = tuple(f"{name}={value}" for name, value in parameters.items())
         spec = replace(self._spec, overrides=(*self._spec.overrides, *changed))
         found, alarmed, frames = {}, 0.0, 0.0
-        for case in run_study(spec, self._base, self._jobs).cases:
+        for case in run_study(spec, self._base, self._workers).cases:
             if case.scored is None:
                 raise SystemExit(f"{case.clip.name}: {case.cause}")
             told = measures([case.scored])

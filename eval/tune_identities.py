@@ -39,8 +39,8 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.studies import sweep
-from torchvision_dddas.evaluation.studies.axes import Range
-from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.search_space import Range
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.tuning import tracking
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters

@@ -30,7 +30,7 @@ from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.evaluation.datasets import inria, motchallenge
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.boxes import iou, judged
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import people_of
 from torchvision_dddas.people.detector import people_in, recognizer_of
@@ -86,7 +86,7 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
         numbers = sorted(clip.truth.boxes)
         share = max(1, most // len(some))
         wanted = {numbers[i * len(numbers) // share] for i in range(share)} if len(numbers) > share else set(numbers)
-        for frame in opened(clip):
+        for frame in open_clip(clip):
             if frame.number not in wanted:
                 continue
             size = (frame.image.shape[1], frame.image.shape[0])
@@ -100,7 +100,7 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
             print(f"\r{group}: {len(pictures)} pictures", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     first = pictures[0]
-    for frame in opened(some[0]):  # what is held is what the recognizer itself finds
+    for frame in open_clip(some[0]):  # what is held is what the recognizer itself finds
         if frame.number in some[0].truth.boxes:  # type: ignore[union-attr]
             (whole,) = people_in([frame.image], recognizer, parameters)
             assert np.allclose(whole.box_px, first.people(parameters).box_px), "the kept windows give other people"

@@ -29,7 +29,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.evaluation.metrics.pixels import Pixels
 from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.motion import Masks
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
@@ -106,7 +106,7 @@ def f(clip: Clip, settings: Settings) -> float:
     """Pixels' F of the hard pipeline."""
     assert clip.truth is not None
     total = Pixels()
-    for scene in detect_motion(opened(clip), settings, "onboard"):
+    for scene in detect_motion(open_clip(clip), settings, "onboard"):
         total = total.plus(segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
     return float(np.nan_to_num(segmentation.measures(total)["f"]))
 

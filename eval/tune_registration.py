@@ -26,7 +26,7 @@ from tune_recovery import BASE, FRAMES, SIZE, f, filmed
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, family
@@ -80,7 +80,7 @@ def judged(clip: Clip, seed: int, settings: Settings) -> tuple[float, float]:
     maps = [view.image_from_ground for view in flight(seed, FRAMES, SIZE, RATE_HZ)]
     true = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(maps)]
     engine = load_engine("onboard", settings)
-    views = [engine.prepare(frame.image) for frame in opened(clip)]
+    views = [engine.prepare(frame.image) for frame in open_clip(clip)]
     ours = [engine.register([pair])[0].later_from_earlier for pair in pairwise(views)]
     error_px = float(np.mean([distance(a, b, *SIZE) for a, b in zip(ours, true, strict=True)]))
     return error_px, f(clip, settings)

@@ -20,8 +20,8 @@ import numpy as np
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import truth as true_boxes
-from torchvision_dddas.evaluation.studies.record import Found
-from torchvision_dddas.evaluation.studies.scoring import as_written, score
+from torchvision_dddas.evaluation.studies.results import Found, round_as_written
+from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.summary import measures
 
 HERE = Path(__file__).resolve().parent
@@ -138,7 +138,7 @@ def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, 
         write(folder / "gt" / name / "gt/gt.txt", thinned(marked, interval))
         for result, table in found[name].items():
             # To hundredths of a pixel, as the program writes and a study scores them.
-            table = np.c_[table[:, :2], as_written(table[:, 2:6]), table[:, 6], np.full((len(table), 3), -1)]
+            table = np.c_[table[:, :2], round_as_written(table[:, 2:6]), table[:, 6], np.full((len(table), 3), -1)]
             write(folder / "found" / result / f"{name}.txt", table)
             write(folder / "results" / result / "data" / f"{name}.txt", thinned(table, interval))
     (folder / "lengths.json").write_text(json.dumps({n: (f - 1) // interval + 1 for n, f in lengths.items()}))

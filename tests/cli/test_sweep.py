@@ -1,7 +1,6 @@
 """`dddas sweep` on small clips: what it writes, that it repeats, what becomes of clips held out and of bad input."""
 
 import json
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from tests.cli.mistakes import bad
 from tests.synthetic_clip import render
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.studies import tried
-from torchvision_dddas.evaluation.studies.tried import Tried
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
 
@@ -37,9 +34,8 @@ def study(tmp_path_factory) -> Path:
 
 def asked(study: Path, *words: str, measure: str = "motion.pixels.f"):
     files = ["--dataset", str(study), "--cache", str(study.parent / "cache")]
-    with pytest.MonkeyPatch.context() as here:  # a worker takes seconds to start
-        here.setattr(tried, "Tried", lambda *asked: replace(Tried(*asked), jobs=0))
-        return CliRunner().invoke(app, ["sweep", *files, "--measure", measure, *words])
+    one = [] if "--jobs" in words or "--scheduler" in words else ["--jobs", "1"]  # others take seconds to start
+    return CliRunner().invoke(app, ["sweep", *files, "--measure", measure, *one, *words])
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +76,7 @@ def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(st
     def none(*_, **__):
         raise AssertionError("something was computed again")
 
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.stages.motion", none)
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.scoring.score", none)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.workers.work", none)
     out = study.parent / "again"
     assert asked(study, *GRID, "--holdout", "h*", "--out", str(out), "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):

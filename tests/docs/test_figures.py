@@ -122,8 +122,8 @@ def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
 
     from torchvision_dddas.cli import app
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies.axes import on_grid
-    from torchvision_dddas.evaluation.studies.goals import goal_of
+    from torchvision_dddas.evaluation.studies.goals import parse_goal
+    from torchvision_dddas.evaluation.studies.search_space import parse_grid
     from torchvision_dddas.simulation import load_scenario as load_scenario
 
     program, name, *words = command.split()
@@ -140,9 +140,9 @@ def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
     assert set(options) <= known
     values = dict(itertools.pairwise(words))
     load_config(values.get("--config"), [values["--set"]] if "--set" in values else [])
-    on_grid([value for option, value in itertools.pairwise(words) if option == "--grid"], load_config())
+    parse_grid([value for option, value in itertools.pairwise(words) if option == "--grid"], load_config())
     if "--measure" in values:
-        goal_of(values["--measure"])
+        parse_goal(values["--measure"])
     for word in words:
         if word.startswith("sim:") or (name == "simulate" and word == words[0]):
             load_scenario(word.removeprefix("sim:"))

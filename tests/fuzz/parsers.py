@@ -323,7 +323,7 @@ def _boxes_of_colours(path: Path) -> None:
 def _dataset(kind: str, path: Path) -> None:
     """What is wrong with a clip is told, and the clip left out; where none is left that counts as a refusal."""
     from torchvision_dddas.evaluation.datasets import kinds
-    from torchvision_dddas.evaluation.studies.record import Source
+    from torchvision_dddas.evaluation.studies.spec import Source
 
     folder = next(place for place in path.parents if place.name == ROOT)
     found = kinds.read(Source(kind, folder), folder.parent)

@@ -9,9 +9,9 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
-from torchvision_dddas.evaluation.studies.record import Case, Found, Results, Source, Spec, Task
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Case, Found, Results, Scored
 from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.spec import Source, Spec, Task
 
 SIZE = (160, 120)
 FRAMES = 6

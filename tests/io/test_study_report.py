@@ -25,7 +25,7 @@ from torchvision_dddas.evaluation.report.pictures import (
     matched,
 )
 from torchvision_dddas.evaluation.report.worst import MOST, boxes_at, drawn, worst_frames
-from torchvision_dddas.evaluation.studies.summary import summary
+from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite
 
 
@@ -36,7 +36,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def metrics(results):
-    return finite(summary(results))
+    return finite(summarize(results))
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_the_same_study_gives_the_same_page(text, results, metrics):
 
 def test_a_study_without_any_result_still_has_a_page(results):
     empty = replace(results, cases=tuple(case for case in results.cases if case.cause))
-    said = " ".join(Page(report(finite(summary(empty)), empty)).words)
+    said = " ".join(Page(report(finite(summarize(empty)), empty)).words)
     assert "0 clips" in said and "4x4" in said
 
 

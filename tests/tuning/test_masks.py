@@ -10,7 +10,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.family import Example, family_of, loss_of, with_loss
 from torchvision_dddas.tuning.motion import Masks, masks_of, together
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
@@ -36,7 +36,7 @@ def examples(clip: Clip) -> list[Example]:
 
 def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example]) -> None:
     """At the settings that the examples were prepared with: what comes after the hulls is then as it was."""
-    final = {s.frame.number: s.mask > 0 for s in detect_motion(opened(clip), SETTINGS, "onboard")}
+    final = {s.frame.number: s.mask > 0 for s in detect_motion(open_clip(clip), SETTINGS, "onboard")}
     assert [example.frame for example in examples] == list(range(1, 10))
     for example in examples:
         mask = masks_of(together([example.content], CPU), {}, 0.0)[0, 0] > 0.5

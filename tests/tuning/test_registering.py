@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
@@ -54,7 +54,7 @@ def test_every_labelled_frame_that_has_a_next_one_is_an_example(clip: Clip, exam
 def test_the_hard_loss_is_the_error_of_the_pipelines_registration(clip, examples, tolerance_px: float) -> None:
     settings = with_parameters(SETTINGS, {RANSAC: tolerance_px})
     engine = load_engine("onboard", settings)
-    views = [engine.prepare(frame.image) for frame in opened(clip)]
+    views = [engine.prepare(frame.image) for frame in open_clip(clip)]
     wanted = []
     for pair, example in zip(pairwise(views), examples, strict=True):
         points = example.content.points

@@ -30,8 +30,8 @@ def compare(
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.evaluation.studies.comparing import compare as beside
-    from torchvision_dddas.evaluation.studies.scored import read_scores
+    from torchvision_dddas.evaluation.studies.comparison import compare_studies as beside
+    from torchvision_dddas.evaluation.studies.storage import read_scores
     from torchvision_dddas.io.output.run_record import finite
 
     found = beside(read_scores(first), read_scores(second))

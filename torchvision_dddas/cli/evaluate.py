@@ -88,6 +88,10 @@ def evaluate(
         Path | None,
         typer.Option(metavar="DIR", help="Of a study: where results are kept. [default: in the user's cache folder]"),
     ] = None,
+    prune_cache: Annotated[
+        float | None,
+        typer.Option(metavar="DAYS", min=0, help="Of a study: afterwards remove kept results unused for so long."),
+    ] = None,
     config: Config = None,
     set_: Overrides = None,
     backend: Annotated[Backend | None, typer.Option(help="Of a study: the engine. [default: as FILE says]")] = None,
@@ -116,6 +120,7 @@ def evaluate(
     With --dataset the clips of whole data sets are run and scored; metrics.json, report.html and run.json are written.
     """
     study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
+    study["--prune-cache"] = prune_cache
     study |= {"--config": config, "--set": set_ or None, "--backend": backend}
     if dataset is not None:
         _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
@@ -131,6 +136,8 @@ def evaluate(
         )
         if not quiet:
             whole.show(results, measures, folder)
+        if prune_cache is not None:
+            whole.prune_cache(cache, prune_cache, quiet)
         whole.refuse_nothing(results)
         return
     _refuse(study, "is for a study; give --dataset FILE too")

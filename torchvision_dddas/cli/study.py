@@ -1,10 +1,9 @@
-"""`dddas evaluate --dataset`: a study of whole data sets, its tables, its report and what it cost."""
+"""`dddas evaluate --dataset`: how a study is asked for and shown."""
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +15,10 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.evaluation.studies.jobs import Event
-    from torchvision_dddas.evaluation.studies.record import Results, Spec
-    from torchvision_dddas.evaluation.studies.running import Plan
+    from torchvision_dddas.evaluation.studies.results import Results
+    from torchvision_dddas.evaluation.studies.runner import Plan
+    from torchvision_dddas.evaluation.studies.spec import Spec
 
-FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", "scores.bin", "report.html", "run.json")
 MOST_NOTES = 12
 
 
@@ -52,85 +51,13 @@ def study_into(
     cache: Path | None = None,
     clips: Sequence[str] = (),
     quiet: bool = False,
-) -> tuple["Results", dict[str, Any]]:
-    """Run a study and write it under a folder; returns its results and its measures. Raises InputError."""
-    from torchvision_dddas.evaluation.report import report
-    from torchvision_dddas.evaluation.studies.running import cache_folder, run_study
-    from torchvision_dddas.evaluation.studies.summary import summary
-    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
-    from torchvision_dddas.io.output.run_record import finite
+) -> "tuple[Results, dict[str, Any]]":
+    """Run a study, write it into a folder and show how far it is; its results and measures. Raises InputError."""
+    from torchvision_dddas.evaluation.studies.output import write_study
+    from torchvision_dddas.evaluation.studies.workers import Workers
 
-    began, place = time.perf_counter(), cache or cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        running = False
-
-        def begin(planned: "Plan") -> None:
-            nonlocal running
-            _write(folder, "run.json", {"state": "running", "study": spec.name})
-            running = True
-            begun(planned)
-
-        try:
-            with shown(quiet) as (begun, tell):
-                results = run_study(spec, base, jobs, scheduler, place, clips, tell, begin)
-            measures = summary(results)
-            _write(folder, "metrics.json", measures)
-            _write_tables(folder, measures, results)
-            write_whole(folder / "report.html", report(finite(measures), results).encode())
-            _write(folder, "run.json", _record(results, time.perf_counter() - began, place))
-        except BaseException:
-            if running:  # else nothing of an earlier study in this folder has been touched
-                with suppress(OSError):
-                    _write(folder, "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
-            raise
-    except OSError as error:
-        raise cannot_write(folder / "run.json", error) from error
-    return results, measures
-
-
-def _write(folder: Path, name: str, content: Any) -> None:
-    from torchvision_dddas.io.atomic_files import write_whole
-    from torchvision_dddas.io.output.run_record import finite
-
-    write_whole(folder / name, (json.dumps(finite(content), indent=2) + "\n").encode())
-
-
-def _write_tables(folder: Path, measures: dict[str, Any], results: "Results") -> None:
-    """The figures as tables, and what `dddas compare` needs."""
-    from torchvision_dddas.evaluation.studies.scored import ScoredCase, write_scores
-    from torchvision_dddas.evaluation.studies.tables import write_csv, write_parquet
-
-    write_csv(folder / "metrics.csv", measures)
-    write_parquet(folder, measures, results)
-    kept = [ScoredCase(case.task, case.clip.name, case.scored) for case in results.cases if case.scored is not None]
-    write_scores(folder, results.spec.name, kept)
-
-
-def _record(results: "Results", wall_s: float, cache: Path) -> dict[str, Any]:
-    """What run.json says of a study."""
-    from torchvision_dddas.evaluation.studies.costs import costs
-    from torchvision_dddas.io.output.run_record import versions
-
-    spec = results.spec
-    return {
-        "state": "complete",
-        "versions": versions(),
-        "study": {
-            "name": spec.name,
-            "tasks": spec.tasks,
-            "config": spec.config,
-            "set": spec.overrides,
-            "backend": spec.backend,
-            "interval": spec.interval,
-        },
-        **results.facts,
-        "left_out": results.left_out,
-        "cache": cache,
-        "settings": results.settings.model_dump(),
-        "seconds": {"wall": round(wall_s, 3)},
-        "costs": costs(results),
-    }
+    with Workers(jobs, scheduler) as workers, shown(quiet) as (begun, tell):
+        return write_study(folder, spec, base, workers, cache, clips, tell, begun)
 
 
 @contextmanager
@@ -208,6 +135,7 @@ def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from torchvision_dddas.cli.study_tables import tables
+    from torchvision_dddas.evaluation.studies.output import FILES
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
     for table in tables(measures):
@@ -230,3 +158,14 @@ def refuse_nothing(results: "Results") -> None:
     if all(case.cause for case in results.cases):
         case = results.cases[0]
         raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")
+
+
+def prune_cache(cache: Path | None, days: float, quiet: bool) -> None:
+    """Remove kept results that nobody has used for so many days."""
+    from torchvision_dddas.evaluation.studies.runner import cache_folder
+    from torchvision_dddas.evaluation.studies.storage import Cache
+
+    folder = cache or cache_folder()
+    count, size = Cache(folder).prune(days)
+    if not quiet:
+        typer.echo(f"{folder}: {count} results removed that were not used for {days:g} days, {size / 1e6:.1f} MB")

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +16,7 @@ from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.evaluation.studies.sweep import Trial
-    from torchvision_dddas.evaluation.studies.swept import Swept
+    from torchvision_dddas.evaluation.studies.sweep import SweepRecord, Trial
 
 MOST_SHOWN = 20  # rows of the table
 MOST_PROPOSED = 10_000
@@ -65,42 +65,52 @@ def sweep(
     """
     from torchvision_dddas.cli.study import asked, patterns
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies import axes
-    from torchvision_dddas.evaluation.studies import sweep as sweeping
-    from torchvision_dddas.evaluation.studies.goals import goal_of
-    from torchvision_dddas.evaluation.studies.swept import Swept
-    from torchvision_dddas.evaluation.studies.tried import Tried, parted
+    from torchvision_dddas.evaluation.studies import search_space
+    from torchvision_dddas.evaluation.studies.goals import parse_goal
+    from torchvision_dddas.evaluation.studies.sweep import (
+        StudyMeasure,
+        SweepRecord,
+        best,
+        check_optuna,
+        search_grid,
+        search_ranges,
+        split_clips,
+    )
+    from torchvision_dddas.evaluation.studies.workers import Workers
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
-    goal, spec = goal_of(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
+    goal, spec = parse_goal(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
     spec = replace(spec, tasks=(goal.task,))
     settings = load_config(spec.config, spec.overrides)
-    choices, ranges = axes.on_grid(grid or [], settings), axes.in_ranges(range_ or [], settings)
-    points = optuna if optuna is not None else sum(1 for _ in axes.points(choices))
+    points = search_space.parse_grid(grid or [], settings)
+    ranges = search_space.parse_ranges(range_ or [], settings)
+    count = optuna or search_space.count_points(points)
     if optuna is not None:
-        sweeping.need_optuna()
-    tuned, held = parted(spec, dataset.parent, patterns(clips, "--clips"), patterns(holdout, "--holdout"))
-    tried = Tried(spec, dataset.parent, goal, jobs, scheduler, cache, _pace(quiet))
-    search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
-    swept = Swept(out, settings, goal, search, tuned, held)
-    on_tuned = lambda parameters: tried.measured(parameters, tuned)  # noqa: E731
-    trials = (
-        sweeping.on_grid(choices, settings, on_tuned, lambda points: tried.ahead(points, tuned))
-        if optuna is None
-        else sweeping.proposed(ranges, settings, on_tuned, optuna, seed, goal.least)
-    )
-    for trial in trials:
-        swept.add(trial)
-        if not quiet:
-            print(f"{trial.number} of {points}: {_said(trial)}", file=sys.stderr, flush=True)
-    if (found := sweeping.best(swept.trials, goal.least)) is None:
-        raise InputError(f"no setting has a {goal.name}: {swept.trials[0].cause}")
-    if held:
-        tried.ahead([{}, found.parameters], held)
-    swept.choose(found, (tried.measured({}, held), tried.measured(found.parameters, held)) if held else None)
+        check_optuna()
+    tuned, held = split_clips(spec, dataset.parent, patterns(clips, "--clips"), patterns(holdout, "--holdout"))
+    asked_for: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
+    record = SweepRecord(out, settings, goal, asked_for, tuned, held)
+    with Workers(jobs, scheduler) as workers:
+        study = StudyMeasure(spec, dataset.parent, goal, workers, cache, _pace(quiet))
+        on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
+        if optuna is None:
+            trials = search_grid(points, settings, on_tuned, prepare)
+        else:
+            trials = search_ranges(ranges, settings, on_tuned, optuna, seed, goal.minimize)
+        for trial in trials:
+            record.add(trial)
+            if not quiet:
+                print(f"{trial.number} of {count}: {_said(trial)}", file=sys.stderr, flush=True)
+        if (found := best(record.trials, goal.minimize)) is None:
+            raise InputError(f"no setting has a {goal.name}: {record.trials[0].cause}")
+        on_held = None
+        if held:
+            study.prepare([{}, found.parameters], held)
+            on_held = (study.measure({}, held), study.measure(found.parameters, held))
+    record.finish(found, on_held)
     if not quiet:
-        show(swept)
+        show(record)
 
 
 def _pace(quiet: bool) -> Callable[[int, int], None]:
@@ -129,26 +139,25 @@ def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] 
         raise InputError(f"--optuna is {optuna}; wanted 1 to {MOST_PROPOSED} points")
 
 
-def show(swept: "Swept") -> None:
+def show(swept: "SweepRecord") -> None:
     """Print the best trials, what the clips held out say, and where the rest is."""
     from rich.console import Console
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.studies.sweep import ranked
-    from torchvision_dddas.evaluation.studies.swept import number
+    from torchvision_dddas.evaluation.studies.sweep import format_value, ranked
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
     parameters = list(dict.fromkeys(parameter for trial in swept.trials for parameter in trial.parameters))
-    table = Table(title=f"{swept.heading}, {'least' if swept.goal.least else 'most'} first")
+    table = Table(title=f"{swept.heading}, {'least' if swept.goal.minimize else 'most'} first")
     for column in ("trial", *parameters, swept.goal.measure):
         table.add_column(column, justify="left" if column in parameters else "right")
-    ordered = ranked(swept.trials, swept.goal.least)
+    ordered = ranked(swept.trials, swept.goal.minimize)
     shown = ordered[:MOST_SHOWN]
     if swept.trials[0] not in shown:
         shown.append(swept.trials[0])
     for trial in shown:
         cells = [_value(trial.parameters[k]) if k in trial.parameters else "as it was" for k in parameters]
-        table.add_row(str(trial.number), *cells, number(trial.value))
+        table.add_row(str(trial.number), *cells, format_value(trial.value))
     console.print(table)
     if len(ordered) > len(shown):
         console.print(f"{len(ordered) - len(shown)} more in {swept.folder / 'sweep.json'}", highlight=False)
@@ -156,19 +165,19 @@ def show(swept: "Swept") -> None:
         if trial.cause:
             console.print(f"trial {trial.number} has no value: {trial.cause}", markup=False, highlight=False)
     if swept.on_held is not None:
-        before, after = (number(value) for value, _ in swept.on_held)
+        before, after = (format_value(value) for value, _ in swept.on_held)
         names = ", ".join(swept.held)
         console.print(f"Held out ({names}): {after} with the best, {before} before.", markup=False, highlight=False)
     typer.echo(f"{swept.folder}: sweep.json, best.toml (for --config)")
 
 
 def _said(trial: "Trial") -> str:
-    from torchvision_dddas.evaluation.studies.swept import number
+    from torchvision_dddas.evaluation.studies.sweep import format_value
 
     parameters = (
         ", ".join(f"{parameter}={_value(value)}" for parameter, value in trial.parameters.items()) or "as it was"
     )
-    return f"{parameters}: {trial.cause or number(trial.value)}"
+    return f"{parameters}: {trial.cause or format_value(trial.value)}"
 
 
 def _value(value: object) -> str:

@@ -255,12 +255,12 @@ class _Tuning:
         return found
 
     def _toml(self, ready: "Prepared", found: "Descended", verdict: "Verdict | None") -> None:
-        from torchvision_dddas.evaluation.studies.sweep import as_toml
+        from torchvision_dddas.evaluation.studies.sweep import settings_toml
 
         about = [f"dddas tune: {', '.join(ready.parameters.names)} on {', '.join(ready.tuned)}, step {found.best}."]
         if verdict is not None:
             about += [f"{line}." for line in _told(verdict)]
-        self._write(TUNED, as_toml(found.settings, about))
+        self._write(TUNED, settings_toml(found.settings, about))
 
     def _record(
         self,
@@ -343,7 +343,7 @@ def show(verdict: "Verdict", folder: Path, before: Mapping[str, Any], after: Map
     from rich.table import Table
 
     console = Console() if sys.stdout.isatty() else Console(width=120)
-    table = Table(title=f"Tuned: {verdict.goal.name}, {'less' if verdict.goal.least else 'more'} is better")
+    table = Table(title=f"Tuned: {verdict.goal.name}, {'less' if verdict.goal.minimize else 'more'} is better")
     for column in ("knob", "before", "after"):
         table.add_column(column, justify="left" if column == "knob" else "right")
     for name in after:
@@ -364,11 +364,12 @@ def _told(verdict: "Verdict") -> list[str]:
 
 
 def _line(what: str, side: "Side", verdict: "Verdict") -> str:
-    from torchvision_dddas.evaluation.studies.swept import number
+    from torchvision_dddas.evaluation.studies.sweep import format_value
 
     goal = verdict.goal
-    told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {number(side.pooled[0])} -> {number(side.pooled[1])}"
-    mean = f", mean of clips {number(side.mean[0])} -> {number(side.mean[1])}" if len(side.clips) > 1 else ""
+    pooled, mean = (" -> ".join(map(format_value, pair)) for pair in (side.pooled, side.mean))
+    told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {pooled}"
+    mean = f", mean of clips {mean}" if len(side.clips) > 1 else ""
     return told + mean + (f": {side.says}" if side.says else "")
 
 

@@ -29,7 +29,7 @@ Entry = Mapping[str, Any]
 
 
 def comparison_report(found: Mapping[str, Any]) -> str:
-    """The HTML. found: as `studies.comparing.compare` has it, NaN as None."""
+    """The HTML. found: as `compare_studies` returns it, NaN as None."""
     first, second = str(found["first"]), str(found["second"])
     title = f"{first} and {second}: comparison"
     parts = [f"<h1>{escape(first)} → {escape(second)} <span>comparison</span></h1>", f'<p class="soft">{MEANING}</p>']

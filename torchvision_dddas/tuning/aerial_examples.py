@@ -12,7 +12,7 @@ from torchvision_dddas.config import AerialParameters, LandmarkParameters, Setti
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
-from torchvision_dddas.evaluation.studies.placing_score import whose_places
+from torchvision_dddas.evaluation.studies.scoring import whose_places
 from torchvision_dddas.geo import AerialLocator, Targets
 from torchvision_dddas.geo.landmark_faults import passes
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
@@ -359,11 +359,11 @@ def _given(clip: Clip) -> "AerialInput":
 
 
 def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
-    from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.evaluation.studies.stages import open_clip
     from torchvision_dddas.io.run_inputs import prepare_run
     from torchvision_dddas.pipeline import survey
 
-    source = opened(clip)
+    source = open_clip(clip)
     ready = prepare_run(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
     assert ready.watch is not None, "there are landmarks"
     for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, pictures=False):

@@ -14,8 +14,9 @@ from torch import Tensor
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Found, Task
-from torchvision_dddas.evaluation.studies.stages import find, upstream
+from torchvision_dddas.evaluation.studies.results import Found
+from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.stages import find, upstream_task
 from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 from torchvision_dddas.tuning.parameters import TUNABLE
 
@@ -146,7 +147,7 @@ def read(place: Path) -> TimeCost:
 
 
 def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
-    need = upstream(clip, task)
+    need = upstream_task(clip, task)
     before: Found | None = None if need is None else find(clip, need, settings, backend)
 
     def timed(changed: Settings) -> float:

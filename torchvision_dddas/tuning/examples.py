@@ -12,7 +12,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, TrackTable, pair
 from torchvision_dddas.evaluation.metrics.truth import Truth, labels_of
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.types import DetectionTable
 
@@ -107,7 +107,7 @@ def boxed(clip: Clip, table: TrackTable, interval: int) -> Iterator[Boxed]:
         for number in range(int(table.frame.min()), last + 1, interval):
             yield at(number, None)
         return
-    for frame in opened(clip).every(interval):
+    for frame in open_clip(clip).every(interval):
         if frame.number > last:
             return
         yield at(frame.number, frame.image)

@@ -13,10 +13,10 @@ from torch import Tensor
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.goals import Goal, check_possible, goal_of
-from torchvision_dddas.evaluation.studies.record import Spec, Task
-from torchvision_dddas.evaluation.studies.running import plan
-from torchvision_dddas.evaluation.studies.tried import parted
+from torchvision_dddas.evaluation.studies.goals import Goal, check_possible, parse_goal
+from torchvision_dddas.evaluation.studies.runner import plan_study
+from torchvision_dddas.evaluation.studies.spec import Spec, Task
+from torchvision_dddas.evaluation.studies.sweep import split_clips
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, chosen
 
 Tick = Callable[[], object]
@@ -181,14 +181,14 @@ def prepare(
     parameters = Parameters(settings, names)
     if isinstance(family, Particular):
         family.check(parameters.names, settings)
-    goal = goal_of(measure or family.measure)
+    goal = parse_goal(measure or family.measure)
     if isinstance(family, Timed):
         family = family.at(spec.interval, goal.task)
     if loss is not None:
         family = with_loss(family, loss)
     spec = replace(spec, tasks=(goal.task,))
-    tuned, held = parted(spec, base, clips, holdout)
-    seen = tuple(job.clip for job in plan(spec, base, [glob.escape(name) for name in tuned]).jobs)
+    tuned, held = split_clips(spec, base, clips, holdout)
+    seen = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)
     check_possible(goal, seen)
     examples = family.examples(seen, settings, tick)
     return Prepared(spec, base, family, parameters, seen, tuned, held, goal, examples)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.placing_score import whose_places
+from torchvision_dddas.evaluation.studies.scoring import whose_places
 from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.soft_places import gaussian_nll

@@ -33,8 +33,8 @@ from torchvision_dddas.detection.torch_engine import (
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional.soft import straight_through
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values
 from torchvision_dddas.tuning.examples import check_masks, labels_at
@@ -326,7 +326,7 @@ _NUMBER = "number of the frame"
 
 def recorded(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[Recorded]:
     """The wanted frames of a clip, in order. Raises InputError as `dddas detect` does."""
-    source = opened(clip)
+    source = open_clip(clip)
     engine = _Recorder(load_engine("onboard", settings), wanted)
     loop = MotionDetector(settings, engine, source.rate_hz)
 

@@ -16,7 +16,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.boxes import SAME, areas, iou, judged
 from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.functional.soft import step
 from torchvision_dddas.people import pyramid as scan
 from torchvision_dddas.people.boxes import body_sides, log_odds, people_of
@@ -121,7 +121,7 @@ def scored(
 
 
 def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer) -> Iterator[Example]:
-    from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.evaluation.studies.stages import open_clip
     from torchvision_dddas.people.detector import checked
 
     truth = clip.truth
@@ -129,7 +129,7 @@ def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer
         raise InputError(f"{clip.name} has no boxes of people; wanted pictures with labelled people")
     numbers = sorted(truth.boxes)
     some = {numbers[i * len(numbers) // MOST] for i in range(MOST)} if len(numbers) > MOST else set(numbers)
-    for frame in opened(clip):
+    for frame in open_clip(clip):
         if frame.number in some:
             image = checked(frame.image, f"{clip.name}, frame {frame.number}")
             true_px = np.asarray(truth.boxes[frame.number], float).reshape(-1, 4)

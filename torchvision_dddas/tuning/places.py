@@ -15,7 +15,7 @@ from torch import Tensor
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.geo.pose_estimation import EXACT_M
 from torchvision_dddas.tuning.aerial_examples import GroundFit, Look, Seen, fit_ground, joined, looks_of, of_settings
 from torchvision_dddas.tuning.family import Example, Tick

@@ -21,8 +21,8 @@ from torchvision_dddas.detection.opencv_registration import (
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Task
-from torchvision_dddas.evaluation.studies.stages import opened
+from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional import affine, homography
 from torchvision_dddas.functional.consensus import Fit, fit_to_inliers, inlier_weights, transfer_error
 from torchvision_dddas.functional.soft import step
@@ -128,7 +128,7 @@ def followed(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels: np.
 def _examples(clip: Clip, settings: Settings) -> Iterator[Example]:
     truth, engine = clip.truth, load_engine("onboard", settings)
     assert truth is not None, "asked for clips with masks alone"
-    frames: Iterator[tuple[Frame, Frame]] = pairwise(opened(clip))
+    frames: Iterator[tuple[Frame, Frame]] = pairwise(open_clip(clip))
     for frame, later in frames:
         if frame.number not in truth.masks or later.number != frame.number + 1:
             continue

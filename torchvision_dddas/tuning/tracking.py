@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import kalman
@@ -228,10 +228,10 @@ def _looks(clip: Clip, boxes: Owned, settings: Settings, interval: int) -> Itera
 
 
 def _size(clip: Clip, boxes: Owned) -> tuple[float, float]:
-    from torchvision_dddas.evaluation.studies.stages import opened
+    from torchvision_dddas.evaluation.studies.stages import open_clip
 
     if clip.pictures:
-        width, height = opened(clip).size
+        width, height = open_clip(clip).size
         return float(width), float(height)
     return boxes.size if boxes.size is not None else (1e6, 1e6)
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.evaluation.studies.comparing import LEVEL, compare
-from torchvision_dddas.evaluation.studies.goals import Goal, value_of
+from torchvision_dddas.evaluation.studies.comparison import LEVEL, compare_studies
+from torchvision_dddas.evaluation.studies.goals import Goal, goal_value
 from torchvision_dddas.evaluation.studies.jobs import Event
-from torchvision_dddas.evaluation.studies.record import Case, Spec
-from torchvision_dddas.evaluation.studies.running import Plan, run_study
-from torchvision_dddas.evaluation.studies.scored import ScoredCase, ScoredStudy
-from torchvision_dddas.evaluation.studies.sweep import written
+from torchvision_dddas.evaluation.studies.results import Case, ScoredCase, ScoredStudy
+from torchvision_dddas.evaluation.studies.runner import Plan, run_study
+from torchvision_dddas.evaluation.studies.spec import Spec
+from torchvision_dddas.evaluation.studies.sweep import toml_value
+from torchvision_dddas.evaluation.studies.workers import Workers
 
 BEFORE, AFTER = "before", "after"
 
@@ -27,7 +28,7 @@ class Side:
     """One set of clips. pooled, mean: the goal before and after, over all counts and over the clips' values.
 
     says: of the pooled goal, the one question that was asked: better or worse beyond noise, or not. changes: every
-    measure and clip, as `comparing.compare` tells it, corrected for all of them; None where nothing can be compared.
+    measure and clip, as `compare_studies` tells it, corrected for all of them; None where nothing can be compared.
     frame_ms: what a frame took before and after, where it was computed. notes: clips without a result, and why.
     """
 
@@ -51,7 +52,7 @@ class Verdict:
     def told(self) -> dict[str, Any]:
         """As JSON has it."""
         sides = {"tuned": _told(self.tuned), "held_out": None if self.held is None else _told(self.held)}
-        return {"measure": self.goal.name, "better": "less" if self.goal.least else "more", **sides}
+        return {"measure": self.goal.name, "better": "less" if self.goal.minimize else "more", **sides}
 
 
 def judge(
@@ -67,16 +68,17 @@ def judge(
 ) -> Verdict:
     """Run a study as it is and with other values of some parameters. tuned, held: names of clips.
 
-    spec, base, jobs, cache: as `running.run_study` takes them. Raises InputError as it does, and where no clip can
-    have the goal's measure.
+    spec, base, cache: as `run_study` takes them; jobs: as `Workers`. Raises InputError as they do, and where no clip
+    can have the goal's measure.
     """
-    changed = tuple(f"{name}={written(value)}" for name, value in parameters.items())
+    changed = tuple(f"{name}={toml_value(value)}" for name, value in parameters.items())
     specs = [replace(spec, tasks=(goal.task,), overrides=(*spec.overrides, *more)) for more in ((), changed)]
     names = [glob.escape(name) for name in (*tuned, *held)]
     cases = []
-    for one in specs:
-        with shown() as (begun, tell):
-            cases.append(run_study(one, base, jobs, None, cache, names, tell, begun).cases)
+    with Workers(jobs) as workers:
+        for one in specs:
+            with shown() as (begun, tell):
+                cases.append(run_study(one, base, workers, cache, names, tell, begun).cases)
     sides = [_side(goal, _of(cases[0], clips), _of(cases[1], clips), clips) for clips in (tuned, held) if clips]
     return Verdict(goal, sides[0], sides[1] if len(sides) > 1 else None)
 
@@ -104,7 +106,7 @@ def _side(goal: Goal, before: Sequence[Case], after: Sequence[Case], clips: Sequ
         for when, cases in zip((BEFORE, AFTER), pairs, strict=True)
     ]
     took = [_frame_ms(cases) for cases in pairs]
-    changes = compare(*studies) if both else None
+    changes = compare_studies(*studies) if both else None
     return Side(
         tuple(clips),
         (pooled[0], pooled[1]),
@@ -117,12 +119,12 @@ def _side(goal: Goal, before: Sequence[Case], after: Sequence[Case], clips: Sequ
 
 
 def _says(goal: Goal, changes: Mapping[str, Any] | None) -> str:
-    """As `comparing` says it, but not corrected for measures that nobody asked about."""
+    """As `compare_studies` says it, but not corrected for measures that nobody asked about."""
     entry = (changes or {"tasks": {}})["tasks"].get(goal.task, {"pooled": {}})["pooled"].get(goal.group, {})
     entry = entry.get(goal.measure)
     if entry is None or not entry["change"]:
         return "the same" if entry else ""
-    word = "better" if (entry["change"] < 0) == goal.least else "worse"
+    word = "better" if (entry["change"] < 0) == goal.minimize else "worse"
     ways = [(over, way) for over in ("over_clips", "over_frames") if (way := entry.get(over)) is not None]
     for over, way in ways:
         if way["p"] < LEVEL:
@@ -131,7 +133,7 @@ def _says(goal: Goal, changes: Mapping[str, Any] | None) -> str:
 
 
 def _value(goal: Goal, cases: Sequence[Case]) -> float:
-    return value_of(goal, cases)[0]
+    return goal_value(goal, cases)[0]
 
 
 def _frame_ms(cases: Sequence[Case]) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
-from torchvision_dddas.evaluation.studies.record import Source
+from torchvision_dddas.evaluation.studies.spec import Source
 
 SIZE = (32, 24)
 """Of pictures and masks, px."""

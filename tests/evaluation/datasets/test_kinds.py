@@ -67,7 +67,7 @@ def test_clips_come_in_natural_order(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_relative_to_the_base(tmp_path: Path) -> None:
-    from torchvision_dddas.evaluation.studies.record import Source
+    from torchvision_dddas.evaluation.studies.spec import Source
 
     make(tmp_path / "data", "cars1")
     found = kinds.read(Source("folder", Path("../data")), tmp_path / "studies")

@@ -9,8 +9,8 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.studies.record import Case, Found, Results, Spec, Task
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Case, Found, Results, Scored
+from torchvision_dddas.evaluation.studies.spec import Spec, Task
 
 SIZE = (60, 80)
 

@@ -6,9 +6,9 @@ import pytest
 
 from tests.evaluation.studies.scored_clips import masked, targeted, tracked
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.goals import OF_TASK, check_possible, goal_of, groups_of
+from torchvision_dddas.evaluation.studies.goals import OF_TASK, check_possible, parse_goal, possible_groups
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures, names
+from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measure_names, measures
 
 
 @pytest.mark.parametrize(
@@ -17,16 +17,16 @@ from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures, n
 def test_the_names_of_measures_are_those_that_scored_clips_have(tmp_path, make, task) -> None:
     clip, found = make(tmp_path / "clip", 0)
     having = measures([score(clip, task, found)])
-    assert set(having) == set(groups_of(clip, task)) <= set(OF_TASK[task])
+    assert set(having) == set(possible_groups(clip, task)) <= set(OF_TASK[task])
     for group, told in having.items():
-        assert set(names(group)) == {name for name in told if not name.startswith("n_") or name in BETTER_LOW}
+        assert set(measure_names(group)) == {name for name in told if not name.startswith("n_") or name in BETTER_LOW}
 
 
 def test_every_task_has_a_group_and_every_group_a_measure() -> None:
     for task, groups in OF_TASK.items():
         for group in groups:
-            assert names(group)
-            assert goal_of(f"{task}.{group}.{names(group)[0]}").group == group
+            assert measure_names(group)
+            assert parse_goal(f"{task}.{group}.{measure_names(group)[0]}").group == group
 
 
 @pytest.mark.parametrize(
@@ -40,15 +40,15 @@ def test_every_task_has_a_group_and_every_group_a_measure() -> None:
 )
 def test_a_measure_that_no_clip_can_have_is_refused_by_its_name(asked, said) -> None:
     with pytest.raises(InputError, match=said):
-        goal_of(asked)
+        parse_goal(asked)
 
 
 def test_a_measure_that_the_truth_of_these_clips_does_not_allow_is_told(tmp_path) -> None:
     clip, _ = masked(tmp_path / "clip", 0)
-    check_possible(goal_of("motion.pixels.f"), [clip])
+    check_possible(parse_goal("motion.pixels.f"), [clip])
     with pytest.raises(InputError, match=r"no clip has truth for motion\.target\.hit; .* motion\.pixels"):
-        check_possible(goal_of("motion.target.hit"), [clip])
+        check_possible(parse_goal("motion.target.hit"), [clip])
     still = replace(clip, still=True)
-    check_possible(goal_of("motion.still.alarmed"), [clip, still])
+    check_possible(parse_goal("motion.still.alarmed"), [clip, still])
     with pytest.raises(InputError, match=r"there is truth for motion\.still$"):
-        check_possible(goal_of("motion.pixels.f"), [still])
+        check_possible(parse_goal("motion.pixels.f"), [still])

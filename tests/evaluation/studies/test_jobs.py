@@ -1,124 +1,132 @@
-"""Workers share jobs: what they find does not depend on how many there are, and one that dies costs its clip's time."""
+"""What is kept is not computed again; a change computes again what depends on it, and nothing else."""
 
-import os
-import select
-import signal
-import subprocess
-import sys
-import textwrap
-import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.evaluation.studies import world
-from torchvision_dddas.evaluation.studies.cache import Cache
-from torchvision_dddas.evaluation.studies.jobs import TRIES, share
-from torchvision_dddas.evaluation.studies.running import plan
-from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.evaluation.studies.worker import LIMITS
+from torchvision_dddas.config import load_config
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.studies import jobs
+from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
+from torchvision_dddas.evaluation.studies.jobs import FrameCounter, Job, kept, make_keys, work
+from torchvision_dddas.evaluation.studies.spec import Source, Task
+from torchvision_dddas.evaluation.studies.storage import Cache
 
-linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds workers by /proc")
-
-
-@pytest.fixture
-def jobs(tmp_path):
-    return plan(read_spec(world.three(tmp_path / "clips")), tmp_path).jobs
+TASKS: tuple[Task, ...] = ("motion", "tracking", "association")
+ALL = ["motion", "motion: score", "tracking", "tracking: score", "association", "association: score"]
 
 
-def ended(jobs, workers, cache):
-    return {event.job.clip.name: event.done for event in share(jobs, workers, cache) if event.done is not None}
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A cache in which all of a clip is kept, and the clip."""
+    place = tmp_path_factory.mktemp("data")
+    world.followed(place / "clips", "tracks", 2)
+    assert computed(place, job_of(place)) == ALL
+    return place
 
 
-def contents(done, cache):
-    """All that was scored, as bytes."""
-    return {name: [Cache(cache).content(d.scored) for d in each] for name, each in done.items()}
+def job_of(place, *overrides, interval=1):
+    (clip,) = read(Source("folder", place / "clips"), Path()).clips
+    return Job(0, clip, TASKS, load_config(None, overrides), "onboard", interval)
 
 
-def test_results_depend_neither_on_the_number_of_workers_nor_on_the_order(jobs, tmp_path) -> None:
-    one = ended(jobs, 1, tmp_path / "one")
-    two = ended(jobs[::-1], 2, tmp_path / "two")
-    assert all(d.cause == "" and d.computed for each in one.values() for d in each)
-    assert two == one
-    assert contents(two, tmp_path / "two") == contents(one, tmp_path / "one")
-    assert None not in contents(one, tmp_path / "one")["tracks"]
+def do(place, job, cache=None):
+    return work(job, make_keys(job, FileDigests()), cache or Cache(place / "cache"))
 
 
-def workers_of(parent: int) -> list[int]:
-    """The worker processes that a process started."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            ppid = int(stat.read_text().rpartition(")")[2].split()[1])
-            command = (stat.parent / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if ppid == parent and b"torchvision_dddas.evaluation.studies.worker" in command:
-            found.append(int(stat.parent.name))
-    return found
+def computed(place, job):
+    done = do(place, job)
+    assert [d.cause for d in done] == [""] * len(done)
+    return [stage for d in done for stage in d.computed]
 
 
-class Trap:
-    """A picture that a worker waits for, and is killed while it does."""
-
-    def __init__(self, picture: Path, times: int) -> None:
-        self.content, self.picture, self.times = picture.read_bytes(), picture, times
-        picture.unlink()
-        os.mkfifo(picture)
-        self.thread = threading.Thread(target=self.run, daemon=True)
-        self.thread.start()
-
-    def run(self) -> None:
-        for k in range(self.times):
-            with self.picture.open("wb"):  # goes on once somebody reads
-                if k + 1 == self.times < TRIES:
-                    self.picture.unlink()
-                    self.picture.write_bytes(self.content)
-                (worker,) = workers_of(os.getpid())
-                end = os.pidfd_open(worker)
-                os.kill(worker, signal.SIGKILL)
-                select.select([end], [], [])  # until it is gone, and does not read any more
-                os.close(end)
+@pytest.mark.parametrize(
+    ("change", "again"),
+    [
+        ("difference.threshold=4.5", ALL[:4]),
+        ("track.memory_frames=9", ALL[2:]),
+        pytest.param("registration.keypoints=400", ALL, marks=pytest.mark.slow),
+        pytest.param("paper.window=2", ALL[2:], marks=pytest.mark.slow),
+        ("people.search=regions", []),
+        ("live.calm_s=9.0", []),
+    ],
+)
+def test_a_changed_parameter_computes_again_what_depends_on_it_and_nothing_else(folder, change, again) -> None:
+    assert computed(folder, job_of(folder, change)) == again
 
 
-@linux
-def test_a_killed_worker_costs_its_clip_s_time_only(jobs, tmp_path) -> None:
-    wanted = ended(jobs, 1, tmp_path / "untroubled")
-    by_name = {job.clip.name: job for job in jobs}
-    trap = Trap(by_name["tracks"].clip.pictures[4], times=1)
-    events = list(share([by_name["masks"], by_name["tracks"], by_name["table"]], 1, tmp_path / "cache"))
-    trap.thread.join()
-    done = {event.job.clip.name: event.done for event in events if event.done is not None}
-    notes = [event.note for event in events if event.note]
-    assert notes == ["tracks: its worker was killed (SIGKILL); it is tried again"]
-    assert contents(done, tmp_path / "cache") == contents(wanted, tmp_path / "untroubled")
-    assert [event.job.clip.name for event in events if event.done is not None] == ["masks", "tracks", "table"]
+def test_a_changed_interval_leaves_what_moves(folder) -> None:
+    """Motion is scored by the interval's key too, which costs nothing worth saving."""
+    stages = computed(folder, job_of(folder, interval=2))
+    assert [stage for stage in stages if "score" not in stage] == ["tracking", "association"]
 
 
-@linux
-def test_a_clip_that_always_kills_its_worker_is_left_out_and_the_others_go_on(jobs, tmp_path) -> None:
-    by_name = {job.clip.name: job for job in jobs}
-    trap = Trap(by_name["tracks"].clip.pictures[4], times=TRIES)
-    done = ended([by_name["tracks"], by_name["table"]], 1, tmp_path / "cache")
-    trap.thread.join()
-    assert all(f"was killed (SIGKILL), {TRIES} times" in d.cause for d in done["tracks"])
-    assert all(d.cause == "" for d in done["table"])
+def test_a_clip_is_known_by_its_content_not_by_its_place_or_name(folder, tmp_path) -> None:
+    world.followed(tmp_path / "clips", "renamed", 2)
+    (clip,) = read(Source("folder", tmp_path / "clips"), Path()).clips
+    assert computed(folder, replace(job_of(folder), clip=clip)) == []
+    pictures = sorted((tmp_path / "clips" / "renamed" / "frames").iterdir())
+    pictures[1].write_bytes(pictures[2].read_bytes())
+    assert computed(folder, replace(job_of(folder), clip=clip)) == ALL
 
 
-@linux
-def test_leaving_early_ends_the_workers(jobs, tmp_path) -> None:
-    events = share(jobs, 2, tmp_path / "cache")
-    next(events)
-    events.close()
-    assert workers_of(os.getpid()) == []
+def test_a_changed_truth_scores_again_and_finds_again_only_what_was_made_of_it(folder) -> None:
+    job = job_of(folder)
+    tracks = job.clip.truth.tracks
+    fewer = replace(job.clip.truth, tracks=tracks.at(tracks.frame != 2))
+    again = computed(folder, replace(job, clip=replace(job.clip, truth=fewer)))
+    assert again == ["motion: score", "tracking: score", "association", "association: score"]
 
 
-def test_a_worker_runs_the_libraries_on_one_thread() -> None:
-    script = """
-        import os
-        from torchvision_dddas.evaluation.studies.worker import LIMITS, one_thread
-        one_thread("onboard")
-        import cv2
-        assert cv2.getNumThreads() == 1 and all(os.environ[name] == value for name, value in LIMITS.items())
-    """
-    subprocess.run([sys.executable, "-c", textwrap.dedent(script)], env={**os.environ, **LIMITS}, check=True)
+def test_other_code_is_another_key(folder, monkeypatch) -> None:
+    job, files = job_of(folder), FileDigests()
+    before = make_keys(job, files)
+    monkeypatch.setattr(jobs, "code_digest", lambda function, engine="": "another")
+    after = make_keys(job, files)
+    for task in TASKS:
+        assert before.found[task] != after.found[task] and before.scored[task] != after.scored[task]
+
+
+def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
+    cache, job = Cache(folder / "cache"), job_of(folder)
+    keys = make_keys(job, FileDigests())
+    assert kept(job, keys, cache) == do(folder, job)
+    cache.path(keys.found["tracking"]).write_bytes(b"damaged")
+    assert kept(job, keys, cache) is None
+    assert [stage for d in do(folder, job, cache) for stage in d.computed] == ["tracking"]
+    assert len(cache.notes) == 1 and "computed again" in cache.notes[0]
+
+
+def test_bad_input_of_one_task_leaves_the_others(folder) -> None:
+    job = job_of(folder)
+    far = job.clip.truth.tracks._replace(frame=job.clip.truth.tracks.frame + 100)
+    done = do(folder, replace(job, clip=replace(job.clip, truth=replace(job.clip.truth, tracks=far))))
+    assert done[0].cause == "" and "goes on to frame" in done[2].cause
+
+
+def test_a_file_that_is_gone_is_the_cause_of_every_task_that_reads_it(folder, tmp_path) -> None:
+    world.followed(tmp_path / "clips", "tracks", 2)
+    job = job_of(tmp_path)
+    job.clip.pictures[3].unlink()
+    assert all("cannot be read" in d.cause for d in do(folder, job))
+
+
+def test_a_fault_of_the_program_is_a_cause_with_its_trace(folder, tmp_path, monkeypatch) -> None:
+    def broken(*given, **more):
+        raise KeyError("x")
+
+    monkeypatch.setattr(jobs, "find", broken)
+    done = do(tmp_path, job_of(folder))
+    assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
+
+
+def test_frames_are_told_in_groups_and_all_of_them(monkeypatch) -> None:
+    told: list[int] = []
+    counter = FrameCounter(told.append)
+    for _ in range(5):
+        counter()
+    counter.flush()
+    counter.flush()
+    assert told == [5]

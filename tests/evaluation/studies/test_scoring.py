@@ -16,10 +16,11 @@ from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.figures import figures
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, Truth
-from torchvision_dddas.evaluation.studies.record import Source, Task
-from torchvision_dddas.evaluation.studies.scoring import as_written, score
+from torchvision_dddas.evaluation.studies.results import round_as_written
+from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.spec import Source, Task
 from torchvision_dddas.evaluation.studies.stages import find
-from torchvision_dddas.evaluation.studies.stored import packed, unpacked
+from torchvision_dddas.evaluation.studies.storage import pack, unpack
 from torchvision_dddas.geometry import lonlat
 
 
@@ -149,13 +150,13 @@ def test_boxes_are_rounded_as_their_text_is():
     rng = np.random.default_rng(0)
     boxes = np.concatenate([rng.uniform(-50, 2000, (500, 4)), rng.integers(-5000, 90000, (500, 4)) / 1000 + 0.005])
     wanted = [[float(f"{v:.2f}") for v in row] for row in boxes.tolist()]
-    assert np.array_equal(as_written(boxes), wanted)
+    assert np.array_equal(round_as_written(boxes), wanted)
 
 
 def test_scores_come_back_from_the_cache_as_they_were(tmp_path):
     clip, found = tracked(tmp_path / "clip")
     one = score(clip, "tracking", found)
-    again = unpacked(packed(one))
+    again = unpack(pack(one))
     assert figures(again.counts) == figures(one.counts)
     assert np.array_equal(again.per_frame["tracks"]["tp"], one.per_frame["tracks"]["tp"])
 

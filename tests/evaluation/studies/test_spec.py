@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.record import Source, Spec
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.spec import Source, Spec, read_spec
 
 SET = '[[dataset]]\nkind = "bms"\nfolder = "data"\n'
 
@@ -59,22 +58,22 @@ def test_everything_said(tmp_path: Path) -> None:
         ("[dataset]\nkind = 'bms'\nfolder = 'x'", "names no data set; wanted [[dataset]]"),
         ("name = 'a", "is not valid TOML"),
         ("task = ['motion']\n" + SET, "has no key 'task'; wanted name, tasks, config, set, backend, interval, dataset"),
-        ("tasks = ['flying']\n" + SET, "'flying' is no task; wanted some of motion, tracking, association, people"),
-        ("tasks = 'motion'\n" + SET, "tasks = 'motion' will not do; wanted a list of texts"),
-        ("set = [1]\n" + SET, "set = [1] will not do; wanted a list of texts"),
-        ("backend = 'gpu'\n" + SET, "backend = 'gpu' will not do; wanted one of auto, torch, onboard"),
-        ("interval = 0\n" + SET, "interval = 0 will not do; wanted a whole number of frames, 1 to 1000"),
-        ("interval = true\n" + SET, "interval = True will not do"),
-        ("interval = 1.5\n" + SET, "interval = 1.5 will not do"),
-        ("name = 3\n" + SET, "name = 3 will not do; wanted a text"),
-        ("name = '../up'\n" + SET, "name = '../up' will not do; wanted letters, digits, blanks"),
+        ("tasks = ['flying']\n" + SET, "tasks must be some of motion, tracking, association, people"),
+        ("tasks = 'motion'\n" + SET, "tasks must be a list of texts, got 'motion'"),
+        ("set = [1]\n" + SET, "set must be a list of texts, got [1]"),
+        ("backend = 'gpu'\n" + SET, "backend must be one of auto, torch, onboard, got 'gpu'"),
+        ("interval = 0\n" + SET, "interval must be a whole number of frames from 1 to 1000, got 0"),
+        ("interval = true\n" + SET, "1000, got True"),
+        ("interval = 1.5\n" + SET, "1000, got 1.5"),
+        ("name = 3\n" + SET, "name must be a text, got 3"),
+        ("name = '../up'\n" + SET, "name must consist of letters, digits, blanks"),
         ("[[dataset]]\nfolder = 'x'", "data set 1 has no kind; wanted kind = one of folder, bms"),
         (SET + "[[dataset]]\nkind = 'bms'", "data set 2 has no folder; wanted kind = one of folder, bms"),
         (SET + "[[dataset]]\nkind = 'imagenet'\nfolder = 'x'", "data set 2: 'imagenet' is no kind of data set; wanted"),
-        ("[[dataset]]\nkind = 'bms'\nfolder = ''", "data set 1: folder is empty; wanted where the data set lies"),
-        ("[[dataset]]\nkind = 'bms'\nfolder = 3", "data set 1: folder = 3 will not do; wanted a text"),
+        ("[[dataset]]\nkind = 'bms'\nfolder = ''", "data set 1 has no folder"),
+        ("[[dataset]]\nkind = 'bms'\nfolder = 3", "data set 1: folder must be a text, got 3"),
         (SET + "clips = []", "data set 1: clips is empty; wanted patterns of names"),
-        (SET + "clips = 'cars*'", "data set 1: clips = 'cars*' will not do; wanted a list of texts"),
+        (SET + "clips = 'cars*'", "data set 1: clips must be a list of texts, got 'cars*'"),
     ],
 )
 def test_what_will_not_do_is_one_line_that_names_the_file(tmp_path: Path, content: str, line: str) -> None:

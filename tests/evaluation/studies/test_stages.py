@@ -11,8 +11,16 @@ from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.studies.record import Source
-from torchvision_dddas.evaluation.studies.stages import KNOBS, allowed, find, narrowed, opened, scenes_again, upstream
+from torchvision_dddas.evaluation.studies.spec import Source
+from torchvision_dddas.evaluation.studies.stages import (
+    PARAMETER_GROUPS,
+    allowed_tasks,
+    find,
+    narrow_settings,
+    open_clip,
+    replay_scenes,
+    upstream_task,
+)
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.tracking import track_scenes
 
@@ -26,20 +34,20 @@ def clips(tmp_path_factory):
 
 def found_in(clip, task, settings=None, interval=1):
     settings = settings or load_config()
-    need = upstream(clip, task)
+    need = upstream_task(clip, task)
     before = None if need is None else find(clip, need, settings)
     return find(clip, task, settings, interval=interval, before=before)
 
 
 def test_a_clip_allows_what_its_pictures_and_truth_tell(clips) -> None:
-    assert allowed(clips["masks"]) == ("motion",)
-    assert allowed(clips["tracks"]) == ("motion", "tracking", "association")
-    assert allowed(clips["table"]) == ("tracking", "association")
+    assert allowed_tasks(clips["masks"]) == ("motion",)
+    assert allowed_tasks(clips["tracks"]) == ("motion", "tracking", "association")
+    assert allowed_tasks(clips["table"]) == ("tracking", "association")
 
 
 def test_motion_is_what_the_loop_finds(clips) -> None:
     clip, settings = clips["masks"], load_config()
-    scenes = list(detect_motion(opened(clip), settings, "onboard"))
+    scenes = list(detect_motion(open_clip(clip), settings, "onboard"))
     found = find(clip, "motion", settings)
     assert found.looked.tolist() == [scene.frame.number for scene in scenes]
     assert len(found.frame) > 0
@@ -62,7 +70,7 @@ def test_masks_are_kept_of_frames_that_the_truth_labels_alone(clips) -> None:
 @pytest.mark.parametrize("interval", [1, 2])
 def test_tracks_of_what_was_kept_are_those_of_a_run_of_the_clip(clips, interval) -> None:
     clip, settings = clips["tracks"], load_config()
-    source = opened(clip)
+    source = open_clip(clip)
     scenes = detect_motion(source, settings, "onboard")
     wanted = list(track_scenes(scenes, settings, interval, source.size))
     found = found_in(clip, "tracking", settings, interval)
@@ -77,11 +85,11 @@ def test_a_picture_that_cannot_be_read_stays_out_of_the_tracks_too(clips, tmp_pa
     (clip,) = read(Source("folder", tmp_path / "clips"), Path()).clips
     clip.pictures[3].write_bytes(b"no picture")
     settings = load_config()
-    source = opened(clip)
+    source = open_clip(clip)
     scenes = list(detect_motion(source, settings, "onboard"))
     found = find(clip, "motion", settings)
     assert any("could not be decoded" in note for note in found.notes)
-    for scene, again in zip(scenes, scenes_again(clip, found), strict=True):
+    for scene, again in zip(scenes, replay_scenes(clip, found), strict=True):
         assert (scene.frame.image == again.frame.image).all() and scene.frame.number == again.frame.number
         assert np.array_equal(scene.detections.middle_px, again.detections.middle_px, equal_nan=True)
         reliable = scene.step is not None and scene.step.reliable
@@ -127,17 +135,17 @@ def test_a_stage_looks_at_no_settings_but_those_in_its_key(clips, monkeypatch, t
     from torchvision_dddas.evaluation.studies import stages
 
     clip, settings = clips["tracks"], load_config(None, [f"track.mode={mode}"])
-    need = upstream(clip, task)
+    need = upstream_task(clip, task)
     before = None if need is None else find(clip, need, settings)
-    monkeypatch.setattr(stages, "narrowed", lambda settings, task: Watched.model_validate(settings.model_dump()))
+    monkeypatch.setattr(stages, "narrow_settings", lambda settings, task: Watched.model_validate(settings.model_dump()))
     find(clip, task, settings, before=before)
     LOOKED.clear()
     find(clip, task, settings, before=before)
-    assert set(KNOBS[task]) >= LOOKED
+    assert set(PARAMETER_GROUPS[task]) >= LOOKED
 
 
 def test_a_stage_is_given_the_defaults_of_other_groups() -> None:
     settings = load_config(None, ["track.memory_frames=7", "difference.threshold=4.0"])
-    assert narrowed(settings, "motion").track == Settings().track
-    assert narrowed(settings, "motion").difference.threshold == 4.0
-    assert narrowed(settings, "association").track.memory_frames == 7
+    assert narrow_settings(settings, "motion").track == Settings().track
+    assert narrow_settings(settings, "motion").difference.threshold == 4.0
+    assert narrow_settings(settings, "association").track.memory_frames == 7

@@ -1,4 +1,4 @@
-"""Sweeps over a measure that is known in closed form."""
+"""Sweeps over a measure that is known in closed form, and what they search."""
 
 import math
 
@@ -6,10 +6,18 @@ import pytest
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.axes import in_ranges
-from torchvision_dddas.evaluation.studies.axes import on_grid as grid_axes
-from torchvision_dddas.evaluation.studies.sweep import AHEAD, Trial, as_toml, on_grid, proposed, ranked
-from torchvision_dddas.evaluation.studies.sweep import best as best_of
+from torchvision_dddas.evaluation.studies import sweep
+from torchvision_dddas.evaluation.studies.search_space import Choice, Range, count_points, parse_grid, parse_ranges
+from torchvision_dddas.evaluation.studies.sweep import (
+    AHEAD,
+    Trial,
+    best,
+    ranked,
+    search_grid,
+    search_ranges,
+    settings_toml,
+    toml_value,
+)
 
 NOW = Settings()
 
@@ -21,97 +29,133 @@ def hill(parameters) -> tuple[float, str]:
     return 1 - abs(parameters.get("difference.threshold", 100.0) - 14) / 100, ""
 
 
-def best(trials: list[Trial], least: bool) -> Trial:
-    found = best_of(trials, least)
-    assert found is not None
-    return found
+def on_grid(*texts, **how) -> list[Trial]:
+    return list(search_grid(parse_grid(texts, NOW), NOW, how.pop("measure", hill), **how))
 
 
-def threshold(trial: Trial) -> float:
-    """NaN for the settings as they were."""
-    value = trial.parameters.get("difference.threshold", math.nan)
-    assert isinstance(value, float)
-    return value
-
-
-def on(texts, ahead=lambda points: None) -> list[Trial]:
-    return list(on_grid(grid_axes(texts, NOW), NOW, hill, ahead))
-
-
-def drawn(count: int = 12, seed: int = 0, least: bool = False, texts=("difference.threshold=5:40",)) -> list[Trial]:
+def proposed(*texts, count=12, seed=0, minimize=False) -> list[Trial]:
     pytest.importorskip("optuna")
-    return list(proposed(in_ranges(texts, NOW), NOW, hill, count, seed, least))
+    return list(
+        search_ranges(parse_ranges(texts or ("difference.threshold=5:40",), NOW), NOW, hill, count, seed, minimize)
+    )
 
 
-def test_the_settings_as_they_are_come_first_and_compete() -> None:
-    trials = on(["difference.threshold=10,15,20"])
+def test_axes_have_the_types_of_the_settings_and_no_value_twice() -> None:
+    grid = ["difference.threshold=10, 9,9.0", "refine.on=true,false", "difference.near_frames=[1],[1,2]"]
+    axes = parse_grid([*grid, "difference.kind=normalized,to_reference"], NOW)
+    assert axes == [
+        Choice("difference.threshold", (10.0, 9.0)),
+        Choice("refine.on", (True, False)),
+        Choice("difference.near_frames", ((1,), (1, 2))),
+        Choice("difference.kind", ("normalized", "to_reference")),
+    ]
+    assert count_points(axes) == 16
+    ranges = ["difference.threshold=8:30", "difference.blur_px=3:9", "small.gap_frames=2:20:log"]
+    assert parse_ranges([*ranges, "refine.on=true,false"], NOW) == [
+        Range("difference.threshold", 8.0, 30.0),
+        Range("difference.blur_px", 3, 9, step=2),
+        Range("small.gap_frames", 2, 20, step=1, log=True),
+        Choice("refine.on", (True, False)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("parse", "text", "said"),
+    [
+        (parse_grid, "difference.threshold", "is no axis of a sweep"),
+        (parse_grid, "difference.threshold=", "is no axis of a sweep"),
+        (parse_grid, "difference.threshold=,", "has no values"),
+        (parse_grid, "difference.treshold=10", "did you mean difference.threshold"),
+        (parse_grid, "difference.threshold=10,-1", "0.1 to 255"),
+        (parse_grid, "difference.threshold=low", "0.1 to 255"),
+        (parse_grid, "difference.kind=normalised", "normalized or to_reference"),
+        (parse_ranges, "difference.threshold=30:8", "the lower end must come first"),
+        (parse_ranges, "difference.threshold=8:many", "must be numbers"),
+        (parse_ranges, "difference.threshold=8:300", "0.1 to 255"),
+        (parse_ranges, "difference.threshold=8:30:linear", "low:high:log"),
+        (parse_ranges, "track.speed_weight=0:2:log", "unknown parameter"),
+        (parse_ranges, "difference.peak=0:2:log", "above 0"),
+        (parse_ranges, "difference.blur_px=4:9", "odd"),
+        (parse_ranges, "difference.blur_px=3:9:log", "leave out :log"),
+        (parse_ranges, "morphology.erode_px=1.5:9", "whole numbers, got 1.5"),
+        (parse_ranges, "difference.kind=1:2", "no number"),
+    ],
+)
+def test_a_bad_axis_is_refused_in_one_line(parse, text, said) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        parse([text], NOW)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_grid_of_more_points_than_anyone_waits_for_is_refused() -> None:
+    many = ",".join(str(k) for k in range(50, 250))
+    with pytest.raises(InputError, match="got 40000"):
+        parse_grid([f"registration.keypoints={many}", f"registration.hypotheses={many}"], NOW)
+
+
+def test_a_parameter_has_one_axis() -> None:
+    with pytest.raises(InputError, match="given twice"):
+        parse_grid(["refine.on=true", "refine.on=false"], NOW)
+
+
+def test_a_grid_is_measured_in_order_after_the_settings_as_they_are() -> None:
+    trials = on_grid("difference.threshold=10,15,20", "morphology.erode_px=3,1")
+    assert [trial.number for trial in trials] == list(range(7))
     assert trials[0].parameters == {} and trials[0].value == pytest.approx(0.14)
-    assert best(trials, least=False).parameters == {"difference.threshold": 15.0}
-    assert best(trials, least=True).number == 0
+    assert [tuple(trial.parameters.values()) for trial in trials[1:4]] == [(10.0, 3), (10.0, 1), (15.0, 3)]
+    found = best(trials, minimize=False)
+    assert found is not None and found.number == 3  # of equal points the first
+    assert best(trials, minimize=True) == trials[0]
 
 
 def test_a_point_without_a_value_is_last_and_never_the_best() -> None:
-    trials = on(["difference.threshold=14", "difference.blur_px=7,9"])
-    assert best(trials, least=False).number == 1
-    assert ranked(trials, least=False)[-1].cause == "the clip broke off"
+    trials = on_grid("difference.threshold=14", "difference.blur_px=7,9")
+    assert ranked(trials, minimize=False)[-1].cause == "the clip broke off"
+    assert best([Trial(0, {}, math.nan, "why")], minimize=False) is None
 
 
-def test_where_nothing_has_a_value_there_is_no_best() -> None:
-    assert best_of([Trial(0, {}, math.nan, "why")], least=False) is None
-
-
-def test_of_equal_points_the_first_is_the_best() -> None:
-    assert best(on(["difference.threshold=13,15"]), least=False).parameters == {"difference.threshold": 13.0}
-
-
-def test_a_point_that_cannot_be_is_told_and_the_others_are_measured() -> None:
-    trials = on(["interval.minimum_frames=1,7", "interval.maximum_frames=5,9"])
+def test_an_impossible_point_is_recorded_and_a_grid_of_nothing_else_refused() -> None:
+    trials = on_grid("interval.minimum_frames=1,7", "interval.maximum_frames=5,9")
     assert [bool(trial.cause) for trial in trials] == [False, False, False, True, False]
-
-
-def test_a_grid_on_which_nothing_is_possible_is_refused() -> None:
     with pytest.raises(InputError, match="no point of the grid is possible"):
-        on(["interval.minimum_frames=7", "interval.maximum_frames=5"])
+        on_grid("interval.minimum_frames=7", "interval.maximum_frames=5")
 
 
-def test_points_are_told_ahead_each_once_and_before_they_are_measured() -> None:
-    told: list = []
+def test_points_are_prepared_once_each_and_before_they_are_measured() -> None:
+    ready: list = []
     values = [5.0 + k for k in range(2 * AHEAD + 1)]
-    trials = on_grid(
-        grid_axes([f"difference.threshold={','.join(map(str, values))}"], NOW),
-        NOW,
-        lambda parameters: (float(parameters in told), ""),
-        told.extend,
-    )
+    text = f"difference.threshold={','.join(map(str, values))}"
+    trials = on_grid(text, measure=lambda parameters: (float(parameters in ready), ""), prepare=ready.extend)
     assert all(trial.value for trial in trials)
-    assert told[0] == {} and [point["difference.threshold"] for point in told[1:]] == values
+    assert ready[0] == {} and [point["difference.threshold"] for point in ready[1:]] == values
 
 
-def test_proposals_repeat_with_the_seed_and_differ_with_another() -> None:
-    assert drawn(seed=3) == drawn(seed=3) != drawn(seed=4)
+def test_proposals_repeat_with_the_seed_and_come_near_the_best() -> None:
+    assert proposed(seed=3) == proposed(seed=3) != proposed(seed=4)
+    for minimize, low, high in ((False, 12, 16), (True, 38, 40)):
+        found = best(proposed(count=40, minimize=minimize)[1:], minimize)
+        assert found is not None and low <= float(str(found.parameters["difference.threshold"])) <= high
 
 
-def test_proposals_come_near_the_best_of_a_hill() -> None:
-    assert abs(threshold(best(drawn(40), least=False)) - 14) < 2
-    lowest = min(drawn(40, least=True)[1:], key=lambda trial: trial.value)
-    assert threshold(lowest) > 38
+def test_proposals_keep_to_whole_and_odd_numbers_and_named_values_and_survive_failures() -> None:
+    trials = proposed("difference.blur_px=3:9", "difference.near_frames=[1],[1,2]", "morphology.erode_px=1:4", count=30)
+    assert len(trials) == 31 and any(trial.cause for trial in trials)
+    assert {trial.parameters["difference.blur_px"] for trial in trials[1:]} == {3, 5, 7, 9}
+    assert {trial.parameters["difference.near_frames"] for trial in trials[1:]} == {(1,), (1, 2)}
+    assert {type(trial.parameters["morphology.erode_px"]) for trial in trials[1:]} == {int}
 
 
-def test_proposals_keep_to_whole_and_odd_numbers_and_to_the_values_named() -> None:
-    texts = ("difference.blur_px=3:9", "difference.near_frames=[1],[1,2]", "morphology.erode_px=1:4")
-    trials = drawn(30, texts=texts)[1:]
-    assert {trial.parameters["difference.blur_px"] for trial in trials} == {3, 5, 7, 9}
-    assert {trial.parameters["difference.near_frames"] for trial in trials} == {(1,), (1, 2)}
-    assert {type(trial.parameters["morphology.erode_px"]) for trial in trials} == {int}
+def test_without_optuna_the_line_says_how_to_get_it(monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"torchvision-dddas\[tune\]"):
+        next(search_ranges([], NOW, hill, 1))
 
 
-def test_trials_without_a_value_do_not_end_a_search() -> None:
-    trials = drawn(20, texts=("difference.blur_px=3:9", "difference.threshold=5:40"))
-    assert len(trials) == 21 and any(trial.cause for trial in trials)
-
-
-def test_what_is_written_of_the_best_is_read_as_the_same_settings(tmp_path) -> None:
+def test_the_best_is_written_so_that_it_is_read_as_the_same_settings(tmp_path) -> None:
     parameters = {"difference.near_frames": (1, 3), "difference.threshold": 0.1 + 0.2, "refine.on": False}
-    wanted = with_parameters(load_config("fast"), parameters)
-    (tmp_path / "best.toml").write_text(as_toml(wanted, ["a line", "another"]))
+    wanted = with_parameters(load_config("fast"), {**parameters, "people.graphs": "\U0001f600"})
+    (tmp_path / "best.toml").write_text(settings_toml(wanted, ["a line", "another"]), encoding="utf-8")
     assert load_config(tmp_path / "best.toml") == wanted
+    assert load_config("fast", [f"{name}={toml_value(value)}" for name, value in parameters.items()]) == (
+        with_parameters(load_config("fast"), parameters)
+    )

@@ -8,7 +8,7 @@ from torchvision_dddas.evaluation.report.costs import Cost, summed
 from torchvision_dddas.evaluation.report.figures import Told
 from torchvision_dddas.evaluation.report.measures import groups_of, shown
 from torchvision_dddas.evaluation.report.words import GROUPS, HEADLINES, TITLES, measure
-from torchvision_dddas.evaluation.studies.record import Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.io.report import format_number
 
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.report.words import TITLES
-from torchvision_dddas.evaluation.studies.record import Case, Task
+from torchvision_dddas.evaluation.studies.results import Case
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
 from torchvision_dddas.io.report import Axis, Cell, Column, Dots, chart, format_number, number_cell, table, text_cell
 from torchvision_dddas.io.sources import open_source

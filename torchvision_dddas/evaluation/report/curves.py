@@ -6,8 +6,7 @@ import numpy as np
 
 from torchvision_dddas.evaluation.metrics.boxes import precision_recall, ranking
 from torchvision_dddas.evaluation.report.tallies import main_group, tally
-from torchvision_dddas.evaluation.studies.record import Case
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Case, Scored
 from torchvision_dddas.io.report import Axis, Dots, Line, chart
 
 MOST_CLIPS = 6

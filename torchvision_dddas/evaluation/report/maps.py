@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchvision_dddas.evaluation.studies.record import Case
+from torchvision_dddas.evaluation.studies.results import Case
 from torchvision_dddas.io.report import Axis, Dots, Line, chart
 
 MOST_CLIPS = 6

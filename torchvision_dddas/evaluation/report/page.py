@@ -14,7 +14,8 @@ from torchvision_dddas.evaluation.report.measures import groups_of, measure_plot
 from torchvision_dddas.evaluation.report.pictures import KEY
 from torchvision_dddas.evaluation.report.words import GROUPS, TITLES
 from torchvision_dddas.evaluation.report.worst import Worst, drawn, worst_frames
-from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results
+from torchvision_dddas.evaluation.studies.results import Case, Results
+from torchvision_dddas.evaluation.studies.spec import TASKS
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.io.report import Column, data_url, render_page, table, text_cell
 

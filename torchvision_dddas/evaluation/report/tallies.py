@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Scored
 
 _GROUPS = ("pixels", "tracks", "boxes", "target_track", "target", "still")
 _NAMES = {"right": ("tp", "hit", "found"), "false": ("fp", "false", "blobs"), "missed": ("fn", "missed")}

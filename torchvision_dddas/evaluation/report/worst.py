@@ -13,7 +13,7 @@ from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.report.pictures import Boxes, Pair, box_pair, mask_pair, matched
 from torchvision_dddas.evaluation.report.tallies import Tally, main_group, tally
-from torchvision_dddas.evaluation.studies.record import Case, Found
+from torchvision_dddas.evaluation.studies.results import Case, Found
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, decode_image, read_image
 from torchvision_dddas.io.report import format_number
 from torchvision_dddas.io.sources import open_source

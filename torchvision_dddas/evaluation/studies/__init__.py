@@ -1,1 +1,1 @@
-"""Studies: many clips, their results and their measures; jobs that share the work, and a cache that keeps it."""
+"""Studies: whole data sets are run and scored, in parallel and with a cache; their results compared and searched."""

@@ -12,7 +12,7 @@ from torchvision_dddas.evaluation.metrics.figures import of_group
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still, ratio
 from torchvision_dddas.evaluation.metrics.tracking import Clear
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Scored
 
 Measure = Callable[[np.ndarray], dict[str, float]]
 """Sums (C,) of a group's counts to its measures."""

@@ -1,14 +1,15 @@
-"""What a sweep wants to be best: one measure of one task, over the clips."""
+"""The goal of a sweep: one measure of one task, over the clips."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.record import Case, Task
-from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures, names
+from torchvision_dddas.evaluation.studies.results import Case
+from torchvision_dddas.evaluation.studies.spec import TASKS, Task
+from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measure_names, measures
 
 BY = ("pooled", "mean", "worst")
 
@@ -32,36 +33,37 @@ class Goal:
     by: str = "pooled"
 
     @property
-    def least(self) -> bool:
+    def minimize(self) -> bool:
         """Whether less is better."""
         return self.measure in BETTER_LOW
 
     @property
     def name(self) -> str:
-        """As it is asked for."""
+        """As `parse_goal` takes it."""
         return f"{self.task}.{self.group}.{self.measure}"
 
 
-def goal_of(text: str, by: str = "pooled") -> Goal:
-    """A goal from `task.group.measure`. Raises InputError where it is none, or nothing says whether less is better."""
+def parse_goal(text: str, by: str = "pooled") -> Goal:
+    """A goal from `task.group.measure`. Raises InputError if there is none of that name, or it is a mere count."""
     parts = text.split(".", 2)
     if len(parts) != 3 or not all(parts):
         raise InputError(f"'{text}' is no measure; wanted task.group.measure, such as motion.pixels.f")
-    task, group, measure = parts
-    for what, word, known in (("task", task, get_args(Task)), ("way", by, BY)):
-        if word not in known:
-            raise InputError(f"'{word}' is no {what} that a study knows; wanted {', '.join(known)}")
-    found: Task = next(known for known in get_args(Task) if known == task)
-    if group not in OF_TASK[found]:
-        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(OF_TASK[found])}")
+    named, group, measure = parts
+    task = next((known for known in TASKS if known == named), None)
+    if task is None:
+        raise InputError(f"'{named}' is no task of a study; wanted {', '.join(TASKS)}")
+    if by not in BY:
+        raise InputError(f"a goal is over all clips by {', '.join(BY)}; got '{by}'")
+    if group not in OF_TASK[task]:
+        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(OF_TASK[task])}")
     if measure.startswith("n_") and measure not in BETTER_LOW:
         raise InputError(f"{measure} is a count, of which neither more nor less is better; wanted a measure")
-    if measure not in names(group):
-        raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(names(group))}")
-    return Goal(found, group, measure, by)
+    if measure not in measure_names(group):
+        raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(measure_names(group))}")
+    return Goal(task, group, measure, by)
 
 
-def groups_of(clip: Clip, task: Task) -> tuple[str, ...]:
+def possible_groups(clip: Clip, task: Task) -> tuple[str, ...]:
     """The groups of measures that a clip's truth allows, of a task that the clip allows."""
     truth = clip.truth
     if task == "motion" and clip.still:
@@ -77,37 +79,37 @@ def groups_of(clip: Clip, task: Task) -> tuple[str, ...]:
 
 
 def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
-    """Raises InputError where no clip's truth has the goal's group of measures: told before anything is computed."""
-    having = dict.fromkeys(group for clip in clips for group in groups_of(clip, goal.task))
+    """Raises InputError if no clip's truth has the goal's group of measures."""
+    having = dict.fromkeys(group for clip in clips for group in possible_groups(clip, goal.task))
     if goal.group not in having:
-        told = ", ".join(f"{goal.task}.{group}" for group in having)
-        raise InputError(f"no clip has truth for {goal.name}; there is truth for {told or 'nothing'}")
+        there = ", ".join(f"{goal.task}.{group}" for group in having)
+        raise InputError(f"no clip has truth for {goal.name}; there is truth for {there or 'nothing'}")
 
 
-def value_of(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:
-    """The goal's value, NaN where it has none, and why. Raises InputError where no clip can have such a measure."""
-    cases = [case for case in cases if case.task == goal.task]
+def goal_value(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:
+    """The goal's value; if it has none NaN, and why. Raises InputError if no clip can have such a measure."""
+    cases = sorted((case for case in cases if case.task == goal.task), key=lambda case: case.clip.name)
     if lost := [case for case in cases if case.scored is None]:
-        # Without its worst clip every setting would look better.
+        # Without its worst clip any setting would look better.
         return math.nan, f"{lost[0].clip.name}: {lost[0].cause}"
-    having = sorted((case for case in cases if case.scored is not None), key=lambda case: case.clip.name)
-    by_clip = [measures([case.scored]) for case in having if case.scored is not None]
+    scored = [case.scored for case in cases if case.scored is not None]
+    by_clip = [measures([one]) for one in scored]
     if not any(goal.measure in clip.get(goal.group, {}) for clip in by_clip):
         raise InputError(f"no clip has {goal.name}; there are {_known(by_clip) or 'none'}")
     if goal.by == "pooled":
-        value = _in(measures([case.scored for case in having if case.scored is not None]), goal)
+        value = _value(measures(scored), goal)
     else:
-        values = [value for clip in by_clip if not math.isnan(value := _in(clip, goal))]
+        values = [value for clip in by_clip if not math.isnan(value := _value(clip, goal))]
         if not values:
             value = math.nan
         elif goal.by == "mean":
             value = math.fsum(values) / len(values)
         else:
-            value = max(values) if goal.least else min(values)
+            value = max(values) if goal.minimize else min(values)
     return value, "the measure is not defined here" if math.isnan(value) else ""
 
 
-def _in(found: Mapping[str, Mapping[str, Any]], goal: Goal) -> float:
+def _value(found: Mapping[str, Mapping[str, Any]], goal: Goal) -> float:
     return float(found.get(goal.group, {}).get(goal.measure, math.nan))
 
 

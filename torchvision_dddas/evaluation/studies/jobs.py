@@ -1,32 +1,73 @@
-"""Jobs shared among worker processes of one thread each: one that dies costs the time of its clip, and no more."""
+"""One clip from its files to its measures: each stage is taken from the cache, or computed and kept."""
 
-import os
-import queue
-import signal
-import subprocess
-import sys
-import threading
-from collections import deque
-from collections.abc import Generator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.worker import LIMITS, receive, send
-from torchvision_dddas.evaluation.studies.working import Done, Job
+from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.studies.fingerprints import FileDigests, code_digest
+from torchvision_dddas.evaluation.studies.results import Found
+from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.stages import (
+    PARAMETER_GROUPS,
+    STAGES,
+    Tick,
+    allowed_tasks,
+    files_of,
+    find,
+    labelled_frames,
+    upstream_task,
+)
+from torchvision_dddas.evaluation.studies.storage import Cache, Store, digest
 
-TRIES = 3
-"""So often a job is given to a worker; if it dies each time, the clip is left out."""
+_TELL_S = 0.25
+
+
+@dataclass(frozen=True)
+class Job:
+    """A clip and what is asked of it. number: its place in the study. tasks: each after those it builds upon."""
+
+    number: int
+    clip: Clip
+    tasks: tuple[Task, ...]
+    settings: Settings
+    backend: str
+    interval: int
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys of a job's results in the cache, by task. causes: why a task has none."""
+
+    found: dict[Task, str] = field(default_factory=dict)
+    scored: dict[Task, str] = field(default_factory=dict)
+    causes: dict[Task, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Done:
+    """The outcome of a task. found, scored: keys in the cache, empty if there is no result; cause: why there is none.
+
+    computed: the stages that were not in the cache. trace: the traceback of a fault of the program.
+    """
+
+    task: Task
+    found: str = ""
+    scored: str = ""
+    cause: str = ""
+    computed: tuple[str, ...] = ()
+    trace: str = ""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened. done: what became of a job, else None. frames: looked at since the last such event.
-
-    note: a line that the user should read.
-    """
+    """Progress of a job. done: its outcome once it ends. frames: processed since the last event. note: for the user."""
 
     job: Job
     done: tuple[Done, ...] | None = None
@@ -34,125 +75,126 @@ class Event:
     note: str = ""
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+Tell = Callable[[Event], object]
 
 
-def share(jobs: Sequence[Job], workers: int, cache: Path) -> Generator[Event, None, None]:
-    """Do jobs in the order given, so many at once, each in a process of its own; events as they come.
+class FrameCounter:
+    """Called once per frame; tells the number of new frames a few times a second, and the rest by `flush`."""
 
-    cache: the folder where results are kept, and taken from. The results do not depend on the number of workers.
-    Leaving the iterator early ends the workers. Raises InputError where no process can be started.
-    """
-    if not jobs:
-        return
-    waiting, events = deque(jobs), queue.SimpleQueue[Event | BaseException | None]()
-    team = [_Worker(waiting, events, cache) for _ in range(min(workers, len(jobs)))]
+    def __init__(self, tell: Callable[[int], object]) -> None:
+        self._tell, self._count, self._told = tell, 0, time.monotonic()
+
+    def __call__(self) -> None:
+        """Count another frame."""
+        self._count += 1
+        if time.monotonic() - self._told >= _TELL_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Tell the rest."""
+        if self._count:
+            self._tell(self._count)
+        self._count, self._told = 0, time.monotonic()
+
+
+def make_keys(job: Job, files: FileDigests) -> Keys:
+    """The keys of a job's tasks and of the tasks they build upon: all that a result depends on, and nothing else."""
+    keys, clip = Keys(), job.clip
+    needed = [need for task in job.tasks if (need := upstream_task(clip, task)) is not None]
+    for task in dict.fromkeys([*needed, *job.tasks]):
+        try:
+            keys.found[task] = _found_key(job, task, keys, files)
+            known = (clip.still, clip.shows, _truth_content(clip, files))
+            keys.scored[task] = digest("scored", task, code_digest(score), keys.found[task], job.interval, known)
+        except InputError as error:
+            keys.causes[task] = str(error)
+    return keys
+
+
+def code_identity(backend: str) -> str:
+    """The digest of all code that finds and scores. Machines where it is the same get the same results."""
+    return digest(code_digest(score), *(code_digest(stage, backend) for stage in STAGES.values()))
+
+
+def kept(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
+    """The outcome of a job if all of it is in the cache, else None."""
+    if any(task not in keys.scored for task in job.tasks):
+        return None
+    done = tuple(Done(task, keys.found[task], keys.scored[task]) for task in job.tasks)
+    return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
+
+
+def work(job: Job, keys: Keys, store: Store, tick: Tick = lambda: None) -> tuple[Done, ...]:
+    """Do a job. Bad input of one task does not stop the others. tick: called once per frame."""
+    return tuple(_do_task(job, task, keys, store, tick) for task in job.tasks)
+
+
+def _do_task(job: Job, task: Task, keys: Keys, store: Store, tick: Tick) -> Done:
+    computed: list[str] = []
     try:
-        running = len(team)
-        while running:
-            event = events.get()
-            if event is None:
-                running -= 1
-            elif isinstance(event, BaseException):
-                raise event
-            else:
-                yield event
-    finally:
-        waiting.clear()
-        for worker in team:
-            worker.end()
+        if task not in allowed_tasks(job.clip):
+            raise InputError(f"its pictures and truth do not allow {task}")
+        if task in keys.causes:
+            raise InputError(keys.causes[task])
+        found = _find_or_take(job, task, keys, store, tick, computed)
+        if store.get(keys.scored[task]) is None:
+            store.put(keys.scored[task], score(job.clip, task, found, job.interval))
+            computed.append(f"{task}: score")
+    except InputError as error:
+        return Done(task, cause=str(error), computed=tuple(computed))
+    except Exception as error:
+        cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
+        return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
+    return Done(task, keys.found[task], keys.scored[task], computed=tuple(computed))
 
 
-class _Worker(threading.Thread):
-    """Takes jobs that wait and has a process do them; starts another process where one died."""
+def _find_or_take(job: Job, task: Task, keys: Keys, store: Store, tick: Tick, computed: list[str]) -> Found:
+    known: Found | None = store.get(keys.found[task])
+    if known is not None:
+        return known
+    need = upstream_task(job.clip, task)
+    before = None if need is None else _find_or_take(job, need, keys, store, lambda: None, computed)
+    found = find(job.clip, task, job.settings, job.backend, job.interval, before, tick)
+    store.put(keys.found[task], found)
+    computed.append(task)
+    return found
 
-    def __init__(self, waiting: deque[Job], events: "queue.SimpleQueue[Any]", cache: Path) -> None:
-        super().__init__(daemon=True)
-        self._waiting, self._events, self._cache = waiting, events, cache
-        self._child: subprocess.Popen[bytes] | None = None
-        self._over = False
-        self.start()
 
-    def run(self) -> None:
-        """Until no job waits."""
-        try:
-            while not self._over:
-                try:
-                    job = self._waiting.popleft()
-                except IndexError:
-                    break
-                self._do(job)
-        except BaseException as error:
-            self._events.put(error)
-        finally:
-            self._stopped()
-            self._events.put(None)
+def _found_key(job: Job, task: Task, keys: Keys, files: FileDigests) -> str:
+    clip, before = job.clip, upstream_task(job.clip, task)
+    if before in keys.causes:
+        raise InputError(keys.causes[before])
+    truth: Any = sorted(labelled_frames(clip)) if task == "motion" else None
+    if task == "association" and clip.truth is not None:
+        truth = clip.truth.tracks
+    return digest(
+        ("found", task, code_digest(STAGES[task], job.backend), job.backend),
+        {group: getattr(job.settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
+        files.digest([*files_of(clip, task), *_files_in_settings(job.settings, task)]),
+        clip.rate_hz,
+        truth,
+        None if task in ("motion", "people") else job.interval,
+        "" if before is None else keys.found[before],
+    )
 
-    def end(self) -> None:
-        """End the process at once, and this thread with it."""
-        self._over = True
-        process = self._child
-        if process is not None:
-            process.kill()
-        self.join()
 
-    def _do(self, job: Job) -> None:
-        how = ""
-        for attempt in range(TRIES):
-            if self._over:
-                return
-            process = self._running()
-            assert process.stdin is not None and process.stdout is not None
-            with suppress(OSError):  # it died already: told below
-                send(process.stdin, job)
-                while (message := receive(process.stdout)) is not None:
-                    what, content = message
-                    if what == "frames":
-                        self._events.put(Event(job, frames=content))
-                    elif what == "note":
-                        self._events.put(Event(job, note=content))
-                    elif what == "done":
-                        self._events.put(Event(job, tuple(content)))
-                        return
-            how = self._stopped()
-            if not self._over and attempt + 1 < TRIES:
-                self._events.put(Event(job, note=f"{job.clip.name}: its worker {how}; it is tried again"))
-        cause = f"its worker {how}, {TRIES} times; is there memory enough for {job.clip.name} and {job.backend}?"
-        self._events.put(Event(job, tuple(Done(task, cause=cause) for task in job.tasks)))
+def _files_in_settings(settings: Settings, task: Task) -> list[Path]:
+    """Files that parameters name."""
+    if "people" not in PARAMETER_GROUPS[task]:
+        return []
+    places = [Path(settings.people.classifier), Path(settings.people.graphs)]
+    return [
+        file
+        for path in places
+        for file in (sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else [])
+    ]
 
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._child is not None and self._child.poll() is None:
-            return self._child
-        self._stopped()
-        command = [sys.executable, "-m", "torchvision_dddas.evaluation.studies.worker"]
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        try:
-            # A session of its own: Ctrl-C is for whoever shares the jobs, who then ends the workers.
-            self._child = subprocess.Popen(command, env={**os.environ, **LIMITS}, start_new_session=True, **pipes)
-        except OSError as error:
-            raise InputError(f"no worker can be started: {error.strerror}") from None
-        assert self._child.stdin is not None
-        with suppress(OSError):
-            send(self._child.stdin, self._cache)
-        return self._child
 
-    def _stopped(self) -> str:
-        """End the process, and say how it ended."""
-        process, self._child = self._child, None
-        if process is None:
-            return "is gone"
-        for pipe in (process.stdin, process.stdout):
-            assert pipe is not None
-            with suppress(OSError):
-                pipe.close()
-        try:
-            code = process.wait(5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            code = process.wait()
-        if code < 0:
-            with suppress(ValueError):
-                return f"was killed ({signal.Signals(-code).name})"
-        return f"ended with {code}"
+def _truth_content(clip: Clip, files: FileDigests) -> Any:
+    """The truth of a clip, without where it is written."""
+    truth = clip.truth
+    if truth is None:
+        return None
+    masks = files.digest([truth.masks[frame] for frame in sorted(truth.masks)])
+    rest: Mapping[str, Any] = {name: value for name, value in vars(truth).items() if name not in ("masks", "place")}
+    return (sorted(truth.masks), masks, rest)

@@ -1,82 +1,113 @@
-"""The TOML file of a study, read and checked."""
+"""What a study asks for: its data sets, tasks and settings, and the TOML file that says so."""
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal
 
 from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import kinds
-from torchvision_dddas.evaluation.studies.record import TASKS, Source, Spec, Task
 
-KEYS = ("name", "tasks", "config", "set", "backend", "interval", "dataset")
+Task = Literal["motion", "tracking", "association", "people", "location"]
+
+TASKS: Mapping[Task, str] = {
+    "motion": "what moves in the clip's pictures, against masks, boxes or one target; in a still clip all is false",
+    "tracking": "identities of what was found, or of the data set's own detections, against true tracks",
+    "association": "identities of the true boxes, at each interval-th frame, against the true identities",
+    "people": "persons in each picture, against true boxes",
+    "location": "places on the ground, in metres, against the true ones",
+}
+
 BACKENDS = ("auto", "torch", "onboard")
-NAME = re.compile(r"[\w][\w .+-]{0,99}")
+
+_KEYS = ("name", "tasks", "config", "set", "backend", "interval", "dataset")
+_NAME = re.compile(r"[\w][\w .+-]{0,99}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A data set of a study. clips: patterns of names (fnmatch). options: further options of its kind, by name."""
+
+    kind: str
+    folder: Path
+    clips: tuple[str, ...] = ("*",)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A study. tasks: empty for all that each clip allows. config, overrides: as --config and --set."""
+
+    name: str
+    sources: tuple[Source, ...]
+    tasks: tuple[Task, ...] = ()
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    backend: str = "auto"
+    interval: int = 1
 
 
 def read_spec(path: Path) -> Spec:
-    """A study's file: folders stay as they stand there, relative to the file's own folder.
+    """Read a study's TOML file. Folders of data sets stay relative to the file's own folder.
 
-    Raises InputError with one line: unreadable, a key that is unknown or lacks, a value that will not do, an unknown
-    kind of data set.
+    Raises InputError with one line for an unreadable file, an unknown or missing key, or a bad value.
     """
-    said = read_toml(path, "study")
+    content = read_toml(path, "study")
     where = f"study {path}"
-    _known(said, KEYS, where)
-    name = _text(said, "name", where, path.stem)
-    if not NAME.fullmatch(name):
-        raise InputError(f"{where}: name = {name!r} will not do; wanted letters, digits, blanks, and . + - _")
-    tasks = _texts(said, "tasks", where)
-    if strange := [task for task in tasks if task not in TASKS]:
-        raise InputError(f"{where}: '{strange[0]}' is no task; wanted some of {', '.join(TASKS)}")
-    backend = _text(said, "backend", where, "auto")
+    if unknown := [key for key in content if key not in _KEYS]:
+        raise InputError(f"{where} has no key '{unknown[0]}'; wanted {', '.join(_KEYS)}")
+    name = _text(content, "name", where, path.stem)
+    if not _NAME.fullmatch(name):
+        raise InputError(f"{where}: name must consist of letters, digits, blanks, and . + - _, got {name!r}")
+    tasks = _texts(content, "tasks", where)
+    if unknown := [task for task in tasks if task not in TASKS]:
+        raise InputError(f"{where}: tasks must be some of {', '.join(TASKS)}, got '{unknown[0]}'")
+    backend = _text(content, "backend", where, "auto")
     if backend not in BACKENDS:
-        raise InputError(f"{where}: backend = '{backend}' will not do; wanted one of {', '.join(BACKENDS)}")
-    interval = said.get("interval", 1)
-    if not isinstance(interval, int) or isinstance(interval, bool) or not 1 <= interval <= 1000:
-        raise InputError(f"{where}: interval = {interval!r} will not do; wanted a whole number of frames, 1 to 1000")
-    tables = said.get("dataset", [])
+        raise InputError(f"{where}: backend must be one of {', '.join(BACKENDS)}, got '{backend}'")
+    interval = content.get("interval", 1)
+    if type(interval) is not int or not 1 <= interval <= 1000:
+        raise InputError(f"{where}: interval must be a whole number of frames from 1 to 1000, got {interval!r}")
+    tables = content.get("dataset", [])
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise InputError(f"{where} names no data set; wanted [[dataset]] with kind and folder, once or more")
-    sources = tuple(_source(table, f"{where}, data set {k}") for k, table in enumerate(tables, 1))
-    config = _text(said, "config", where, "") or None
-    chosen: tuple[Task, ...] = tuple(task for task in get_args(Task) if task in tasks)
-    return Spec(name, sources, chosen, config, tuple(_texts(said, "set", where)), backend, interval)
+    return Spec(
+        name,
+        tuple(_source(table, f"{where}, data set {k}") for k, table in enumerate(tables, 1)),
+        tuple(task for task in TASKS if task in tasks),
+        _text(content, "config", where, "") or None,
+        tuple(_texts(content, "set", where)),
+        backend,
+        interval,
+    )
 
 
 def _source(table: Mapping[str, Any], where: str) -> Source:
     for key in ("kind", "folder"):
-        if key not in table:
+        if not _text(table, key, where, ""):
             raise InputError(f"{where} has no {key}; wanted kind = one of {', '.join(kinds.KINDS)}, and folder")
-    kind, folder = _text(table, "kind", where, ""), _text(table, "folder", where, "")
     try:
-        kinds.known(kind)
+        kinds.known(table["kind"])
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    if not folder:
-        raise InputError(f"{where}: folder is empty; wanted where the data set lies")
     patterns = tuple(_texts(table, "clips", where)) if "clips" in table else ("*",)
     if not patterns:
         raise InputError(f'{where}: clips is empty; wanted patterns of names, as clips = ["cars*"], or leave it out')
     options = {key: value for key, value in table.items() if key not in ("kind", "folder", "clips")}
-    return Source(kind, Path(folder), patterns, options)
-
-
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
-    if strange := [key for key in table if key not in keys]:
-        raise InputError(f"{where} has no key '{strange[0]}'; wanted {', '.join(keys)}")
+    return Source(table["kind"], Path(table["folder"]), patterns, options)
 
 
 def _text(table: Mapping[str, Any], key: str, where: str, default: str) -> str:
     value = table.get(key, default)
     if not isinstance(value, str):
-        raise InputError(f"{where}: {key} = {value!r} will not do; wanted a text")
+        raise InputError(f"{where}: {key} must be a text, got {value!r}")
     return value
 
 
 def _texts(table: Mapping[str, Any], key: str, where: str) -> list[str]:
     value = table.get(key, [])
     if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-        raise InputError(f"{where}: {key} = {value!r} will not do; wanted a list of texts")
+        raise InputError(f"{where}: {key} must be a list of texts, got {value!r}")
     return value

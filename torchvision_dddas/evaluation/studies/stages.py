@@ -1,36 +1,58 @@
-"""The work on one clip: what moves, who is who, people, places on the ground; each stage as its own command does it."""
+"""The stages that process one clip, each as its own command does: motion, tracking, association, people, location."""
 
+import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 
+from torchvision_dddas import geo
 from torchvision_dddas.config import Settings
+from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.memory import Peak
-from torchvision_dddas.evaluation.studies.record import Found, Task
-from torchvision_dddas.evaluation.studies.rows import Rows, Tick, followed_kept, scenes_kept, written
-from torchvision_dddas.types import Detections, Frame, Registration, Scene
+from torchvision_dddas.evaluation.studies.results import Found, round_as_written
+from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.geo.ground_locator import GroundLocator
+from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.detection_tables import check_table, read_detections
+from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource
+from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.people.detector import recognize, recognizer_of
+from torchvision_dddas.pipeline import survey
+from torchvision_dddas.tracking import track_clip, track_scenes, track_table
+from torchvision_dddas.types import (
+    AerialLocations,
+    Detections,
+    DetectionTable,
+    Frame,
+    Positions,
+    Registration,
+    Scene,
+    Source,
+    TrackedFrame,
+)
 
-if TYPE_CHECKING:
-    from torchvision_dddas.types import DetectionTable, Source
+Tick = Callable[[], object]
 
-_SEES = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
-_FOLLOWS = ("track", "paper")
+_MOTION = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
+_TRACKING = ("track", "paper")
 
-KNOBS: Mapping[Task, tuple[str, ...]] = {
-    "motion": _SEES,
-    "tracking": ("registration", *_FOLLOWS),
-    "association": ("registration", *_FOLLOWS),
+PARAMETER_GROUPS: Mapping[Task, tuple[str, ...]] = {
+    "motion": _MOTION,
+    "tracking": ("registration", *_TRACKING),
+    "association": ("registration", *_TRACKING),
     "people": ("people",),
-    "location": (*_SEES, *_FOLLOWS, "people", "ground", "landmarks", "aerial", "crowds"),
+    "location": (*_MOTION, *_TRACKING, "people", "ground", "landmarks", "aerial", "crowds"),
 }
-"""The groups of settings that each stage depends on by itself; it is given the defaults of all others."""
+"""The groups of settings that each stage depends on by itself. It gets the defaults of all others."""
 
-INPUTS: Mapping[Task, tuple[str, ...]] = {
+_FILES: Mapping[Task, tuple[str, ...]] = {
     "motion": ("pictures",),
     "tracking": ("pictures", "given"),
     "association": ("pictures",),
@@ -39,11 +61,30 @@ INPUTS: Mapping[Task, tuple[str, ...]] = {
 }
 """The files of a clip that each stage reads."""
 
-_SHUFFLE = 7  # seed of the order of true boxes within their frames: it must not tell who is who
+_SHUFFLE_SEED = 7  # the order of true boxes within their frames must not tell their identities
 
 
-def allowed(clip: Clip) -> tuple[Task, ...]:
-    """The tasks that a clip's pictures and truth allow, each after those that it is done upon."""
+def find(
+    clip: Clip,
+    task: Task,
+    settings: Settings,
+    backend: str = "auto",
+    interval: int = 1,
+    before: Found | None = None,
+    tick: Tick = lambda: None,
+) -> Found:
+    """Run a stage on a clip. before: the result of `upstream_task`. tick: called once per frame.
+
+    Raises InputError if the clip's files are unusable.
+    """
+    peak, start = _PeakMemory(), time.perf_counter()
+    rows = STAGES[task](_Job(clip, narrow_settings(settings, task), backend, interval, before, tick))
+    rows.seconds["other"] = time.perf_counter() - start - sum(rows.seconds.values())
+    return rows.found(peak.read_mb())
+
+
+def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
+    """The tasks that a clip's pictures and truth allow, each after those that it builds upon."""
     truth, pictures, moves = clip.truth, bool(clip.pictures), "movers" in clip.shows
     tasks: list[Task] = []
     if pictures and moves and (clip.still or truth is not None):
@@ -62,51 +103,24 @@ def allowed(clip: Clip) -> tuple[Task, ...]:
     return tuple(tasks)
 
 
-def upstream(clip: Clip, task: Task) -> Task | None:
-    """The task whose result another is done upon; None where it needs none."""
+def upstream_task(clip: Clip, task: Task) -> Task | None:
+    """The task whose result another one builds upon; None if it needs none."""
     return "motion" if task == "tracking" and bool(clip.pictures) and "movers" in clip.shows else None
 
 
-def narrowed(settings: Settings, task: Task) -> Settings:
-    """The settings as a stage sees them: no group that its key does not hold can have a say."""
-    return Settings().model_copy(update={group: getattr(settings, group) for group in KNOBS[task]})
+def narrow_settings(settings: Settings, task: Task) -> Settings:
+    """The settings that a stage gets: defaults for all groups that its key in the cache does not hold."""
+    return Settings().model_copy(update={group: getattr(settings, group) for group in PARAMETER_GROUPS[task]})
 
 
-def find(
-    clip: Clip,
-    task: Task,
-    settings: Settings,
-    backend: str = "auto",
-    interval: int = 1,
-    before: Found | None = None,
-    tick: Tick = lambda: None,
-) -> Found:
-    """What a stage finds in a clip. before: the result of `upstream`. tick: called once a frame.
-
-    Raises InputError where the clip's files will not do.
-    """
-    settings, peak, start = narrowed(settings, task), Peak(), time.perf_counter()
-    if task == "motion":
-        rows = motion(clip, settings, backend, tick)
-    elif task == "tracking":
-        rows = _tracking(clip, settings, backend, interval, before, tick)
-    elif task == "association":
-        rows = _association(clip, settings, backend, interval, tick)
-    elif task == "people":
-        rows = _people(clip, settings, backend, tick)
-    else:
-        from torchvision_dddas.evaluation.studies.placing import location
-
-        rows = location(clip, settings, backend, interval, tick)
-    rows.seconds["other"] = time.perf_counter() - start - sum(rows.seconds.values())
-    return rows.found(peak.mb())
+def files_of(clip: Clip, task: Task) -> list[Path]:
+    """The files that a stage reads."""
+    values = [getattr(clip, name) for name in _FILES[task]]
+    return [path for value in values for path in (value if isinstance(value, tuple) else (value,)) if path is not None]
 
 
-def opened(clip: Clip) -> "Source":
-    """The pictures of a clip. Raises InputError where they cannot be read."""
-    from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource
-    from torchvision_dddas.io.sources import open_source
-
+def open_clip(clip: Clip) -> Source:
+    """Open the pictures of a clip. Raises InputError if they cannot be read."""
     if not clip.pictures:
         raise InputError(f"{clip.name} has no pictures: {clip.place}")
     if len(clip.pictures) == 1 and clip.pictures[0].suffix.lower() not in IMAGE_SUFFIXES:
@@ -114,29 +128,31 @@ def opened(clip: Clip) -> "Source":
     return ImageSource(clip.pictures, clip.name, clip.rate_hz or 10.0)
 
 
-def labelled(clip: Clip) -> set[int]:
-    """The frames whose masks are kept: those for which the truth tells pixels."""
+def labelled_frames(clip: Clip) -> set[int]:
+    """The frames whose masks are kept: those for which the truth labels pixels."""
     truth = clip.truth
     return set() if truth is None or truth.kind == "boxes" else set(truth.frames)
 
 
-def motion(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
-    """What moves: `dddas detect`."""
-    from torchvision_dddas.detection import detect_motion
+def true_boxes(clip: Clip, interval: int) -> DetectionTable:
+    """The true boxes of each interval-th frame as certain detections. Raises InputError if there are none."""
+    assert clip.truth is not None and clip.truth.tracks is not None, "allowed_tasks() asks for tracks"
+    table = clip.truth.tracks.every(interval)
+    if not len(table.frame):
+        raise InputError(f"{clip.truth.place} has no box on frames 1, {1 + interval}, {1 + 2 * interval}, ...")
+    order = np.random.default_rng(_SHUFFLE_SEED).permutation(len(table.frame))
+    order = order[np.argsort(table.frame[order], kind="stable")]
+    frame, box_px = table.frame[order], np.asarray(table.box_px, float)[order]
+    return DetectionTable(clip.name, frame, box_px, np.ones(len(frame)), np.arange(1, len(frame) + 1))
 
-    source, wanted = opened(clip), labelled(clip)
-    rows = scenes_kept(detect_motion(source, settings, backend), wanted, tick)
-    rows.notes += [str(problem) for problem in source.problems]
-    return rows
 
-
-def scenes_again(clip: Clip, found: Found) -> Iterator[Scene]:
-    """The scenes of a clip as `run.run` gave them, but for their masks: pictures are read again."""
-    source, numbers = opened(clip), found.looked.tolist()
+def replay_scenes(clip: Clip, found: Found) -> Iterator[Scene]:
+    """The scenes of a clip as the detector gave them, without their masks. The pictures are read again."""
+    source = open_clip(clip)
     shape: tuple[int, ...] = (source.size[1], source.size[0])
     pictures = iter(source)
     picture = next(pictures, None)
-    for number in numbers:
+    for number in found.looked.tolist():
         while picture is not None and picture.number < number:
             picture = next(pictures, None)
         frame = Frame(number, (number - 1) / source.rate_hz, np.zeros(shape, np.uint8))
@@ -146,82 +162,250 @@ def scenes_again(clip: Clip, found: Found) -> Iterator[Scene]:
         area_px, heading_rad, speed_px, middle_px = (
             found.more[name][here] for name in ("area_px", "heading_rad", "speed_px", "middle_px")
         )
-        detections = Detections(
-            found.box_px[here], found.score[here], area_px, heading_rad, speed_px, middle_px=middle_px
-        )
         step = None
         if number in found.steps:
             step = Registration(found.steps[number], 0, 0, float("nan"), float("nan"))
+        detections = Detections(
+            found.box_px[here], found.score[here], area_px, heading_rad, speed_px, middle_px=middle_px
+        )
         yield Scene(frame, np.zeros((0, 0), np.uint16), detections, 0, step=step)
 
 
-def _tracking(clip: Clip, settings: Settings, backend: str, interval: int, before: Found | None, tick: Tick) -> Rows:
-    """Identities: `dddas track CLIP`, or of the data set's own detections."""
-    from torchvision_dddas.io.detection_tables import read_detections
-    from torchvision_dddas.tracking import track_scenes
+@dataclass
+class Rows:
+    """What a stage has found so far, frame by frame; the fields of `Found`."""
 
-    if upstream(clip, "tracking") is not None:
-        assert before is not None, "tracks are of what was seen to move"
-        size = opened(clip).size
-        return followed_kept(track_scenes(scenes_again(clip, before), settings, interval, size, False), tick)
-    assert clip.given is not None, "allowed() asks for tracks where there is something to follow"
-    return _followed(clip, read_detections(clip.given), settings, backend, interval, tick)
+    looked: list[int] = field(default_factory=list)
+    columns: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    masks: dict[int, bytes] = field(default_factory=dict)
+    steps: dict[int, np.ndarray] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
+    def add(self, number: int, seconds: Mapping[str, float], **columns: np.ndarray) -> None:
+        """Add the boxes of a frame, one row each, in columns of one length."""
+        self.looked.append(number)
+        for stage, spent in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+        count = len(columns["box_px"])
+        default = {
+            "frame": np.full(count, number),
+            "identity": np.full(count, -1),
+            "east_north_m": np.full((count, 2), np.nan),
+            "covariance_m2": np.full((count, 2, 2), np.nan),
+        }
+        for name, column in (default | columns).items():
+            self.columns.setdefault(name, []).append(column)
 
-def _association(clip: Clip, settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
-    """Identities of the true boxes, in an order that does not tell them."""
-    return _followed(clip, true_boxes(clip, interval), settings, backend, interval, tick)
-
-
-def true_boxes(clip: Clip, interval: int) -> "DetectionTable":
-    """The true boxes of each interval-th frame as certain detections. Raises InputError where there are none."""
-    from torchvision_dddas.types import DetectionTable
-
-    assert clip.truth is not None and clip.truth.tracks is not None, "allowed() asks for it where there is truth"
-    table = clip.truth.tracks.every(interval)
-    if not len(table.frame):
-        raise InputError(f"{clip.truth.place} has no box on frames 1, {1 + interval}, {1 + 2 * interval}, ...")
-    order = np.random.default_rng(_SHUFFLE).permutation(len(table.frame))
-    order = order[np.argsort(table.frame[order], kind="stable")]
-    frame, box_px = table.frame[order], np.asarray(table.box_px, float)[order]
-    return DetectionTable(clip.name, frame, box_px, np.ones(len(frame)), np.arange(1, len(frame) + 1))
-
-
-def _followed(clip: Clip, table: "DetectionTable", settings: Settings, backend: str, interval: int, tick: Tick) -> Rows:
-    """A table along the clip's pictures, or alone where it has none."""
-    from torchvision_dddas.detection import load_engine
-    from torchvision_dddas.io.detection_tables import check_table
-    from torchvision_dddas.tracking import track_clip, track_table
-
-    if not clip.pictures:
-        notes = check_table(table, interval)
-        rows = followed_kept(track_table(table, settings, interval), tick)
-        rows.notes += notes
-        return rows
-    source = opened(clip)
-    notes = check_table(table, interval, source)
-    rows = followed_kept(track_clip(source, table, load_engine(backend, settings), settings, interval), tick)
-    rows.notes += [*notes, *map(str, source.problems)]
-    return rows
+    def found(self, peak_mb: float) -> Found:
+        """All of it."""
+        shapes = {"frame": (0,), "box_px": (0, 4), "score": (0,), "identity": (0,)}
+        shapes |= {"east_north_m": (0, 2), "covariance_m2": (0, 2, 2)}
+        columns = {name: np.zeros(shape) for name, shape in shapes.items()}
+        columns |= {name: np.concatenate(parts) for name, parts in self.columns.items()}
+        for name, kind in (("frame", np.int64), ("identity", np.int64), ("box_px", float), ("score", float)):
+            columns[name] = columns[name].astype(kind)
+        return Found(
+            **{name: columns.pop(name) for name in shapes},
+            looked=np.array(self.looked, np.int64),
+            masks=self.masks,
+            steps=self.steps,
+            more=columns,
+            seconds=self.seconds,
+            peak_mb=peak_mb,
+            notes=tuple(self.notes),
+        )
 
 
-def _people(clip: Clip, settings: Settings, backend: str, tick: Tick) -> Rows:
-    """People by their shape: `dddas people`."""
-    from torchvision_dddas.people.detector import recognize, recognizer_of
+@dataclass(frozen=True)
+class _Job:
+    """What a stage is given; see `find`."""
 
-    source, rows = opened(clip), Rows()
-    for here in recognize(source, recognizer_of(settings.people, backend), settings):
-        people = here.people
-        rows.add(here.frame.number, here.seconds, box_px=written(people.box_px), score=people.score)
-        tick()
+    clip: Clip
+    settings: Settings
+    backend: str
+    interval: int
+    before: Found | None
+    tick: Tick
+
+
+def _find_motion(job: _Job) -> Rows:
+    """Moving targets: `dddas detect`."""
+    source, rows, causes = open_clip(job.clip), Rows(), dict[int, str]()
+    labelled = labelled_frames(job.clip)
+    for scene in detect_motion(source, job.settings, job.backend):
+        number, found = scene.frame.number, scene.detections
+        more = {"area_px": found.area_px, "heading_rad": found.heading_rad, "speed_px": found.speed_px}
+        rows.add(number, scene.seconds, box_px=found.box_px, score=found.score, middle_px=found.middle_px, **more)
+        if number in labelled:
+            # One bit would be enough; the numbers of the targets cost little more, and reports show them.
+            mask = np.minimum(scene.mask, 255).astype(np.uint8)
+            rows.masks[number] = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        if scene.step is not None and scene.step.reliable:
+            rows.steps[number] = scene.step.later_from_earlier
+        if not scene.reliable:
+            causes[number] = scene.cause
+        job.tick()
+    if causes:
+        first = min(causes)
+        rows.notes.append(f"{len(causes)} frames with unreliable registration, first {first}: {causes[first]}")
     rows.notes += map(str, source.problems)
     return rows
 
 
-def files_of(clip: Clip, task: Task) -> list[Path]:
-    """The files that a stage reads."""
-    found: list[Path] = []
-    for name in INPUTS[task]:
-        value: Any = getattr(clip, name)
-        found += value if isinstance(value, tuple) else [] if value is None else [value]
-    return found
+def _find_tracks(job: _Job) -> Rows:
+    """Identities: `dddas track CLIP`, or of the data set's own detections."""
+    if upstream_task(job.clip, "tracking") is not None:
+        assert job.before is not None, "tracks build upon motion"
+        scenes, size = replay_scenes(job.clip, job.before), open_clip(job.clip).size
+        return _rows_of_tracks(track_scenes(scenes, job.settings, job.interval, size, False), job.tick)
+    assert job.clip.given is not None, "allowed_tasks() asks for detections"
+    return _track_table(job, read_detections(job.clip.given))
+
+
+def _find_associations(job: _Job) -> Rows:
+    """Identities of the true boxes."""
+    return _track_table(job, true_boxes(job.clip, job.interval))
+
+
+def _find_people(job: _Job) -> Rows:
+    """People by their shape: `dddas people`."""
+    source, rows = open_clip(job.clip), Rows()
+    for here in recognize(source, recognizer_of(job.settings.people, job.backend), job.settings):
+        people = here.people
+        rows.add(here.frame.number, here.seconds, box_px=round_as_written(people.box_px), score=people.score)
+        job.tick()
+    rows.notes += map(str, source.problems)
+    return rows
+
+
+def _find_locations(job: _Job) -> Rows:
+    """Places on the ground: `dddas run`, or `dddas locate` of the data set's own detections."""
+    if job.clip.landmarks is None:
+        return _locate_from_ground(job)
+    files = AerialInput(
+        job.clip.landmarks, job.clip.telemetry, job.clip.camera, job.clip.elevation, None, job.clip.colours
+    )
+    return _locate_along(job, files) if job.clip.pictures else _locate_table(job, files)
+
+
+STAGES: Mapping[Task, Callable[[_Job], Rows]] = {
+    "motion": _find_motion,
+    "tracking": _find_tracks,
+    "association": _find_associations,
+    "people": _find_people,
+    "location": _find_locations,
+}
+
+
+def _track_table(job: _Job, table: DetectionTable) -> Rows:
+    """Track the boxes of a table, with the clip's pictures where it has any."""
+    if not job.clip.pictures:
+        notes = check_table(table, job.interval)
+        rows = _rows_of_tracks(track_table(table, job.settings, job.interval), job.tick)
+    else:
+        source = open_clip(job.clip)
+        notes = check_table(table, job.interval, source)
+        engine = load_engine(job.backend, job.settings)
+        rows = _rows_of_tracks(track_clip(source, table, engine, job.settings, job.interval), job.tick)
+        notes += map(str, source.problems)
+    rows.notes += notes
+    return rows
+
+
+def _rows_of_tracks(frames: Iterable[TrackedFrame], tick: Tick) -> Rows:
+    rows = Rows()
+    for here in frames:
+        tracks, box_px = here.tracks, round_as_written(here.tracks.box_px)
+        rows.add(here.number, here.seconds, box_px=box_px, score=tracks.score, identity=tracks.identity)
+        tick()
+    return rows
+
+
+def _locate_along(job: _Job, files: AerialInput) -> Rows:
+    source, rows = open_clip(job.clip), Rows()
+    ready = prepare_run(files, job.clip.telemetry, job.settings, source, job.backend, str(job.clip.pictures[0]))
+    for result in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, job.interval, pictures=False):
+        tracks, located = result.followed.tracks, result.grounded
+        seen = tracks.row >= 0
+        columns = {"box_px": tracks.box_px[seen], "identity": tracks.identity[seen], "score": tracks.score[seen]}
+        seconds = result.followed.seconds if located is None else located.seconds
+        rows.add(result.followed.number, seconds, **_with_places(columns, located))
+        job.tick()
+    rows.notes += [*ready.notes, *map(str, source.problems)]
+    return rows
+
+
+def _locate_table(job: _Job, files: AerialInput) -> Rows:
+    if job.clip.given is None:
+        raise InputError(f"{job.clip.place} has no pictures and no detections: there is nothing to locate")
+    rows, table = Rows(), read_detections(job.clip.given)
+    span = (table.first, table.last)
+    locator, notes = read_locator(
+        files, job.settings, None, job.clip.rate_hz, job.backend, span, "table", None, extent=table.extent
+    )
+    geo.check_table(table, locator)
+    for located in locator.locate_table(table):
+        here = table.rows(located.frame)
+        identity = np.full(here.stop - here.start, -1) if table.identity is None else table.identity[here]
+        columns = {"box_px": located.box_px, "identity": identity, "score": table.score[here].clip(0, 1)}
+        rows.add(located.frame, located.seconds, **_with_places(columns, located))
+        job.tick()
+    rows.notes += notes
+    return rows
+
+
+def _locate_from_ground(job: _Job) -> Rows:
+    clip = job.clip
+    if clip.given is None or clip.camera is None:
+        raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
+    rows, table = Rows(), read_detections(clip.given)
+    locator = GroundLocator(read_camera(clip.camera), job.settings, rate_hz=clip.rate_hz)
+    for found in locator.locate_tables([table]):
+        count, here = len(found.box_px), found.sightings.by != "bearing"
+        identity = np.full(count, -1) if table.identity is None else table.identity[table.rows(found.frame)]
+        columns = {"box_px": round_as_written(found.box_px), "score": found.score.clip(0, 1), "identity": identity}
+        rows.add(found.frame, {}, **columns, **_place_columns(count, np.flatnonzero(here), found.positions))
+        job.tick()
+    return rows
+
+
+def _with_places(columns: dict[str, np.ndarray], located: AerialLocations | None) -> dict[str, np.ndarray]:
+    """The columns of a frame's targets, with the places of those that were located."""
+    count = len(columns["box_px"])
+    row = np.zeros(0, np.int64) if located is None else located.row
+    places = _place_columns(count, row, Positions() if located is None else located.positions)
+    places["relative_m2"] = np.full((count, 2, 2), np.nan)
+    if located is not None:
+        places["relative_m2"][row] = located.relative_m2
+    return {**columns, "box_px": round_as_written(columns["box_px"]), **places}
+
+
+def _place_columns(count: int, row: np.ndarray, found: Positions) -> dict[str, np.ndarray]:
+    """The columns of places of a frame's boxes. row: the box of each position."""
+    shapes = {"east_north_m": (2,), "covariance_m2": (2, 2), "lonlat_deg": (2,)}
+    places = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
+    places["east_north_m"][row], places["covariance_m2"][row] = found.east_north_m, found.covariance_m2
+    if found.lonlat_deg is not None:
+        places["lonlat_deg"][row] = found.lonlat_deg
+    return places
+
+
+class _PeakMemory:
+    """The most memory that this process has held since this object was made, or since its start on some systems."""
+
+    def __init__(self) -> None:
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+    def read_mb(self) -> float:
+        """The peak in units of 2**20 bytes; NaN where the system does not tell."""
+        with suppress(OSError, ValueError, StopIteration):
+            lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+            return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
+        try:
+            import resource
+        except ImportError:
+            return float("nan")
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak / 2**20 if sys.platform == "darwin" else peak / 1024

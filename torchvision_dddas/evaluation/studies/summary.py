@@ -1,10 +1,11 @@
-"""The measures of a study: of each clip, of all together, with how sure they are. The content of metrics.json.
+"""The measures of a study with their intervals, which are the content of metrics.json; and what it cost.
 
-It tells nothing of the machine, the time or the folders: the same data, code and settings give the same bytes.
+metrics.json has nothing of the machine, the time or the folders: the same data, code and settings give the same bytes.
 """
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,12 +15,12 @@ from torchvision_dddas.evaluation.metrics import bootstrap, metres
 from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget, ranking
 from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still, ratio
 from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
 from torchvision_dddas.evaluation.studies import estimates
 from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
-from torchvision_dddas.evaluation.studies.record import TASKS, Case, Results, Task
-from torchvision_dddas.evaluation.studies.scored import Scored
+from torchvision_dddas.evaluation.studies.results import Case, Results, Scored
+from torchvision_dddas.evaluation.studies.spec import TASKS, Task
 
 FORMAT = 1
 
@@ -44,10 +45,10 @@ _EMPTY: Mapping[str, Any] = {
     "still": Still(),
     "location": GroundLocations(),
 }
-"""Groups whose measures come of counts, and no counts at all."""
+"""Groups whose measures come from counts, with no counts at all."""
 
 
-def summary(results: Results) -> dict[str, Any]:
+def summarize(results: Results) -> dict[str, Any]:
     """By task: "clips" by name, "pooled" over all counts, "mean" over clips, "worst" clip of each measure.
 
     {"tasks": {task: {"clips": {name: {"frames": F, group: {measure: value}, "intervals": {group: {measure:
@@ -63,7 +64,7 @@ def summary(results: Results) -> dict[str, Any]:
         if cases:
             tasks[task] = _task(task, sorted(cases, key=lambda case: case.clip.name))
     left_out = [
-        {"clip": case.clip.name, "task": case.task, "cause": _placeless(case.cause)}
+        {"clip": case.clip.name, "task": case.task, "cause": _without_folders(case.cause)}
         for case in sorted(results.cases, key=lambda case: (case.clip.name, case.task))
         if case.scored is None
     ]
@@ -73,7 +74,7 @@ def summary(results: Results) -> dict[str, Any]:
 def _task(task: Task, cases: Sequence[Case]) -> dict[str, Any]:
     scored = [case.scored for case in cases if case.scored is not None]
     clips = {case.clip.name: clip_measures(of_clip) for case, of_clip in zip(cases, scored, strict=True)}
-    notes = [_placeless(note) for one in scored for note in one.notes]
+    notes = [_without_folders(note) for one in scored for note in one.notes]
     return {
         "what": TASKS[task],
         "clips": clips,
@@ -115,7 +116,7 @@ def measures(cases: Sequence[Scored]) -> dict[str, dict[str, float]]:
     return {group: found[group] for group in GROUPS if group in found}
 
 
-def names(group: str) -> tuple[str, ...]:
+def measure_names(group: str) -> tuple[str, ...]:
     """The measures that a group of GROUPS can have, and those of its counts of which less is better."""
     if group == RANKED:
         return tuple(ranking(*np.zeros((5, 0))).measures())
@@ -145,6 +146,40 @@ def _worst(clips: dict[str, dict[str, Any]]) -> dict[str, dict[str, dict[str, An
     return worst
 
 
-def _placeless(words: str) -> str:
-    """Words without the folders that lie on this machine alone: of a path its last part stays."""
-    return re.sub(r"(?:(?<=[\s('\"])|^)(?:[A-Za-z]:)?[\\/](?:[^\s:;,'\"()]*[\\/])?([^\s:;,'\"()\\/]*)", r"\1", words)
+def _without_folders(text: str) -> str:
+    """The text with only the last part of each path, as folders are this machine's own."""
+    return re.sub(r"(?:(?<=[\s('\"])|^)(?:[A-Za-z]:)?[\\/](?:[^\s:;,'\"()]*[\\/])?([^\s:;,'\"()\\/]*)", r"\1", text)
+
+
+def summarize_costs(results: Results) -> dict[str, Any]:
+    """What a study cost, for run.json: by task "clips" by name, and "all" of them together.
+
+    {task: {"clips": {name: {"frames": processed, "seconds": in all stages, "frames_per_s": .., "ms_per_frame": {stage:
+    ..}, "peak_mb": ..}}, "all": the same, of all clips; peak_mb the most}}. Times are those that the stages took where
+    they were computed, kept with their results; a stage that another task shares is in the cost of both.
+    """
+    found: dict[str, Any] = {}
+    for task in TASKS:
+        cases = sorted((c for c in results.cases if c.task == task and c.found is not None), key=lambda c: c.clip.name)
+        if cases:
+            found[task] = {"clips": {case.clip.name: _cost([case]) for case in cases}, "all": _cost(cases)}
+    return found
+
+
+def _cost(cases: Sequence[Case]) -> dict[str, Any]:
+    seconds: Counter[str] = Counter()
+    frames, peaks = 0, [float("nan")]
+    for case in cases:
+        assert case.found is not None
+        seconds.update(case.found.seconds)
+        frames += len(case.found.looked)
+        peaks.append(case.found.peak_mb)
+    total = sum(seconds.values())
+    known = [peak for peak in peaks if np.isfinite(peak)]
+    return {
+        "frames": frames,
+        "seconds": total,
+        "frames_per_s": ratio(frames, total),
+        "ms_per_frame": {stage: 1000 * ratio(spent, frames) for stage, spent in sorted(seconds.items())},
+        "peak_mb": max(known) if known else float("nan"),
+    }

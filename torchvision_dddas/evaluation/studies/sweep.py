@@ -1,30 +1,39 @@
 """Sweeps: the same study with other parameters, on a grid or as Optuna proposes, and which of them measure best.
 
-Nothing random is left open and every study takes from the cache what it has computed before: a sweep that was broken
-off and is asked for again goes the same way, and is soon where it was.
+Nothing random is left open, and every study takes from the cache what was computed before: a sweep that was interrupted
+and is started again takes the same way, and soon is where it was.
 """
 
+import glob
+import itertools
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchvision_dddas.config import Settings, changes, format_toml
+from torchvision_dddas.config import Settings, changes, format_toml, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.axes import Axis, Choice, points, possible
+from torchvision_dddas.evaluation.studies.goals import Goal, goal_value
+from torchvision_dddas.evaluation.studies.jobs import Event
+from torchvision_dddas.evaluation.studies.runner import cache_folder, plan_study, run_jobs, run_study
+from torchvision_dddas.evaluation.studies.search_space import Axis, Choice, why_impossible
+from torchvision_dddas.evaluation.studies.spec import Spec
+from torchvision_dddas.evaluation.studies.storage import Cache
+from torchvision_dddas.evaluation.studies.workers import Workers
+from torchvision_dddas.io.atomic_files import cannot_write, write_whole
 
 if TYPE_CHECKING:
-    from optuna.study import Study as Optuna
     from optuna.trial import Trial as Proposal
 
 Measured = tuple[float, str]
-"""The measure, NaN where there is none, and then why."""
+"""The measure, NaN if there is none, and then why."""
 
 Measure = Callable[[Mapping[str, object]], Measured]
 """What a study measures with some parameters changed."""
-
-Ahead = Callable[[Sequence[Mapping[str, object]]], None]
 
 AHEAD = 12  # points of a grid whose clips the workers share
 
@@ -39,73 +48,208 @@ class Trial:
     cause: str = ""
 
 
-def on_grid(axes: Sequence[Choice], settings: Settings, measure: Measure, ahead: Ahead) -> Iterator[Trial]:
-    """The settings as they are, then all points of a grid. Raises InputError where it has too many or no possible one.
-
-    A point whose parameters cannot have their values together has a cause and no value. ahead: is told the points that
-    will be measured next.
-    """
-    wanted = list(points(axes))
-    causes = [possible(settings, parameters) for parameters in wanted]
-    if all(causes):
-        raise InputError(f"no point of the grid is possible; the first: {causes[0]}")
-    todo: list[tuple[Mapping[str, object], str]] = [({}, ""), *zip(wanted, causes, strict=True)]
-    for first in range(0, len(todo), AHEAD):
-        part = todo[first : first + AHEAD]
-        ahead([parameters for parameters, cause in part if not cause])
-        for number, (parameters, cause) in enumerate(part, first):
-            yield (
-                Trial(number, parameters, math.nan, cause) if cause else Trial(number, parameters, *measure(parameters))
-            )
-
-
-def proposed(
-    axes: Sequence[Axis], settings: Settings, measure: Measure, count: int, seed: int, least: bool
+def search_grid(
+    axes: Sequence[Choice],
+    settings: Settings,
+    measure: Measure,
+    prepare: Callable[[Sequence[Mapping[str, object]]], None] = lambda points: None,
 ) -> Iterator[Trial]:
-    """The settings as they are, then `count` points that Optuna's tree-structured Parzen estimator proposes.
+    """Measure the settings as they are, then every point of a grid, the last axis the quickest.
 
-    least: less is better. Raises InputError where Optuna is not installed.
+    prepare: is given the next points before they are measured. A point whose values are impossible together has a cause
+    and no value. Raises InputError if no point is possible.
     """
-    need_optuna()
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    sampler = optuna.samplers.TPESampler(seed=seed)
-    study = optuna.create_study(direction="minimize" if least else "maximize", sampler=sampler)
-    yield Trial(0, {}, *measure({}))
-    for number in range(1, count + 1):
-        proposal = study.ask()
-        parameters = {axis.parameter: _suggested(proposal, axis) for axis in axes}
-        cause = possible(settings, parameters)
-        trial = Trial(number, parameters, math.nan, cause) if cause else Trial(number, parameters, *measure(parameters))
-        _tell(study, proposal, trial)
-        yield trial
+    points: list[tuple[dict[str, object], str]] = [({}, "")]
+    for values in itertools.product(*(axis.values for axis in axes)):
+        parameters = {axis.parameter: value for axis, value in zip(axes, values, strict=True)}
+        points.append((parameters, why_impossible(settings, parameters)))
+    if all(cause for _, cause in points[1:]):
+        raise InputError(f"no point of the grid is possible; the first: {points[1][1]}")
+    for first in range(0, len(points), AHEAD):
+        part = points[first : first + AHEAD]
+        prepare([parameters for parameters, cause in part if not cause])
+        for number, (parameters, cause) in enumerate(part, first):
+            yield Trial(number, parameters, *((math.nan, cause) if cause else measure(parameters)))
 
 
-def need_optuna() -> None:
-    """Raises InputError where Optuna is not installed."""
+def check_optuna() -> None:
+    """Raises InputError if Optuna is not installed."""
     if find_spec("optuna") is None:
         raise InputError("--optuna needs optuna; pip install 'torchvision-dddas[tune]', or take --grid")
 
 
-def best(trials: Sequence[Trial], least: bool) -> Trial | None:
-    """The trial of the best value, of equal ones the first; None where none has a value."""
-    return next((trial for trial in ranked(trials, least) if not math.isnan(trial.value)), None)
+def search_ranges(
+    axes: Sequence[Axis], settings: Settings, measure: Measure, count: int, seed: int = 0, minimize: bool = False
+) -> Iterator[Trial]:
+    """Measure the settings as they are, then `count` points that Optuna's TPESampler proposes.
+
+    Raises InputError if Optuna is not installed.
+    """
+    check_optuna()
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampler = optuna.samplers.TPESampler(seed=seed)
+    study = optuna.create_study(direction="minimize" if minimize else "maximize", sampler=sampler)
+    yield Trial(0, {}, *measure({}))
+    for number in range(1, count + 1):
+        proposal = study.ask()
+        parameters = {axis.parameter: _suggest(proposal, axis) for axis in axes}
+        cause = why_impossible(settings, parameters)
+        trial = Trial(number, parameters, *((math.nan, cause) if cause else measure(parameters)))
+        if math.isnan(trial.value):
+            study.tell(proposal, state=optuna.trial.TrialState.FAIL)
+        else:
+            study.tell(proposal, trial.value)
+        yield trial
 
 
-def ranked(trials: Sequence[Trial], least: bool) -> list[Trial]:
+def _suggest(proposal: "Proposal", axis: Axis) -> object:
+    if isinstance(axis, Choice):
+        # By their places: Optuna takes no lists as values.
+        return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
+    if axis.step:
+        return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
+    return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
+
+
+def best(trials: Sequence[Trial], minimize: bool) -> Trial | None:
+    """The trial with the best value, of equal ones the first; None if none has a value."""
+    return next((trial for trial in ranked(trials, minimize) if not math.isnan(trial.value)), None)
+
+
+def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
     """The best first, equal ones in their order, those without a value last."""
-    sign = 1 if least else -1
+    sign = 1 if minimize else -1
     return sorted(trials, key=lambda t: (math.isnan(t.value), 0 if math.isnan(t.value) else sign * t.value, t.number))
 
 
-def written(value: object) -> str:
-    """A parameter's value as TOML has it, and as `--set` takes it."""
-    return format_toml({"value": value}).removeprefix("value = ").rstrip()
+@dataclass
+class StudyMeasure:
+    """Runs the studies of a sweep. tell: is given how many of how many clips are done."""
+
+    spec: Spec
+    base: Path
+    goal: Goal
+    workers: Workers = field(default_factory=lambda: Workers(1))
+    cache: Path | None = None
+    tell: Callable[[int, int], object] = lambda done, of: None
+
+    def measure(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
+        """The goal's value over clips of these names; if it has none, why."""
+        changed = tuple(f"{name}={toml_value(value)}" for name, value in parameters.items())
+        spec = replace(self.spec, overrides=(*self.spec.overrides, *changed))
+        names = [glob.escape(name) for name in clips]
+        results = run_study(spec, self.base, self.workers, self.cache, names, self._counter(len(clips)))
+        return goal_value(self.goal, results.cases)
+
+    def prepare(self, points: Sequence[Mapping[str, object]], clips: Sequence[str]) -> None:
+        """Compute what the studies of several points need, so that no worker has to wait between them."""
+        planned = plan_study(self.spec, self.base, [glob.escape(name) for name in clips])
+        each = [
+            replace(job, settings=with_parameters(job.settings, parameters))
+            for parameters in points
+            for job in planned.jobs
+        ]
+        jobs = [replace(job, number=number) for number, job in enumerate(each)]
+        run_jobs(jobs, self.workers, Cache(self.cache or cache_folder()), self._counter(len(jobs)))
+
+    def _counter(self, total: int) -> Callable[[Event], None]:
+        done = 0
+
+        def tell(event: Event) -> None:
+            nonlocal done
+            done += event.done is not None
+            self.tell(done, total)
+
+        return tell
 
 
-def as_toml(settings: Settings, heading: Sequence[str]) -> str:
-    """What differs from the defaults, as `--config` takes it, under some lines of comment."""
+def split_clips(
+    spec: Spec, base: Path, clips: Sequence[str], holdout: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of the clips that are tuned on, and of those held out. Raises InputError if either is empty."""
+    names = [job.clip.name for job in plan_study(spec, base, clips).jobs]
+    held = tuple(name for name in names if any(fnmatchcase(name, pattern) for pattern in holdout))
+    tuned = tuple(name for name in names if name not in held)
+    if holdout and not held:
+        raise InputError(f"--holdout {','.join(holdout)} fits no clip; there are {', '.join(names)}")
+    if not tuned:
+        raise InputError(f"--holdout {','.join(holdout)} leaves no clip to measure; there are {', '.join(names)}")
+    return tuned, held
+
+
+@dataclass
+class SweepRecord:
+    """What a sweep has found so far: sweep.json after every trial, best.toml at the end.
+
+    tuned, held: names of clips. on_held: the measure on those held out, with the settings as they were and the best.
+    """
+
+    folder: Path
+    settings: Settings
+    goal: Goal
+    search: dict[str, Any]
+    tuned: tuple[str, ...]
+    held: tuple[str, ...]
+    trials: list[Trial] = field(default_factory=list)
+    best: Trial | None = None
+    on_held: tuple[Measured, Measured] | None = None
+
+    def add(self, trial: Trial) -> None:
+        """Record a trial. Raises InputError if it cannot be written."""
+        self.trials.append(trial)
+        self._write_json()
+
+    def finish(self, best: Trial, on_held: tuple[Measured, Measured] | None) -> None:
+        """Record the best trial. Raises InputError if it cannot be written."""
+        self.best, self.on_held = best, on_held
+        before = format_value(self.trials[0].value)
+        about = [f"dddas sweep: {self.heading}: {format_value(best.value)}, with the settings as they were {before}."]
+        about += [f"{parameter}: {value}" for parameter, value in best.parameters.items()]
+        if on_held is not None:
+            about.append(f"On the clips held out: {format_value(on_held[1][0])}, before {format_value(on_held[0][0])}.")
+        self._write_json()
+        self._write("best.toml", settings_toml(with_parameters(self.settings, best.parameters), about))
+
+    @property
+    def heading(self) -> str:
+        """What is measured, in words."""
+        return f"{self.goal.name}, {self.goal.by} over {len(self.tuned)} clip{'s' * (len(self.tuned) != 1)}"
+
+    def _write_json(self) -> None:
+        trials = [
+            {"number": t.number, "knobs": dict(t.parameters), "value": _null_if_nan(t.value), "cause": t.cause}
+            for t in self.trials
+        ]
+        held = None
+        if self.on_held is not None:
+            held = {"before": _null_if_nan(self.on_held[0][0]), "best": _null_if_nan(self.on_held[1][0])}
+        content = {
+            "format": 1,
+            "measure": self.goal.name,
+            "by": self.goal.by,
+            "better": "less" if self.goal.minimize else "more",
+            "search": self.search,
+            "settings": changes(self.settings),
+            "clips": self.tuned,
+            "held_out": self.held,
+            "trials": trials,
+            "best": None if self.best is None else self.best.number,
+            "on_held_out": held,
+        }
+        self._write("sweep.json", json.dumps(content, indent=2) + "\n")
+
+    def _write(self, name: str, text: str) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self.folder / name, text.encode())
+        except OSError as error:
+            raise cannot_write(self.folder / name, error) from error
+
+
+def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
+    """What differs from the defaults, as `--config` takes it, below some lines of comment."""
     groups: dict[str, dict[str, object]] = {}
     for name, value in changes(settings).items():
         group, parameter = name.split(".")
@@ -113,32 +257,15 @@ def as_toml(settings: Settings, heading: Sequence[str]) -> str:
     return format_toml(groups, heading)
 
 
-def told(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    """The trials as JSON has them."""
-    return [
-        {
-            "number": t.number,
-            "knobs": dict(t.parameters),
-            "value": None if math.isnan(t.value) else t.value,
-            "cause": t.cause,
-        }
-        for t in trials
-    ]
+def toml_value(value: object) -> str:
+    """A parameter's value as `--set` takes it."""
+    return format_toml({"value": value}).removeprefix("value = ").rstrip()
 
 
-def _suggested(proposal: "Proposal", axis: Axis) -> object:
-    if isinstance(axis, Choice):
-        # By their places: a list is no choice that Optuna knows.
-        return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
-    if axis.step:
-        return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
-    return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
+def format_value(value: float) -> str:
+    """A measure to four digits; a dash if there is none."""
+    return "–" if math.isnan(value) else f"{value:.4f}"
 
 
-def _tell(study: "Optuna", proposal: "Proposal", trial: Trial) -> None:
-    import optuna
-
-    if math.isnan(trial.value):
-        study.tell(proposal, state=optuna.trial.TrialState.FAIL)
-    else:
-        study.tell(proposal, trial.value)
+def _null_if_nan(value: float) -> float | None:
+    return None if math.isnan(value) else value

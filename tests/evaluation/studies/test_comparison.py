@@ -8,10 +8,11 @@ from tests.evaluation.studies.scored_clips import found_of, masked, tracked, wal
 from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.evaluation.studies import comparing
-from torchvision_dddas.evaluation.studies.comparing import compare
-from torchvision_dddas.evaluation.studies.scored import SCORES, ScoredCase, ScoredStudy, read_scores, write_scores
+from torchvision_dddas.evaluation.studies import comparison
+from torchvision_dddas.evaluation.studies.comparison import compare_studies
+from torchvision_dddas.evaluation.studies.results import ScoredCase, ScoredStudy
 from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.storage import SCORES, read_scores, write_scores
 
 
 @pytest.fixture(autouse=True)
@@ -33,14 +34,14 @@ def of_tracks(folder, name, miss, clips=range(8)) -> ScoredStudy:
 
 def test_a_study_beside_itself_is_the_same(tmp_path):
     one = of_tracks(tmp_path, "one", 0.2, range(3))
-    found = compare(one, one)["tasks"]["tracking"]
+    found = compare_studies(one, one)["tasks"]["tracking"]
     assert found["same"] == ["clip-0", "clip-1", "clip-2"]
     assert found["clips"] == {}
     assert {entry["says"] for entry in found["pooled"]["tracks"].values()} == {"the same"}
 
 
 def test_what_got_worse_everywhere_is_worse_beyond_noise(tmp_path):
-    found = compare(of_tracks(tmp_path, "one", 0.05), of_tracks(tmp_path, "two", 0.6))["tasks"]["tracking"]
+    found = compare_studies(of_tracks(tmp_path, "one", 0.05), of_tracks(tmp_path, "two", 0.6))["tasks"]["tracking"]
     mota = found["pooled"]["tracks"]["mota"]
     assert mota["says"] == "worse"
     assert mota["change"] == mota["second"] - mota["first"] < 0
@@ -51,14 +52,14 @@ def test_what_got_worse_everywhere_is_worse_beyond_noise(tmp_path):
 
 
 def test_other_noise_of_the_same_size_is_within_noise(tmp_path):
-    found = compare(of_tracks(tmp_path, "one", 0.2), of_tracks(tmp_path, "two", 0.21))["tasks"]["tracking"]
+    found = compare_studies(of_tracks(tmp_path, "one", 0.2), of_tracks(tmp_path, "two", 0.21))["tasks"]["tracking"]
     assert {entry["says"] for entry in found["pooled"]["tracks"].values()} <= {"within noise", "the same"}
     assert found["pooled"]["tracks"]["mota"]["over_clips"]["enough"]
 
 
 def test_few_clips_are_said_to_tell_too_little_or_only_of_themselves(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.05, range(2)), of_tracks(tmp_path, "two", 0.7, range(2))
-    pooled = compare(one, two)["tasks"]["tracking"]["pooled"]["tracks"]
+    pooled = compare_studies(one, two)["tasks"]["tracking"]["pooled"]["tracks"]
     assert pooled["mota"]["over_clips"] is None
     assert pooled["mota"]["says"] == "worse on these clips"
     assert pooled["hota"]["says"] == "too little to tell"  # of whole tracks: frames say nothing of it
@@ -67,20 +68,20 @@ def test_few_clips_are_said_to_tell_too_little_or_only_of_themselves(tmp_path):
 def test_the_order_of_cases_changes_nothing(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.1, range(6)), of_tracks(tmp_path, "two", 0.3, range(6))
     turned = [ScoredStudy(study.name, study.cases[::-1]) for study in (one, two)]
-    assert json.dumps(compare(one, two)) == json.dumps(compare(*turned))
+    assert json.dumps(compare_studies(one, two)) == json.dumps(compare_studies(*turned))
 
 
 def test_clips_of_one_study_alone_are_named_and_no_common_clip_is_refused(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.1, (0, 1)), of_tracks(tmp_path, "two", 0.2, (1, 2))
-    found = compare(one, two)
+    found = compare_studies(one, two)
     assert found["notes"] == [
         "clip-0, tracking: only in the first study, one",
         "clip-2, tracking: only in the second study, two",
     ]
     with pytest.raises(InputError, match=r"no clip of the same task .* the first has clip-0 \(tracking\), the second"):
-        compare(ScoredStudy("one", one.cases[:1]), ScoredStudy("two", two.cases[1:]))
+        compare_studies(ScoredStudy("one", one.cases[:1]), ScoredStudy("two", two.cases[1:]))
     with pytest.raises(InputError, match="the second nothing"):
-        compare(one, ScoredStudy("two", ()))
+        compare_studies(one, ScoredStudy("two", ()))
 
 
 def test_another_truth_or_other_frames_are_not_compared(tmp_path):
@@ -92,19 +93,19 @@ def test_another_truth_or_other_frames_are_not_compared(tmp_path):
         clip, truth=replace(clip.truth, tracks=clip.truth.tracks.at(np.arange(1, len(clip.truth.tracks.frame))))
     )
     other = ScoredCase("tracking", "clip-0", score(fewer, "tracking", found))
-    notes = compare(one, ScoredStudy("two", (other, two.cases[1])))["notes"]
+    notes = compare_studies(one, ScoredStudy("two", (other, two.cases[1])))["notes"]
     assert len(notes) == 1
     assert "clip-0, tracking: its truth is another" in notes[0]
     short, found = tracked(tmp_path / "more" / "short", 0, 20)
     other = ScoredCase("tracking", "clip-0", score(short, "tracking", found))
     with pytest.raises(InputError, match="no clip can be compared; clip-0, tracking: other frames were scored"):
-        compare(ScoredStudy("one", one.cases[:1]), ScoredStudy("two", (other,)))
+        compare_studies(ScoredStudy("one", one.cases[:1]), ScoredStudy("two", (other,)))
 
 
 def test_less_is_better_where_it_is(tmp_path):
     entry = {"change": -0.1, "over_frames": {"p_holm": 0.01, "enough": True}}
-    assert comparing._says(entry, "log_average_miss_rate") == "better"
-    assert comparing._says(entry, "f") == "worse"
+    assert comparison._says(entry, "log_average_miss_rate") == "better"
+    assert comparison._says(entry, "f") == "worse"
 
 
 def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):
@@ -115,7 +116,7 @@ def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):
             blank = dict.fromkeys(found.masks, found.masks[1])
             found = found_of(walk(0, 12)[1][::2], 12, blank, False)
         cases.append(ScoredStudy(f"{seed}", (ScoredCase("motion", "clip", score(clip, "motion", found)),)))
-    found = compare(*cases)["tasks"]["motion"]
+    found = compare_studies(*cases)["tasks"]["motion"]
     assert list(found["pooled"]) == ["pixels", "boxes", "ranking"]
     assert list(found["clips"]["clip"]["pixels"]) == ["f"]
 

@@ -1,4 +1,4 @@
-"""Two studies of the same clips beside each other: what changed, and is it beyond noise?"""
+"""Two studies of the same clips compared: what changed, and whether it is beyond noise."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
 from torchvision_dddas.evaluation.studies import estimates
 from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
-from torchvision_dddas.evaluation.studies.scored import Scored, ScoredStudy
+from torchvision_dddas.evaluation.studies.results import Scored, ScoredStudy
 from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures
 
 ASKED: Mapping[str, tuple[str, ...]] = {
@@ -32,7 +32,7 @@ LEVEL = 0.05
 Pairs = dict[str, tuple[Scored, Scored]]
 
 
-def compare(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
+def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
     """What changed from the first study to the second, on the clips that both have.
 
     {"first", "second": names, "tasks": {task: {"same": clips whose counts are alike to the last digit, "pooled":
