@@ -46,7 +46,7 @@ def main() -> None:
         measure(options.out / name, [*command, *first])
     tables = [str(options.out / name) for name in studies]
     if options.write:
-        places = ["--readme", str(ROOT / "README.md"), "--details", str(HERE / "README.md")]
+        places = ["--readme", str(ROOT / "docs" / "benchmarks.md"), "--details", str(HERE / "README.md")]
         places += ["--plot", str(ROOT / "docs" / "onboard.png")]
     else:
         places = ["--plot", str(options.out / "onboard.png")]

@@ -267,7 +267,7 @@ def main() -> None:
     except (OSError, ValueError) as error:
         sys.exit(str(error))
     people = rest[0] if rest else None
-    if options.readme and options.readme.resolve() == results.ROOT / "README.md":
+    if options.readme and options.readme.resolve() == results.ROOT / "docs" / "benchmarks.md":
         for name, content in (("speed", speed), ("live", live), *([("people", people)] if people else [])):
             results.keep(f"onboard-{name}", {"command": results.command(), "day": results.today(), **content})
     if options.readme:

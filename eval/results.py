@@ -14,7 +14,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "results"
-TEXTS = {"README.md": "readme", "eval/README.md": "eval", "docs/tuning.md": "tuning"}
+TEXTS = {"docs/benchmarks.md": "readme", "eval/README.md": "eval", "docs/tuning.md": "tuning"}
 """The texts of this project that hold what was measured, and what the files of their results begin with."""
 
 Block = str | dict[str, Any]

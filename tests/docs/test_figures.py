@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(
     not (ROOT / "docs" / "results").is_dir(), reason="results and studies are in a checkout, not in a package"
 )
 
-TEXTS = ("README.md", "eval/README.md", "docs/tuning.md")
+TEXTS = ("docs/benchmarks.md", "eval/README.md", "docs/tuning.md")
 # A table with a column of numbers, which are set to the right.
 MEASURED = re.compile(r"^\|[- |:]*---:[- |:]*\|$", re.M)
 
@@ -38,12 +38,12 @@ def test_a_figure_that_is_changed_by_hand_is_told(figures, tmp_path, monkeypatch
     for text in TEXTS:
         (tmp_path / text).parent.mkdir(exist_ok=True)
         (tmp_path / text).write_text((ROOT / text).read_text())
-    readme = tmp_path / "README.md"
+    readme = tmp_path / "docs" / "benchmarks.md"
     changed = readme.read_text().replace("| bms_cars1 | 0.85 ", "| bms_cars1 | 0.95 ")
     assert changed != readme.read_text()
     readme.write_text(changed)
     monkeypatch.setattr(figures.results, "ROOT", tmp_path)
-    assert figures.differing() == [("README.md", "accuracy")]
+    assert figures.differing() == [("docs/benchmarks.md", "accuracy")]
 
 
 @pytest.mark.parametrize("text", TEXTS)
@@ -70,14 +70,15 @@ def test_a_study_that_writes_a_text_keeps_what_it_wrote(figures, tmp_path, monke
     monkeypatch.setattr(results, "ROOT", tmp_path)
     monkeypatch.setattr(results, "FOLDER", tmp_path / "docs" / "results")
     (tmp_path / "data").mkdir()
+    (tmp_path / "docs").mkdir(exist_ok=True)
     monkeypatch.setattr(sys, "argv", [str(tmp_path / "eval" / "study.py"), "/usr", "--seeds", "3"])
-    (tmp_path / "README.md").write_text("before\n<!-- gain -->\n<!-- /gain -->\nafter\n")
+    (tmp_path / "docs" / "benchmarks.md").write_text("before\n<!-- gain -->\n<!-- /gain -->\nafter\n")
     table = "Of two clips:\n\n| clip | ms |\n| --- | ---: |\n| a | 1.5 |\n| b | – |"
-    report.put(tmp_path / "README.md", "gain", table)
+    report.put(tmp_path / "docs" / "benchmarks.md", "gain", table)
     (kept,) = results.every()
-    assert (kept.into, kept.mark, kept.command) == ("README.md", "gain", "python eval/study.py DATA --seeds 3")
+    assert (kept.into, kept.mark, kept.command) == ("docs/benchmarks.md", "gain", "python eval/study.py DATA --seeds 3")
     assert kept.blocks[1]["rows"] == [["a", "1.5"], ["b", "–"]] and kept.text() == table
-    assert f"<!-- gain -->\n\n{table}\n\n<!-- /gain -->\nafter" in (tmp_path / "README.md").read_text()
+    assert f"<!-- gain -->\n\n{table}\n\n<!-- /gain -->\nafter" in (tmp_path / "docs" / "benchmarks.md").read_text()
 
 
 def test_a_text_elsewhere_is_written_and_nothing_is_kept(figures, tmp_path, monkeypatch) -> None:

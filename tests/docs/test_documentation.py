@@ -1,0 +1,94 @@
+"""The README and the pages under docs/ hold: commands, links, files and examples exist and run."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.synthetic_clip import film_into
+from torchvision_dddas.cli import app
+from torchvision_dddas.config import load_config
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+}
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGES[page], re.DOTALL)
+
+
+COMMANDS = sorted(
+    {
+        line.partition("#")[0].removeprefix("$ ").strip()
+        for page in PAGES
+        for block in [*blocks(page, "sh"), *blocks(page, "console")]
+        for line in block.splitlines()
+        if line.removeprefix("$ ").startswith("dddas ") and "COMMAND" not in line
+    }
+)
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_every_command_exists_with_its_options(line: str) -> None:
+    words = shlex.split(line)[1:]
+    names = words[:2] if words[0] == "locate" else words[:1]
+    result = CliRunner().invoke(app, [*names, "--help"])
+    assert result.exit_code == 0
+    assert [word for word in words if word.startswith("--") and word not in result.output] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_and_picture_leads_to_a_file(page: str) -> None:
+    home = ROOT if page == "README.md" else ROOT / "docs"
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", PAGES[page]) if "://" not in link]
+    assert [link for link in links if link and not (home / link).exists()] == []
+
+
+def test_every_file_that_the_method_page_names_is_there() -> None:
+    named = re.findall(r"`([\w/]+\.(?:py|toml|onnx))`", PAGES["method.md"])
+    assert len(named) >= 40
+    assert [
+        name for name in named if not (ROOT / "torchvision_dddas" / name).exists() and not (ROOT / name).exists()
+    ] == []
+
+
+def test_every_room_is_on_the_architecture_page() -> None:
+    rooms = sorted(path.parent.name for path in (ROOT / "torchvision_dddas").glob("*/__init__.py"))
+    assert [room for room in rooms if f"{room}/" not in PAGES["architecture.md"]] == []
+
+
+@pytest.fixture(scope="module")
+def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("docs")
+    film_into(folder / "demo-out/clip", frames=12, size=(480, 360))
+    return folder
+
+
+@pytest.mark.parametrize("page", ["README.md", "python.md"])
+def test_the_python_examples_run_one_after_another(page: str, demo_folder: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(demo_folder)
+    names: dict[str, object] = {}
+    for code in blocks(page, "python"):
+        exec(compile(code, page, "exec"), names)
+    assert len(capsys.readouterr().out.splitlines()) >= 5
+
+
+def test_the_camera_and_the_configuration_of_the_commands_page_can_be_read(tmp_path: Path) -> None:
+    from torchvision_dddas.io.camera_files import describe_missing, read_camera
+
+    own, camera = blocks("commands.md", "toml")
+    (tmp_path / "own.toml").write_text(own)
+    assert load_config(tmp_path / "own.toml").gates.min_area_px == 80
+    (tmp_path / "ugv.toml").write_text(camera)
+    assert read_camera(tmp_path / "ugv.toml").geographic
+    assert describe_missing(tmp_path / "ugv.toml") == ""
+
+
+def test_the_readme_is_short_and_its_picture_small() -> None:
+    assert len(PAGES["README.md"].splitlines()) <= 170
+    assert len(PAGES["README.md"].encode()) <= 12_000
+    assert (ROOT / "docs/demo.jpg").stat().st_size < 300_000
