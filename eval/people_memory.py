@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from torchvision_dddas.config import load_config
-from torchvision_dddas.people.detector import recognizer_of
+from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.targets import scan
 
 def held_mb():
@@ -28,7 +28,7 @@ width, height, frames, threads, *chosen = sys.argv[1:]
 size, parameters = (int(width), int(height)), load_config(None, chosen).people
 cv2.setNumThreads(int(threads))
 held = [held_mb()]
-recognizer = recognizer_of(parameters, "onboard")
+recognizer = load_scorer(parameters, "onboard")
 for frame in range(int(frames)):
     image = np.random.default_rng(frame).integers(0, 256, (size[1], size[0], 3), np.uint8)
     recognizer.scores([image], [scan.everywhere(size, parameters)])

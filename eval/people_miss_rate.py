@@ -25,8 +25,8 @@ from people_opencv import Setting
 from scipy.optimize import minimize
 
 from torchvision_dddas.config import PeopleParameters, load_config
-from torchvision_dddas.people.boxes import probability
-from torchvision_dddas.people.detector import people_in, recognizer_of
+from torchvision_dddas.people.detector import detect_people, load_scorer
+from torchvision_dddas.people.suppression import probability
 from torchvision_dddas.types import People
 
 DEFAULTS = Setting(1.0, 1.05, 8, 0, 2, 0.0)
@@ -79,10 +79,10 @@ def main() -> None:
 
 def recognized(clip: Clip, parameters: PeopleParameters) -> dict[int, People]:
     """The people of every frame, by the onboard back end."""
-    recognizer = recognizer_of(parameters, "onboard")
+    recognizer = load_scorer(parameters, "onboard")
     found = {}
     for i, (number, image) in enumerate(clip.frames.items(), start=1):
-        (found[number],) = people_in([image], recognizer, parameters)
+        (found[number],) = detect_people([image], recognizer, parameters)
         print(f"\r{clip.name}: {i} of {len(clip.frames)} frames", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     return found

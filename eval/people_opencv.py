@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from people_curves import Clip, Curve, Found, curve, matched
 
-from torchvision_dddas.people.suppression import group
+from torchvision_dddas.people.suppression import group_rectangles
 
 STRIDE, PADDING, LEAST = 4, 32, -0.5
 
@@ -69,7 +69,7 @@ def rectangles(scored: np.ndarray, size: tuple[int, int], setting: Setting) -> F
     there = (x >= -padding) & (y >= -padding) & (x + 64 <= width + padding) & (y + 128 <= height + padding)
     there &= ((x + padding) % stride == 0) & ((y + padding) % stride == 0) & (score >= setting.hit)
     corner = np.stack([x, y, np.full_like(x, 64), np.full_like(x, 128)], axis=1)
-    box, best = group(np.rint(corner * level_scale[:, None])[there], score[there], setting.groups)
+    box, best = group_rectangles(np.rint(corner * level_scale[:, None])[there], score[there], setting.groups)
     low = np.maximum(box[:, :2], 0)
     high = np.minimum(box[:, :2] + box[:, 2:], np.rint(np.array(size) * setting.enlarge))
     return np.concatenate([low, high - low], axis=1) / setting.enlarge, best

@@ -33,11 +33,10 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people import pyramid
 from torchvision_dddas.people import suppression as suppress
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.detector import people_in
-from torchvision_dddas.people.scorer import WindowScorer, load_scorer
+from torchvision_dddas.people.detector import WindowScorer, detect_people, load_scorer
 
 # What detectMultiScale does unless told otherwise, whatever the project's defaults.
 PLAIN = PeopleParameters(
@@ -100,11 +99,11 @@ class Parity:
 def compare(images: Iterable[np.ndarray], parameters: PeopleParameters, backends: Sequence[str]) -> dict[str, Parity]:
     """Each back end beside OpenCV over all pictures."""
     svm = read_classifier(parameters.classifier, 3780)
-    engines = {name: load_scorer(name, parameters, svm) for name in backends}
+    engines = {name: load_scorer(parameters, name, svm) for name in backends}
     figures = {name: Parity() for name in backends}
     for image in images:
         size = image.shape[1], image.shape[0]
-        parts = scan.everywhere(size, parameters)
+        parts = pyramid.everywhere(size, parameters)
         wanted = [opencv_scores(image, part.level, parameters) for part in parts]
         boxes = opencv_boxes(image, parameters)
         for name, engine in engines.items():
@@ -167,8 +166,8 @@ def opencv_boxes(image: np.ndarray, parameters: PeopleParameters, group: int | N
 
 def own_boxes(maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters) -> np.ndarray:
     """The same from our maps, cut at the picture's border; those wholly outside are dropped, as OpenCV does."""
-    boxes, scores = suppress.group(
-        *scan.windows(scan.everywhere(size, parameters), maps, size, parameters),
+    boxes, scores = suppress.group_rectangles(
+        *pyramid.windows(pyramid.everywhere(size, parameters), maps, size, parameters),
         parameters.group,
         parameters.group_distance,
     )
@@ -198,7 +197,7 @@ def crops(folder: Path, backends: Sequence[str]) -> None:
     for rule, (wanted, pictures, parameters) in rules.items():
         words = [f"| {rule} | {sum(map(bool, wanted))} |"]
         for name in backends:
-            found = accepted(pictures, load_scorer(name, parameters, svm), parameters)
+            found = accepted(pictures, load_scorer(parameters, name, svm), parameters)
             missed = sum(bool(right) and not one for right, one in zip(wanted, found, strict=True))
             words.append(f"{sum(found)} | {missed} |")
         print(*words, flush=True)
@@ -206,7 +205,7 @@ def crops(folder: Path, backends: Sequence[str]) -> None:
 
 def accepted(images: Sequence[np.ndarray], recognizer: WindowScorer, parameters: PeopleParameters) -> list[bool]:
     """Whether each shows anybody."""
-    return [len(people.box_px) > 0 for people in people_in(images, recognizer, parameters)]
+    return [len(people.box_px) > 0 for people in detect_people(images, recognizer, parameters)]
 
 
 def middle(image: np.ndarray) -> np.ndarray:

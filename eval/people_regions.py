@@ -24,8 +24,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people.detector import recognize, recognizer_of
-from torchvision_dddas.people.scorer import WindowScorer
+from torchvision_dddas.people.detector import WindowScorer, detect_in_clip, load_scorer
 from torchvision_dddas.types import DetectionTable, Frame, PeopleFrame
 
 LIKELY = 0.5
@@ -50,7 +49,7 @@ def main() -> None:
     if not places:
         sys.exit(f"{options.data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
     settings = load_config(overrides=options.set)
-    engine = recognizer_of(settings.people, options.backend)
+    engine = load_scorer(settings.people, options.backend)
     rows = [
         "| clip | searched | recall % | of everywhere % | false boxes a frame | windows % | time |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
@@ -71,7 +70,7 @@ def of_clip(place: Path, settings: Settings, engine: WindowScorer, count: int) -
     moving = movers(islice(iter(open_source(video)), count), settings, rate_hz)
     clips = tee(islice(iter(open_source(video)), count), len(MODES))
     runs = [
-        recognize(
+        detect_in_clip(
             clip, engine, with_parameters(settings, {"people.search": search}), moving if around else None, batch=1
         )
         for clip, (search, around) in zip(clips, MODES.values(), strict=True)

@@ -32,10 +32,10 @@ from synthetic import render
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import OnnxScorer, opened
-from torchvision_dddas.people.scorer import load_scorer
+from torchvision_dddas.people.detector import load_scorer
+from torchvision_dddas.people.onnx_scorer import OnnxScorer, open_people_graph
 from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import Part
 
@@ -59,7 +59,7 @@ def pictures(source: str | None, size: tuple[int, int], most: int = 20) -> list[
 def rectangles(regions_px: np.ndarray, size: tuple[int, int]) -> list[Part]:
     """The regions at every level where they hold a window."""
     parts = []
-    for level in scan.levels(size, KNOBS):
+    for level in pyramid.levels(size, KNOBS):
         for x, y, width, height in regions_px / level.scale:
             left, top = (8 * round(value / 8) for value in (x, y))
             part = Part(
@@ -77,17 +77,19 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
     regions_px = np.concatenate([REGIONS_PX * size, np.tile(REGION_PX, (3, 1))], axis=1)
     blob, tracked = ((low * BLOB_PX, high * BLOB_PX) for low, high in ((1 / 3, 1.3), (1 / 1.3, 1.3)))
     parts = {
-        "everywhere": scan.everywhere(size, KNOBS),
+        "everywhere": pyramid.everywhere(size, KNOBS),
         "rectangles": rectangles(regions_px, size),
-        "regions": scan.within(regions_px, np.full((3, 2), np.nan), size, KNOBS),
-        "regions blobs": scan.within(regions_px, np.tile(blob, (3, 1)), size, KNOBS),
-        "regions tracked": scan.within(regions_px, np.tile(tracked, (3, 1)), size, KNOBS),
+        "regions": pyramid.within(regions_px, np.full((3, 2), np.nan), size, KNOBS),
+        "regions blobs": pyramid.within(regions_px, np.tile(blob, (3, 1)), size, KNOBS),
+        "regions tracked": pyramid.within(regions_px, np.tile(tracked, (3, 1)), size, KNOBS),
     }
-    whole = scan.cost(parts["everywhere"], KNOBS)
+    whole = pyramid.cost(parts["everywhere"], KNOBS)
     for name, held in parts.items():
         pixels = sum(part.width * part.height for part in held) / 1e6
-        print(f"{name:16} {len(held):3} parts, {pixels:.2f} Mpx, {scan.cost(held, KNOBS) / whole:4.0%} of the windows")
-    onboard = load_scorer("onboard", KNOBS, SVM)
+        print(
+            f"{name:16} {len(held):3} parts, {pixels:.2f} Mpx, {pyramid.cost(held, KNOBS) / whole:4.0%} of the windows"
+        )
+    onboard = load_scorer(KNOBS, "onboard", SVM)
     found: dict[str, Callable[[np.ndarray], object]] = {
         "cv2": lambda image: opencv.detectMultiScale(image, winStride=(8, 8), padding=(0, 0), scale=1.05)
     }
@@ -95,14 +97,14 @@ def chains(size: tuple[int, int]) -> dict[str, Callable[[np.ndarray], object]]:
         found[f"onboard {name}"] = lambda image, held=held: onboard.scores([image], [held])
     found["whole graph"] = whole_graph(parts["everywhere"])
     if find_spec("torch"):
-        torch = load_scorer("torch", KNOBS, SVM)
+        torch = load_scorer(KNOBS, "torch", SVM)
         found["torch everywhere"] = lambda image: torch.scores([image], [parts["everywhere"]])
     return found
 
 
 def whole_graph(parts: list[Part]) -> Callable[[np.ndarray], object]:
     """people.onnx on every level, shared among as many threads as OpenCV takes."""
-    session, svm = opened(SHIPPED, "people.onnx"), OnnxScorer(KNOBS, SVM).svm_feed
+    session, svm = open_people_graph(SHIPPED, "people.onnx"), OnnxScorer(KNOBS, SVM).svm_feed
     threads = ThreadPoolExecutor(cv2.getNumThreads())
 
     def scored(image: np.ndarray, part: Part) -> np.ndarray:

@@ -29,9 +29,9 @@ from people_curves import CLIPS, Clip, Found, curve, read
 from export.train_people import Plan, crops, train, write
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import PeopleParameters
-from torchvision_dddas.people.boxes import people_of
-from torchvision_dddas.people.detector import classifier_of
+from torchvision_dddas.people.classifiers import load_classifier
 from torchvision_dddas.people.pyramid import everywhere, windows
+from torchvision_dddas.people.suppression import people_from_windows
 from torchvision_dddas.people.torch_scorer import TorchScorer
 from torchvision_dddas.types import LinearSvm
 
@@ -122,11 +122,11 @@ def classifiers(
         if key in made:
             continue
         if trial.classifier == "OpenCV":
-            made[key] = classifier_of(parameters)
+            made[key] = load_classifier(parameters)
             continue
         kept = options.out and options.out / f"{trial.size[0]}x{trial.size[1]}_{trial.block}_{options.c:g}.npz"
         if kept and kept.exists():
-            made[key] = classifier_of(parameters.model_copy(update={"classifier": str(kept)}))
+            made[key] = load_classifier(parameters.model_copy(update={"classifier": str(kept)}))
             continue
         larger = max(1.0, trial.size[1] / CROP[1])  # so that large windows have pictures to be trained on, too
         pictures = [resized(image, larger) for image in rest]
@@ -197,7 +197,7 @@ def look(trial: Trial, recognizer: TorchScorer, clip: str, number: int, image: n
     trial.seconds.append(time.process_time() - begun)
     every = np.sort(np.concatenate([scores.ravel() for scores in maps]))
     low = parameters.model_copy(update={"threshold": float(every[-MOST_WINDOWS:][0])})
-    found = people_of(*windows(parts, maps, size, low), size, low)
+    found = people_from_windows(*windows(parts, maps, size, low), size, low)
     trial.found.setdefault(clip, {})[number] = (found.box_px / factor, found.margin)
 
 

@@ -31,9 +31,9 @@ from torchvision_dddas.evaluation.datasets import inria, motchallenge
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.boxes import iou, judged
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.people import pyramid as scan
-from torchvision_dddas.people.boxes import people_of
-from torchvision_dddas.people.detector import people_in, recognizer_of
+from torchvision_dddas.people import pyramid
+from torchvision_dddas.people.detector import detect_people, load_scorer
+from torchvision_dddas.people.suppression import people_from_windows
 from torchvision_dddas.tuning import people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
@@ -58,7 +58,7 @@ class Picture:
     def people(self, parameters: PeopleParameters) -> People:
         """Those whom these parameters find in it."""
         above = self.margin >= parameters.threshold
-        return people_of(self.window_px[above], self.margin[above], self.size, parameters)
+        return people_from_windows(self.window_px[above], self.margin[above], self.size, parameters)
 
 
 def clips(data: Path) -> dict[str, list[Clip]]:
@@ -77,7 +77,7 @@ def clips(data: Path) -> dict[str, list[Clip]]:
 def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], list[Example]]:
     """At most so many pictures of a set, evenly over it; as what is judged and as what is learned from."""
     parameters = Settings().people
-    recognizer = recognizer_of(parameters, "onboard")
+    recognizer = load_scorer(parameters, "onboard")
     low = parameters.model_copy(update={"threshold": parameters.threshold - people.BELOW})
     pictures: list[Picture] = []
     examples: list[Example] = []
@@ -90,10 +90,10 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
             if frame.number not in wanted:
                 continue
             size = (frame.image.shape[1], frame.image.shape[0])
-            parts = scan.everywhere(size, parameters)
+            parts = pyramid.everywhere(size, parameters)
             (maps,) = recognizer.scores([frame.image], [parts])
             truth_px = np.asarray(clip.truth.boxes[frame.number], float).reshape(-1, 4)
-            pictures.append(Picture(group, *scan.windows(parts, maps, size, low), size, truth_px))
+            pictures.append(Picture(group, *pyramid.windows(parts, maps, size, low), size, truth_px))
             held = _Held(maps)
             one = people.scored(frame.image, truth_px, parameters, held)
             examples.append(Example(group, len(examples) + 1, one))
@@ -102,7 +102,7 @@ def scored(group: str, some: Sequence[Clip], most: int) -> tuple[list[Picture], 
     first = pictures[0]
     for frame in open_clip(some[0]):  # what is held is what the recognizer itself finds
         if frame.number in some[0].truth.boxes:  # type: ignore[union-attr]
-            (whole,) = people_in([frame.image], recognizer, parameters)
+            (whole,) = detect_people([frame.image], recognizer, parameters)
             assert np.allclose(whole.box_px, first.people(parameters).box_px), "the kept windows give other people"
         break
     return pictures, examples

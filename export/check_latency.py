@@ -24,7 +24,7 @@ from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people.scorer import load_scorer
+from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.simulation import film, load_scenario
 from torchvision_dddas.types import Frame
 
@@ -68,7 +68,7 @@ def people_ms(images: list[np.ndarray]) -> list[float]:
     from torchvision_dddas.people.pyramid import everywhere
 
     parameters = load_config(None, []).people
-    recognizer = load_scorer("onboard", parameters, read_classifier(parameters.classifier, parameters.features))
+    recognizer = load_scorer(parameters, "onboard", read_classifier(parameters.classifier, parameters.features))
     parts = everywhere(images[0].shape[1::-1], parameters)
     return [spent_ms(lambda image=image: recognizer.scores([image], [parts])) for image in images][1:]  # type: ignore[misc]
 

@@ -56,7 +56,7 @@ def stub(monkeypatch):
             loads.append(backend)
             return Stub(parameters, found)
 
-        monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", load)
+        monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", load)
         return loads
 
     install()
@@ -296,7 +296,7 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
         import torchvision_dddas.people.detector
 
         sys.modules["torchvision_dddas.cli.people"].progress = stopping
-        torchvision_dddas.people.detector.recognizer_of = lambda parameters, backend: Stub(parameters)
+        torchvision_dddas.people.detector.load_scorer = lambda parameters, backend: Stub(parameters)
         torchvision_dddas.cli.main()
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "people", str(clip), *SMALL]

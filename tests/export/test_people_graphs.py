@@ -21,8 +21,8 @@ from torchvision_dddas.export import people_graphs as people
 from torchvision_dddas.export.graph_files import refuse_failed, write_graphs
 from torchvision_dddas.functional import hog
 from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.people.onnx_scorer import OnnxScorer
-from torchvision_dddas.people.scorer import load_scorer
 from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import LinearSvm, Part
 
@@ -103,7 +103,7 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
     svm = LinearSvm(weights, 0.1, "made up")
     part = Part((70, 80), 0, 0, 70, 80)
     ((onboard,),) = OnnxScorer(parameters, svm).scores([image], [[part]])
-    ((torch_scores,),) = load_scorer("torch", parameters, svm).scores([image], [[part]])
+    ((torch_scores,),) = load_scorer(parameters, "torch", svm).scores([image], [[part]])
     assert onboard.shape == (3, 7)
     np.testing.assert_allclose(onboard, torch_scores, atol=3e-5)
 

@@ -12,11 +12,10 @@ pytest.importorskip("torch")
 from export import train_people as script
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.boxes import people_of
-from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.detector import classifier_of, recognizer_of
+from torchvision_dddas.people.classifiers import load_classifier, read_classifier
+from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.people.pyramid import everywhere, windows
-from torchvision_dddas.people.scorer import load_scorer
+from torchvision_dddas.people.suppression import people_from_windows
 from torchvision_dddas.types import LinearSvm, Part
 
 SMALL = PeopleParameters(window_width_px=32, window_height_px=64, scale_step=1.2, enlarge=1.0)
@@ -87,14 +86,14 @@ def trained(folders):
 def test_what_was_trained_finds_people_again_in_other_pictures(trained):
     rng = np.random.default_rng(99)
     parameters = SMALL.model_copy(update={"classifier": str(trained)})
-    recognizer = recognizer_of(parameters, "torch")
+    recognizer = load_scorer(parameters, "torch")
     right = 0
     for _ in range(10):
         image = background(rng, (160, 120))
         x, height = int(rng.integers(30, 130)), int(rng.integers(50, 70))
         stick(image, (x, 100), height, rng)
         parts = everywhere((160, 120), parameters)
-        found = people_of(
+        found = people_from_windows(
             *windows(parts, recognizer.scores([image], [parts])[0], (160, 120), parameters), (160, 120), parameters
         )
         if len(found):
@@ -124,7 +123,7 @@ def test_the_same_pictures_and_seed_give_the_same_numbers_as_text_too(folders, t
 
 def test_the_file_tells_its_layout(trained):
     with pytest.raises(InputError, match=r"window of 32 x 64, the settings say 64 x 128"):
-        classifier_of(PeopleParameters(classifier=str(trained)))
+        load_classifier(PeopleParameters(classifier=str(trained)))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +135,7 @@ def test_descriptors_under_the_weights_are_the_recognizers_scores(parameters):
     size = parameters.window_width_px, parameters.window_height_px
     weights = rng.normal(size=parameters.features).astype(np.float32)
     parts = everywhere((200, 170), parameters)
-    maps = load_scorer("torch", parameters, LinearSvm(weights, 0.5)).scores([image], [parts])[0]
+    maps = load_scorer(parameters, "torch", LinearSvm(weights, 0.5)).scores([image], [parts])[0]
     places, wanted = [], []
     for part, scores in zip(parts[::2], maps[::2], strict=True):
         for row, column in {(0, 0), (scores.shape[0] - 1, scores.shape[1] - 1)}:

@@ -225,9 +225,9 @@ def _classifier(path: Path) -> None:
 
 def _manifest(path: Path) -> None:
     from torchvision_dddas.config import PeopleParameters
-    from torchvision_dddas.people.onnx_scorer import graphs
+    from torchvision_dddas.people.onnx_scorer import find_graphs
 
-    graphs(PeopleParameters(graphs=str(path.parent)))
+    find_graphs(PeopleParameters(graphs=str(path.parent)))
 
 
 def _folder(path: Path) -> None:

@@ -6,8 +6,7 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.detector import classifier_of
+from torchvision_dddas.people.classifiers import load_classifier, read_classifier
 
 WEIGHTS = np.array([0.5, -1.25, 3.0, 0.0, 2.0, -0.75], np.float32)
 BIAS = -0.5
@@ -27,7 +26,7 @@ def write(folder, name, content):
 
 
 def test_the_shipped_classifier_is_opencvs_default_people_detector():
-    svm = classifier_of(PeopleParameters())
+    svm = load_classifier(PeopleParameters())
     theirs = np.ravel(cv2.HOGDescriptor.getDefaultPeopleDetector())
     assert PeopleParameters().features == 3780
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), theirs, rtol=0, atol=1e-8)
@@ -80,10 +79,10 @@ def test_what_opencvs_descriptor_saves_is_read_with_its_layout(tmp_path, ending)
     theirs = cv2.HOGDescriptor((32, 64), (16, 16), (8, 8), (8, 8), 9, 1, -1, 0, 0.2, True)
     theirs.setSVMDetector(numbers)
     theirs.save(parameters.classifier)
-    svm = classifier_of(parameters)
+    svm = load_classifier(parameters)
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), numbers, rtol=1e-6)
     with pytest.raises(InputError, match=r"clip of 0\.2, the settings say 0\.3; change people\.clip"):
-        classifier_of(parameters.model_copy(update={"clip": 0.3}))
+        load_classifier(parameters.model_copy(update={"clip": 0.3}))
 
 
 @pytest.mark.parametrize("kind", [cv2.ml.SVM_C_SVC, cv2.ml.SVM_NU_SVC, cv2.ml.SVM_EPS_SVR])
@@ -119,11 +118,11 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
     [
         ("w.txt", "", ["is empty", "6 weights"]),
         ("w.txt", "# nothing\n", ["is empty"]),
-        ("w.txt", "1 2 3\n4 five\n", ["line 2", "'five' is no number"]),
+        ("w.txt", "1 2 3\n4 five\n", ["line 2", "'five' is not a number"]),
         ("w.txt", "1 2 3\n4 nan 6", ["line 2", "'nan'", "finite"]),
         ("w.txt", "1 2 3 4 5 1e60", ["number 6 is inf", "finite"]),
         ("w.txt", "1 2 3 4 5", ["has 5 numbers", "settings has 6", "people.window_width_px"]),
-        ("w.txt", b"\xff\xfe\x00\x01", ["is no text"]),
+        ("w.txt", b"\xff\xfe\x00\x01", ["is not text"]),
         ("w.npy", np.full(6, np.inf), ["number 1 is inf", "finite"]),
         ("w.npy", np.array(["a"] * 6), ["holds <U1", "wanted numbers"]),
         ("w.npy", np.ones(9), ["has 9 numbers", "settings has 6"]),
@@ -140,7 +139,7 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
         ),
         ("w.npz", {"weights": WEIGHTS, "stride": 16}, ["stride of 16", "settings say 8", "people.block_stride_px"]),
         ("w.npz", {"weights": WEIGHTS, "signed": True}, ["signed of true", "settings say false", "people.signed"]),
-        ("w.yml", "1 2 3", ["no file that OpenCV saved"]),
+        ("w.yml", "1 2 3", ["not a file that OpenCV saved"]),
         ("w.yml", "%YAML:1.0\n---\nother: 3\n", ["neither an SVMDetector"]),
         ("w.yml", "%YAML:1.0\n---\n", ["neither an SVMDetector"]),
         ("w.yml", KERNEL, ["kernel RBF", "linear"]),
@@ -148,7 +147,7 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
         ("w.yml", SVM + "         alpha: [ 1., 2. ]\n         rho: 0.5\n", ["broken", "do not fit"]),
         ("w.yml", SVM + "         alpha: [ 1. ]\n         rho: 0.5\n         index: [ 7 ]\n", ["does not hold"]),
         ("w.yml", SVM.partition("   decision")[0] + "   decision_functions: 3\n", ["broken", "do not fit"]),
-        ("w.txt", "1_0 2 3 4 5 6", ["line 1", "'1_0' is no number"]),
+        ("w.txt", "1_0 2 3 4 5 6", ["line 1", "'1_0' is not a number"]),
         ("w.xml", "<html></html>", ["OpenCV"]),
         ("w.xml", b"\xff\xfe", ["OpenCV"]),
     ],

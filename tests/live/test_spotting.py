@@ -3,15 +3,21 @@
 import numpy as np
 import pytest
 
-from tests.people.test_recognizing import SIZE, Brightest, Clip
+from tests.people.test_detector import SIZE, Brightest, Clip
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people.detector import UNREAD
-from torchvision_dddas.people.live_tracker import Spotter
+from torchvision_dddas.people.live_tracker import PersonTracker
+from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Detections, Registration, Scene
 
 SETTINGS = Settings.model_validate({"people": {"search": "regions"}})
 STILL = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+
+
+def person_tracker(scorer, settings, interval, size):
+    tracker = FrameTracker(settings, interval, size, pictures=False)
+    return PersonTracker(scorer, settings, interval, size, tracker)
 
 
 class Sure(Brightest):
@@ -27,15 +33,15 @@ def scenes(clip=None, interval=1):
 
 
 def spotted(scenes, interval=1, settings=SETTINGS):
-    spotter = Spotter(Sure(), settings, interval, SIZE)
+    spotter = person_tracker(Sure(), settings, interval, SIZE)
     for scene in scenes:
-        spotter.see(scene)
+        spotter.update(scene)
     return spotter
 
 
 def test_one_who_walks_keeps_an_identity_and_each_frame_is_told_once():
     spotter = spotted(scenes())
-    found = [spotter.of(number, True) for number in range(1, 13)]
+    found = [spotter.people_of(number, True) for number in range(1, 13)]
     assert [followed.number for followed in found] == list(range(1, 13))
     assert all(followed.detections.kind == "person" for followed in found)
     (identity,) = {name for followed in found for name in followed.tracks.identity.tolist()}
@@ -43,28 +49,28 @@ def test_one_who_walks_keeps_an_identity_and_each_frame_is_told_once():
     at = [followed.tracks.box_px[0, 0] for followed in found if len(followed.tracks)]
     assert len(at) >= 10
     assert at[-1] - at[0] > 20  # it went along
-    assert spotter.of(12, True) is None
+    assert spotter.people_of(12, True) is None
 
 
 def test_what_is_not_settled_is_not_told_before_the_end():
     spotter = spotted(scenes())
-    assert spotter.of(12, False) is None
-    assert spotter.of(12, True) is not None
+    assert spotter.people_of(12, False) is None
+    assert spotter.people_of(12, True) is not None
 
 
 def test_people_settle_with_the_frames_of_what_moves():
     from torchvision_dddas.tracking import track_scenes
 
-    spotter = Spotter(Sure(), SETTINGS, 1, SIZE)
+    spotter = person_tracker(Sure(), SETTINGS, 1, SIZE)
 
     def seen():
         for scene in scenes():
-            spotter.see(scene)
+            spotter.update(scene)
             yield scene
 
     settled = []
     for followed in track_scenes(seen(), SETTINGS, 1, SIZE):
-        people = spotter.of(followed.number, False)
+        people = spotter.people_of(followed.number, False)
         settled.append(people is not None)
     # Only the frames that the end itself settles wait for it.
     assert sum(settled) >= 6
@@ -73,15 +79,15 @@ def test_people_settle_with_the_frames_of_what_moves():
 
 def test_only_frames_that_are_followed_are_searched():
     spotter = spotted(scenes(), interval=3)
-    assert [number for number in range(1, 13) if spotter.of(number, True) is not None] == [1, 4, 7, 10]
+    assert [number for number in range(1, 13) if spotter.people_of(number, True) is not None] == [1, 4, 7, 10]
 
 
 def test_a_frame_that_could_not_be_read_has_nobody():
     (scene,) = scenes(Clip(numbers=(1,)))
     unread = Scene(scene.frame, scene.mask, scene.detections, 1, False, UNREAD)
-    spotter = Spotter(Brightest(), SETTINGS, 1, SIZE)
-    spotter.see(unread)
-    people = spotter.of(1, True)
+    spotter = person_tracker(Brightest(), SETTINGS, 1, SIZE)
+    spotter.update(unread)
+    people = spotter.people_of(1, True)
     assert people is not None
     assert len(people.detections) == 0
 
@@ -89,11 +95,11 @@ def test_a_frame_that_could_not_be_read_has_nobody():
 def test_a_narrower_search_looks_at_less():
     def windows(settings):
         recognizer = Brightest()
-        spotter = Spotter(recognizer, SETTINGS, 1, SIZE)
+        spotter = person_tracker(recognizer, SETTINGS, 1, SIZE)
         for scene in scenes():
             if scene.frame.number == 3:
                 spotter.retune(settings)
-            spotter.see(scene)
+            spotter.update(scene)
         return recognizer.windows
 
     narrow = Settings.model_validate({"people": {"search": "regions", "look_share": 0.05}})
@@ -102,4 +108,4 @@ def test_a_narrower_search_looks_at_less():
 
 def test_pictures_smaller_than_the_window_are_one_line():
     with pytest.raises(InputError):
-        Spotter(Brightest(), SETTINGS, 1, (40, 60))
+        person_tracker(Brightest(), SETTINGS, 1, (40, 60))

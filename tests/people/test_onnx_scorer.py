@@ -1,7 +1,6 @@
-"""The onboard recognizer: no torch, bounded memory, and tiles, bands and threads that leave no trace in the scores."""
+"""The onboard scorer: tiles, threads, gradients and its graphs."""
 
 import json
-import shutil
 import subprocess
 import sys
 import textwrap
@@ -15,11 +14,8 @@ import pytest
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people import onnx_scorer as onboard_people
-from torchvision_dddas.people import opencv_gradient as onboard_gradient
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import OnnxScorer
-from torchvision_dddas.people.opencv_gradient import Gradient
-from torchvision_dddas.people.scratch import Scratch, spans
+from torchvision_dddas.people.onnx_scorer import Gradient, OnnxScorer
 from torchvision_dddas.runtime import SHIPPED, manifest
 from torchvision_dddas.types import Part
 
@@ -66,16 +62,8 @@ def test_how_the_work_is_cut_changes_nothing(monkeypatch, tile_px, gradient_px, 
     monkeypatch.setattr(onboard_people, "_TILE_PX", tile_px)
     monkeypatch.setattr(onboard_people, "_GRADIENT_PX", gradient_px)
     monkeypatch.setattr(onboard_people, "_BLOCKS", blocks)
-    monkeypatch.setattr(onboard_gradient, "_BAND_PX", band_px)
+    monkeypatch.setattr(onboard_people, "_BAND_PX", band_px)
     np.testing.assert_allclose(scored(image), wanted, atol=5e-6, rtol=0)
-
-
-def test_arrays_that_are_used_again_leave_nothing_of_an_earlier_picture():
-    recognizer = OnnxScorer(PeopleParameters(), SVM)
-    images = [picture(2), np.full((300, 260, 3), 255, np.uint8), picture(3, 140, 90)[..., 0].copy(), picture(2)]
-    first, _, small, again = (recognizer.scores([image], [[whole(image)]])[0][0] for image in images)
-    np.testing.assert_array_equal(first, again)
-    np.testing.assert_allclose(small, scored(images[2]), atol=5e-6, rtol=0)
 
 
 def test_a_recognizer_may_be_asked_by_several_threads_at_once():
@@ -109,38 +97,9 @@ def test_a_gradient_and_its_opposite_have_one_direction_unless_it_is_signed():
         )
 
 
-def test_stretches_make_up_the_whole_and_none_is_longer_than_asked():
-    for length in range(1, 40):
-        for most in range(1, 45):
-            held = spans(length, most)
-            assert [begin for begin, _ in held] == [0, *(end for _, end in held[:-1])] and held[-1][1] == length
-            assert max(end - begin for begin, end in held) <= most and len(held) == -(-length // most)
-
-
-def test_an_array_is_made_anew_only_where_it_was_too_small():
-    scratch = Scratch()
-    large = scratch("a", (3, 4))
-    assert np.shares_memory(scratch("a", (2, 5)), large) and scratch("a", (2, 5)).flags.c_contiguous
-    assert not np.shares_memory(scratch("b", (3, 4)), large)
-    assert not np.shares_memory(scratch("a", (13,)), large)
-    assert scratch("a", (2,), np.uint8).dtype == np.uint8
-
-
 def test_graphs_of_another_layout_are_refused_with_what_makes_them():
     with pytest.raises(InputError, match=r"people.cell_px = 8, not 4.*dddas export --graph people.*people.cell_px=4"):
         OnnxScorer(PeopleParameters(cell_px=4), read_classifier("opencv", 3780))
-
-
-@pytest.mark.parametrize(("x", "y"), [(-40, 8), (-200, -160), (136, 0), (176, 200), (-16, -300)])
-def test_a_part_that_reaches_out_of_the_picture_sees_it_reflected(x: int, y: int):
-    """Even one that lies beyond it altogether."""
-    image = picture(5, 180, 150)
-    border = 400
-    wide = cv2.copyMakeBorder(image, border, border, border, border, cv2.BORDER_REFLECT_101)
-    found = scored(image, Part((150, 180), x, y, 72, 144))
-    wanted = scored(wide, Part(wide.shape[1::-1], border + x, border + y, 72, 144))
-    assert found.shape == (3, 2)
-    np.testing.assert_allclose(found, wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", '{"graphs": {}}', '{"layout": null}'])
@@ -151,14 +110,8 @@ def test_a_folder_without_graphs_is_refused(tmp_path: Path, text: str | None):
         OnnxScorer(PeopleParameters(graphs=str(tmp_path)), SVM)
 
 
-def test_a_manifest_without_its_graphs_is_refused(tmp_path: Path):
-    shutil.copy(SHIPPED / "manifest.json", tmp_path)
-    with pytest.raises(InputError, match=r"people_histograms.onnx"):
-        OnnxScorer(PeopleParameters(graphs=str(tmp_path)), SVM)
-
-
 def test_the_shipped_graphs_are_small_and_fit_the_default_settings():
-    assert sum(path.stat().st_size for path in SHIPPED.glob("*.onnx")) < 100_000
+    assert sum(path.stat().st_size for path in SHIPPED.glob("people*.onnx")) < 100_000
     made_for = manifest(SHIPPED)["graphs"]["people_scores.onnx"]["knobs"]
     assert made_for == {name: int(getattr(PeopleParameters(), name)) for name in onboard_people.BAKED}
 
@@ -172,8 +125,8 @@ def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
         import numpy as np
         from torchvision_dddas.config import PeopleParameters
         from torchvision_dddas.people.classifiers import read_classifier
-        from torchvision_dddas.targets import scan
-        from torchvision_dddas.people.scorer import load_scorer
+        from torchvision_dddas.people import pyramid
+        from torchvision_dddas.people.detector import load_scorer
 
         def peak_mb():
             lines = Path("/proc/self/status").read_text().splitlines()
@@ -181,11 +134,11 @@ def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
 
         cv2.setNumThreads(2)
         parameters = PeopleParameters(scale_step=1.2)
-        recognizer = load_scorer("auto", parameters, read_classifier("opencv", 3780))
+        recognizer = load_scorer(parameters, "auto", read_classifier("opencv", 3780))
         image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
         peaks = []
         for _ in range(6):
-            recognizer.scores([image], [scan.everywhere((640, 480), parameters)])
+            recognizer.scores([image], [pyramid.everywhere((640, 480), parameters)])
             peaks.append(peak_mb())
         print(json.dumps({"name": recognizer.name, "torch": "torch" in sys.modules, "peaks": peaks}))
     """)

@@ -1,4 +1,4 @@
-"""Levels, parts and windows of the pyramid."""
+"""Levels, windows and parts of the pyramid."""
 
 from itertools import pairwise
 
@@ -8,8 +8,8 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people import pyramid as scan
-from torchvision_dddas.people.boxes import body
+from torchvision_dddas.people import pyramid
+from torchvision_dddas.people.suppression import body_boxes
 from torchvision_dddas.types import Part
 
 SIZE = (180, 220)
@@ -54,8 +54,8 @@ def maps_of(picture, parts, parameters, hog):
 @pytest.mark.parametrize("changed", [{}, {"padding_px": 16}, {"window_stride_px": 4, "scale_step": 1.1}])
 def test_levels_and_windows_are_those_of_opencv(hog, picture, changed):
     k = parameters(suppression="opencv", threshold=-2.0, **changed)
-    parts = scan.everywhere(SIZE, k)
-    box, margin = scan.windows(parts, maps_of(picture, parts, k, hog), SIZE, k)
+    parts = pyramid.everywhere(SIZE, k)
+    box, margin = pyramid.windows(parts, maps_of(picture, parts, k, hog), SIZE, k)
     stride, pad = k.window_stride_px, k.padding_px
     theirs, weight = hog.detectMultiScale(picture, -2.0, (stride, stride), (pad, pad), k.scale_step, 0)
     # Padded windows may lie outside; detectMultiScale clips what it returns.
@@ -68,7 +68,7 @@ def test_levels_and_windows_are_those_of_opencv(hog, picture, changed):
 
 
 def test_enlarged_pyramids_begin_with_a_larger_picture_and_end_at_the_window():
-    found = scan.levels(SIZE, parameters(enlarge=2.0))
+    found = pyramid.levels(SIZE, parameters(enlarge=2.0))
     assert found[0].scale == pytest.approx(1.05**-14) and 1.05**14 <= 2 < 1.05**15
     assert all(a.scale * 1.05 == pytest.approx(b.scale) for a, b in pairwise(found))
     last = found[-1].size
@@ -76,31 +76,9 @@ def test_enlarged_pyramids_begin_with_a_larger_picture_and_end_at_the_window():
     assert min(last[0] / 64, last[1] / 128) < 1.05
 
 
-def test_the_levels_that_opencv_has_are_among_those_of_an_enlarged_pyramid():
-    plain = [level.size for level in scan.levels(SIZE, parameters())]
-    for enlarge in (1.0, 1.04, 1.5, 2.0, 3.7):
-        found = [level.size for level in scan.levels(SIZE, parameters(enlarge=enlarge))]
-        assert found[-len(plain) :] == plain
-
-
-def test_padding_is_raised_to_where_windows_and_blocks_lie():
-    assert [scan.everywhere(SIZE, parameters(padding_px=pad))[0].x for pad in (0, 1, 8, 20)] == [0, -8, -8, -24]
-    assert scan.everywhere(SIZE, parameters(padding_px=3, window_stride_px=6))[0].x == -4
-
-
-def test_levels_end_after_as_many_as_asked_for():
-    assert scan.levels(SIZE, parameters(max_levels=3)) == scan.levels(SIZE, parameters())[:3]
-
-
-def test_levels_that_round_to_the_same_size_are_scored_once():
-    small = {"window_width_px": 16, "window_height_px": 16, "scale_step": 1.01}
-    sizes = [level.size for level in scan.levels((24, 24), parameters(**small))]
-    assert sizes == [(side, side) for side in range(24, 15, -1)]
-
-
 def test_a_picture_smaller_than_the_window_is_refused_with_both_sizes():
     with pytest.raises(InputError, match=r"60 x 200 px, enlarged 1 times, is smaller than the window of 64 x 128 px"):
-        scan.levels((60, 200), parameters())
+        pyramid.levels((60, 200), parameters())
 
 
 def positions(parts, k):
@@ -114,13 +92,6 @@ def positions(parts, k):
     ]
 
 
-def test_cost_is_the_number_of_windows():
-    k = parameters(padding_px=24, enlarge=1.5)
-    parts = scan.everywhere(SIZE, k)
-    assert scan.cost(parts, k) == len(positions(parts, k)) > 1000
-    assert scan.cost([Part(SIZE, 0, 0, 40, 200)], k) == 0
-
-
 REGIONS = np.array([[30.0, 20, 90, 150], [90, 60, 80, 130], [100, 70, 60, 110]])
 HEIGHTS = np.array([[80.0, 100], [100, 130], [np.nan, np.nan]])
 
@@ -128,12 +99,12 @@ HEIGHTS = np.array([[80.0, 100], [100, 130], [np.nan, np.nan]])
 @pytest.mark.parametrize("changed", [{}, {"padding_px": 20, "enlarge": 1.4, "window_stride_px": 4}])
 def test_parts_hold_every_window_whose_body_lies_in_its_region_where_a_search_everywhere_has_it(changed):
     k = parameters(**changed)
-    everywhere = positions(scan.everywhere(SIZE, k), k)
-    within = set(positions(scan.within(REGIONS, HEIGHTS, SIZE, k), k))
+    everywhere = positions(pyramid.everywhere(SIZE, k), k)
+    within = set(positions(pyramid.within(REGIONS, HEIGHTS, SIZE, k), k))
     assert within < set(everywhere)
-    scale = {level.size: level.scale for level in scan.levels(SIZE, k)}
+    scale = {level.size: level.scale for level in pyramid.levels(SIZE, k)}
     window = np.array([(x, y, 64, 128) for _, x, y in everywhere]) * [[scale[size]] for size, _, _ in everywhere]
-    bodies, wanted = body(window, k), set()
+    bodies, wanted = body_boxes(window, k), set()
     for region, (least, largest) in zip(REGIONS, HEIGHTS, strict=True):
         inside = (bodies[:, :2] >= region[:2]).all(1) & (bodies[:, :2] + bodies[:, 2:] <= region[:2] + region[2:]).all(
             1
@@ -145,18 +116,11 @@ def test_parts_hold_every_window_whose_body_lies_in_its_region_where_a_search_ev
     assert len(within) < 0.5 * len(everywhere)
 
 
-def test_a_body_between_two_levels_is_looked_for_in_the_next_one():
-    k = parameters()
-    height = k.height_share * 128 * 1.05**3.5
-    parts = scan.within(np.array([[10.0, 10, 150, 200]]), np.array([[height, height]]), SIZE, k)
-    assert {part.level for part in parts} & {level.size for level in scan.levels(SIZE, k)[3:5]}
-
-
 def test_no_part_is_made_for_bodies_that_the_pyramid_does_not_reach_or_regions_off_the_picture():
     k = parameters()
-    assert scan.within(np.array([[10.0, 10, 90, 150]]), np.array([[20.0, 40]]), SIZE, k) == []
-    assert scan.within(np.array([[500.0, 500, 90, 150]]), np.array([[np.nan, np.nan]]), SIZE, k) == []
-    assert scan.within(np.zeros((0, 4)), np.zeros((0, 2)), SIZE, k) == []
+    assert pyramid.within(np.array([[10.0, 10, 90, 150]]), np.array([[20.0, 40]]), SIZE, k) == []
+    assert pyramid.within(np.array([[500.0, 500, 90, 150]]), np.array([[np.nan, np.nan]]), SIZE, k) == []
+    assert pyramid.within(np.zeros((0, 4)), np.zeros((0, 2)), SIZE, k) == []
 
 
 def test_overlapping_regions_become_one_part_and_distant_ones_stay_apart():
@@ -164,28 +128,23 @@ def test_overlapping_regions_become_one_part_and_distant_ones_stay_apart():
     near = np.array([[50.0, 20, 80, 130], [60, 25, 80, 130]])
     far = np.array([[50.0, 20, 80, 130], [450, 20, 80, 130]])
     heights = np.array([[90.0, 100]] * 2)
-    assert len(scan.within(near, heights, size, k)) == 1
-    assert len(scan.within(far, heights, size, k)) == 2
+    assert len(pyramid.within(near, heights, size, k)) == 1
+    assert len(pyramid.within(far, heights, size, k)) == 2
 
 
 def test_a_window_in_two_parts_is_found_once():
     k = parameters()
     parts = [Part(SIZE, 0, 0, 80, 136), Part(SIZE, 8, 0, 80, 136)]  # 3 x 2 windows each, 2 x 2 of them the same
     maps = [np.arange(6, dtype=np.float32).reshape(2, 3) + 1, np.array([[2, 3, 9], [5, 6, 9]], np.float32)]
-    box, margin = scan.windows(parts, maps, SIZE, k)
+    box, margin = pyramid.windows(parts, maps, SIZE, k)
     assert margin.tolist() == [1, 2, 3, 4, 5, 6, 9, 9]
     assert box[:3].tolist() == [[0, 0, 64, 128], [8, 0, 64, 128], [16, 0, 64, 128]]
 
 
 def test_windows_are_placed_by_the_true_ratio_of_sizes_not_the_rounded_scale():
     k = parameters()
-    level = scan.levels(SIZE, k)[1]
-    box, margin = scan.windows([Part(level.size, 0, 0, *level.size)], [np.array([[1.0, -1], [-1, 1]])], SIZE, k)
+    level = pyramid.levels(SIZE, k)[1]
+    box, margin = pyramid.windows([Part(level.size, 0, 0, *level.size)], [np.array([[1.0, -1], [-1, 1]])], SIZE, k)
     assert margin.tolist() == [1, 1]
     ratio = np.array(SIZE) / level.size
     np.testing.assert_allclose(box[1], [*(8 * ratio), *((64, 128) * ratio)])
-
-
-def test_no_parts_have_no_windows():
-    box, margin = scan.windows([], [], SIZE, parameters())
-    assert box.shape == (0, 4) and margin.shape == (0,)

@@ -1,10 +1,17 @@
-"""One box a person: suppression, boxes settled on means, OpenCV's grouping."""
+"""From windows to people: suppression, body boxes, probabilities; OpenCV's grouping."""
 
 import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.people.suppression import group, nms, settled
+from torchvision_dddas.config import load_config
+from torchvision_dddas.people.suppression import (
+    body_boxes,
+    group_rectangles,
+    non_maximum_suppression,
+    people_from_windows,
+    refine_boxes,
+)
 
 
 def boxes(*rows):
@@ -25,34 +32,19 @@ def crowd(seed, number=120):
 
 def test_the_best_of_boxes_that_overlap_stays_and_others_are_untouched():
     box = boxes([0, 0, 40, 100], [4, 0, 40, 100], [200, 0, 40, 100])
-    assert nms(box, np.array([1.0, 2, 0.5]), 0.5).tolist() == [1, 2]
-
-
-def test_only_boxes_that_stay_put_others_out():
-    box = boxes([0, 0, 40, 100], [15, 0, 40, 100], [30, 0, 40, 100])  # neighbours share 0.45, the outer two 0.14
-    assert nms(box, np.array([3.0, 2, 1]), 0.4).tolist() == [0, 2]
+    assert non_maximum_suppression(box, np.array([1.0, 2, 0.5]), 0.5).tolist() == [1, 2]
 
 
 def test_a_part_of_a_better_box_goes_where_containment_counts():
     box = boxes([0, 0, 40, 100], [10, 60, 20, 40])
-    assert nms(box, np.array([2.0, 1]), 0.4).tolist() == [0, 1]
-    assert nms(box, np.array([2.0, 1]), 0.4, contained=0.7).tolist() == [0]
-
-
-def test_a_large_box_around_a_better_small_one_goes_too():
-    box = boxes([0, 0, 40, 100], [10, 60, 20, 40])
-    assert nms(box, np.array([1.0, 2]), 0.4, contained=0.7).tolist() == [1]
-
-
-def test_of_equal_scores_the_first_row_stays():
-    box = boxes([0, 0, 40, 100], [2, 0, 40, 100], [4, 0, 40, 100])
-    assert nms(box, np.ones(3), 0.5).tolist() == [0]
+    assert non_maximum_suppression(box, np.array([2.0, 1]), 0.4).tolist() == [0, 1]
+    assert non_maximum_suppression(box, np.array([2.0, 1]), 0.4, contained=0.7).tolist() == [0]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_those_that_stay_are_apart_and_each_that_goes_has_a_better_one_on_it(seed):
     box, score = crowd(seed)
-    kept = nms(box, score, 0.3)
+    kept = non_maximum_suppression(box, score, 0.3)
     assert (np.diff(score[kept]) <= 0).all()
     for place, i in enumerate(kept):
         assert all(iou(box[i], box[j]) <= 0.3 for j in kept[:place])
@@ -63,30 +55,21 @@ def test_those_that_stay_are_apart_and_each_that_goes_has_a_better_one_on_it(see
 def test_suppression_does_not_depend_on_the_order_of_rows():
     box, score = crowd(7)
     order = np.random.default_rng(0).permutation(len(box))
-    assert order[nms(box[order], score[order], 0.3, 0.7)].tolist() == nms(box, score, 0.3, 0.7).tolist()
-
-
-def test_nothing_stays_of_nothing():
-    assert nms(np.zeros((0, 4)), np.zeros(0), 0.5).tolist() == []
-    assert settled(np.zeros((0, 4)), np.zeros(0), np.zeros(0, int), 0.7).shape == (0, 4)
+    assert (
+        order[non_maximum_suppression(box[order], score[order], 0.3, 0.7)].tolist()
+        == non_maximum_suppression(box, score, 0.3, 0.7).tolist()
+    )
 
 
 def test_a_box_settles_on_the_weighted_mean_of_its_neighbours():
     box = boxes([0, 0, 40, 100], [4, 8, 40, 100], [300, 0, 40, 100])
-    np.testing.assert_allclose(settled(box, np.array([3.0, 1, 5]), np.array([0]), 0.7), [[1, 2, 40, 100]])
-
-
-def test_sizes_settle_on_their_geometric_mean():
-    box = boxes([0, 0, 40, 100], [-2, -5, 44, 110])  # one centre
-    (found,) = settled(box, np.ones(2), np.array([0]), 0.7)
-    np.testing.assert_allclose(found[2:], [np.sqrt(40 * 44), np.sqrt(100 * 110)])
-    np.testing.assert_allclose(found[:2] + found[2:] / 2, [20, 50])
+    np.testing.assert_allclose(refine_boxes(box, np.array([3.0, 1, 5]), np.array([0]), 0.7), [[1, 2, 40, 100]])
 
 
 def test_a_box_alone_or_without_weight_stays_where_it_is():
     box = boxes([0, 0, 40, 100], [4, 8, 40, 100])
-    np.testing.assert_allclose(settled(box, np.ones(2), np.array([1, 0]), 1.0), box[[1, 0]], atol=1e-9)
-    np.testing.assert_allclose(settled(box, np.zeros(2), np.array([0]), 0.7), box[[0]], atol=1e-9)
+    np.testing.assert_allclose(refine_boxes(box, np.ones(2), np.array([1, 0]), 1.0), box[[1, 0]], atol=1e-9)
+    np.testing.assert_allclose(refine_boxes(box, np.zeros(2), np.array([0]), 0.7), box[[0]], atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +95,7 @@ def test_groups_are_those_of_opencv_to_the_rectangle_and_the_weight(scored, thre
     image, detector = scored
     every, weight = detector.detectMultiScale(image, threshold, (8, 8), (0, 0), 1.05, 0)
     assert len(every) > 30
-    box, best = group(every, np.ravel(weight), least)
+    box, best = group_rectangles(every, np.ravel(weight), least)
     theirs, weight = detector.detectMultiScale(image, threshold, (8, 8), (0, 0), 1.05, least)
     corner = np.maximum(box[:, :2], 0)
     box = np.concatenate([corner, np.minimum(box[:, :2] + box[:, 2:], (320, 240)) - corner], axis=1)
@@ -126,16 +109,80 @@ def test_boxes_that_a_chain_links_are_one_group_whatever_their_order():
     chain = boxes(*[[x, 0, 64, 128] for x in range(0, 96, 16)])
     order = [3, 0, 5, 1, 4, 2]
     for rows in (chain, chain[order]):
-        box, best = group(rows, np.arange(6.0), least=2)
+        box, best = group_rectangles(rows, np.arange(6.0), least=2)
         assert box.tolist() == [[40, 0, 64, 128]] and best.tolist() == [5]
 
 
-def test_a_group_inside_a_larger_one_goes():
-    small, large = boxes(*[[40, 40, 32, 64]] * 2), boxes(*[[20, 10, 80, 160]] * 4)
-    box, _ = group(np.concatenate([small, large]), np.arange(6.0), least=1)
-    assert box.tolist() == [[20, 10, 80, 160]]
+SIZE = (640, 480)
 
 
-def test_no_boxes_make_no_groups():
-    box, best = group(np.zeros((0, 4)), np.zeros(0), 2)
-    assert box.shape == (0, 4) and best.shape == (0,)
+def parameters(**changed):
+    return load_config(overrides=[f"people.{name}={value}" for name, value in changed.items()]).people
+
+
+def around(box, k):
+    """The window whose body a box is."""
+    x, y, wide, tall = np.asarray(box, float).T
+    width, height = wide / k.width_share, tall / k.height_share
+    return np.stack([x - (width - wide) / 2, y + tall - k.feet_share * height, width, height], axis=-1)
+
+
+def test_a_body_is_the_calibrated_share_of_its_window():
+    k = parameters(height_share=0.75, width_share=0.5, feet_share=0.9)
+    np.testing.assert_allclose(body_boxes(np.array([[100.0, 50, 64, 128]]), k), [[116, 50 + 0.15 * 128, 32, 96]])
+
+
+def test_windows_around_one_person_are_one_between_them():
+    window = np.array([[100.0, 50, 64, 128], [108, 50, 64, 128], [104, 46, 67.2, 134.4], [400, 100, 64, 128]])
+    people = people_from_windows(window, np.array([1.0, 1.0, 0.5, 0.3]), SIZE, parameters())
+    assert len(people) == 2
+    assert people.margin.tolist() == [1.0, 0.3]
+    middle = people.box_px[0, 0] + people.box_px[0, 2] / 2
+    assert 100 + 32 < middle < 108 + 32
+    np.testing.assert_allclose(people.window_px[1], window[3])
+
+
+def test_legs_are_no_second_person():
+    k = parameters()
+    whole = np.array([100.0, 50, 100, 200])
+    x, y, wide, tall = body_boxes(whole[None], k)[0]
+    legs = around(np.array([[x + 5, y + 0.5 * tall, wide / 2, tall / 2]]), k)[0]
+    window, margin = np.stack([legs, whole]), np.array([1.0, 2.0])
+    np.testing.assert_allclose(people_from_windows(window, margin, SIZE, k).window_px, whole[None])
+    assert len(people_from_windows(window, margin, SIZE, parameters(contained=1.0))) == 2
+
+
+def test_people_come_best_first_with_a_probability_that_rises_with_the_score():
+    window = np.array([[0.0, 50, 64, 128], [200, 50, 64, 128], [400, 50, 64, 128]])
+    for suppression in ("nms", "opencv", "none"):
+        people = people_from_windows(
+            window, np.array([0.5, 2.0, 1.0]), SIZE, parameters(suppression=suppression, group=0)
+        )
+        assert people.margin.tolist() == [2.0, 1.0, 0.5]
+        assert (np.diff(people.score) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("box", "cut"),
+    [
+        ((300, 200, 40, 100), False),
+        ((300, -1, 40, 100), True),
+        ((300, 381, 40, 100), True),
+        ((300, 379, 40, 100), True),  # the feet end 1 px above the border: they may go on below it
+        ((-10, 200, 40, 100), True),
+        ((610, 200, 40, 100), True),
+        ((300, 370, 40, 100), False),
+    ],
+)
+def test_a_body_that_meets_the_border_is_flagged(box, cut):
+    k = parameters()
+    people = people_from_windows(around(np.array([box], float), k), np.array([1.0]), SIZE, k)
+    assert people.cut.tolist() == [cut]
+
+
+def test_no_windows_show_nobody():
+    for suppression in ("nms", "opencv", "none"):
+        people = people_from_windows(np.zeros((0, 4)), np.zeros(0), SIZE, parameters(suppression=suppression))
+        assert len(people) == 0
+        assert people.box_px.shape == people.window_px.shape == (0, 4)
+        assert people.cut.dtype == bool

@@ -10,7 +10,7 @@ from torchvision_dddas.config import PeopleParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.people.boxes import body
+from torchvision_dddas.people.suppression import body_boxes
 from torchvision_dddas.tuning import people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
@@ -29,7 +29,7 @@ def picture(seed: int, true: PeopleParameters) -> Scored:
     sure = int((margin >= 0).sum())
     hits = int(right[:sure].sum())
     window = np.column_stack([rng.uniform(0, 300, (hits, 2)), rng.uniform([60, 120], [70, 140], (hits, 2))])
-    columns = margin, right, window, body(window, true) + rng.normal(0, 1, (hits, 4))
+    columns = margin, right, window, body_boxes(window, true) + rng.normal(0, 1, (hits, 4))
     margin_, right_, window_, body_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
     return Scored(margin_, right_, sure, window_, body_, int(right.sum()) + 1, PeopleParameters())
 
@@ -95,7 +95,7 @@ def spotted() -> tuple[np.ndarray, np.ndarray]:
     image = np.zeros((160, 256), np.uint8)
     for u, level in ((40, 250), (136, 150), (216, 50)):
         image[80 - 3 : 80 + 4, u - 3 : u + 4] = level
-    return image, body(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleParameters())
+    return image, body_boxes(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleParameters())
 
 
 def test_detections_below_the_threshold_are_kept_without_a_probability():
@@ -121,7 +121,7 @@ def test_a_clip_gives_its_labelled_pictures(tmp_path: Path, monkeypatch: pytest.
         files.append(tmp_path / f"{number}.png")
         cv2.imwrite(str(files[-1]), image)
     truth = Truth("boxes", tmp_path, {}, {1: true, 3: np.zeros((0, 4))})
-    monkeypatch.setattr("torchvision_dddas.people.detector.recognizer_of", lambda parameters: Spots())
+    monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", lambda parameters: Spots())
     clip = Clip("spots", tmp_path, tuple(files), truth=truth, shows=("people",))
     found = family().examples([clip], Settings())
     assert [(one.frame, one.content.people, one.content.right.sum()) for one in found] == [(1, 1, 1), (3, 0, 0)]

@@ -4,7 +4,7 @@ import torch
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.evaluation.metrics.boxes import areas, iou
-from torchvision_dddas.people.boxes import body, probability
+from torchvision_dddas.people.suppression import body_boxes, probability
 from torchvision_dddas.tuning.people import bodies, doubt, soft_f
 
 KNOBS = {
@@ -20,7 +20,7 @@ def drawn(seed: int = 0, count: int = 6) -> np.ndarray:
 
 def test_bodies_are_those_of_the_hard_recognizer():
     window = drawn()
-    np.testing.assert_allclose(bodies(torch.as_tensor(window), KNOBS).numpy(), body(window, PeopleParameters()))
+    np.testing.assert_allclose(bodies(torch.as_tensor(window), KNOBS).numpy(), body_boxes(window, PeopleParameters()))
 
 
 def test_doubt_is_that_of_the_hard_probability():

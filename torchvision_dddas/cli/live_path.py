@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
+    from torchvision_dddas.people import PersonTracker, WindowScorer
     from torchvision_dddas.types import Adjustment, Frame
 
 
@@ -23,33 +24,44 @@ def path(
 
     settings, recognizer = ready.settings, None
     if people:
-        from torchvision_dddas.people.detector import recognizer_of
-        from torchvision_dddas.people.live_tracker import Spotter
+        from torchvision_dddas.people import load_scorer
 
         # A look at the whole picture takes as long as many pictures do to come.
         share = min(settings.people.look_share, 0.1)
         settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
-        recognizer = recognizer_of(settings.people, backend)
-        Spotter(recognizer, settings, interval, source.size)  # pictures that are too small are told now
+        recognizer = load_scorer(settings.people, backend)
+        _person_tracker(recognizer, settings, interval, source.size)  # refuses pictures that are too small at once
     shedding = LoadShedding(source, settings, health, people)
     visions = iter([ready.engine])
 
     def begin(feed: "Feed") -> "Iterator[Result]":
         # After an error nothing that remembers a frame is trusted.
         engine = next(visions, None) or load_engine(backend, shedding.settings)
-        spotter = None if recognizer is None else Spotter(recognizer, shedding.settings, interval, source.size)
+        people_tracker = None
+        if recognizer is not None:
+            people_tracker = _person_tracker(recognizer, shedding.settings, interval, source.size)
         watch = None if ready.watch is None else ready.watch.restarted()
 
         def retune(frame: "Frame") -> "tuple[Settings, tuple[Adjustment, ...]]":
             settings, moved = shedding(frame)
-            if spotter is not None and moved:
-                spotter.retune(settings)
+            if people_tracker is not None and moved:
+                people_tracker.retune(settings)
             return settings, moved
 
-        seen = None if spotter is None else spotter.see
+        seen = None if people_tracker is None else people_tracker.update
         for surveyed in survey(
             feed, engine, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
         ):
-            yield surveyed, None if spotter is None else spotter.of(surveyed.followed.number, feed.ended)
+            number = surveyed.followed.number
+            yield surveyed, None if people_tracker is None else people_tracker.people_of(number, feed.ended)
 
     return begin
+
+
+def _person_tracker(
+    scorer: "WindowScorer", settings: "Settings", interval: int, size: tuple[int, int]
+) -> "PersonTracker":
+    from torchvision_dddas.people import PersonTracker
+    from torchvision_dddas.tracking import FrameTracker
+
+    return PersonTracker(scorer, settings, interval, size, FrameTracker(settings, interval, size, pictures=False))

@@ -16,7 +16,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.io.output.run_record import PeopleRecord
-    from torchvision_dddas.people.scorer import WindowScorer
+    from torchvision_dddas.people.detector import WindowScorer
 
 
 @explained
@@ -52,12 +52,12 @@ def people(
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import PeopleRecorder, parse_save
-    from torchvision_dddas.people import detector as recognizing
+    from torchvision_dddas.people.detector import load_scorer
 
     settings, names = load_config(config, set_ or []), parse_save(save, PeopleRecorder.saved)
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
-    recognizer = cache(lambda: recognizing.recognizer_of(settings.people, backend.value))
+    recognizer = cache(lambda: load_scorer(settings.people, backend.value))
     for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
         journal = people_into(folder, clip, recognizer, settings, names, around, rate, quiet)
         if not quiet:
@@ -87,7 +87,7 @@ def people_into(
     with PeopleRecorder(folder, save) as output:
         from torchvision_dddas import open_video
         from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
-        from torchvision_dddas.people.detector import recognize
+        from torchvision_dddas.people.detector import detect_in_clip
         from torchvision_dddas.people.pyramid import levels
 
         table = read_detections(around) if around is not None else None
@@ -109,7 +109,7 @@ def people_into(
         journal = output.begin(facts, source.rate_hz, source.exact and source.count == 1)
         try:
             with progress(source.name, source.count, quiet) as tick:
-                for recognized in recognize(source, engine, settings, table):
+                for recognized in detect_in_clip(source, engine, settings, table):
                     output.write(recognized)
                     tick()
             if table is not None:

@@ -26,7 +26,7 @@ from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geo.terrain import shift_origin
-from torchvision_dddas.people.detector import recognizer_of
+from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -128,7 +128,7 @@ def build_mission(source: Instrument, settings: Settings, backend: str, by_landm
     watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
     confirmation = None
     if len(source.colours):
-        confirmation = GroundConfirmation(settings, recognizer_of(settings.people, backend))
+        confirmation = GroundConfirmation(settings, load_scorer(settings.people, backend))
     steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
     if steering is not None:
         source.steer(steering.begin(locator.telemetry_at(0.0)))

@@ -9,17 +9,15 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.geo.ranging import range_people
-from torchvision_dddas.people.collaboration import Beliefs, Look, look, view_of
-from torchvision_dddas.people.confirmation import confirmed_by
-from torchvision_dddas.people.detector import people_in
-from torchvision_dddas.people.scorer import WindowScorer
+from torchvision_dddas.people.confirmation import Beliefs, GroundObservation, field_of_view, observe_ground, summarize
+from torchvision_dddas.people.detector import WindowScorer, detect_people
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundPicture, Poses
 
 # People do not run faster.
 _RUNNING_M_S = 4.0
 
 
-def drop_fast_targets(seen: Look, velocity_m_s: np.ndarray) -> Look:
+def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
     """The look without the people at what goes faster than people do, (N, 2): they mount beside its way."""
     fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
     return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
@@ -53,9 +51,9 @@ class GroundConfirmation:
         self._beliefs.add(targets, looks)
         self.pictures += len(looks)
         self.spent_s = time.perf_counter() - start
-        return confirmed_by(grounded.frame, slice(0, len(targets)), targets, self._beliefs, looks)
+        return summarize(grounded.frame, slice(0, len(targets)), targets, self._beliefs, looks)
 
-    def _look(self, picture: GroundPicture, grounded: AerialLocations, extent_m: np.ndarray) -> Look:
+    def _look(self, picture: GroundPicture, grounded: AerialLocations, extent_m: np.ndarray) -> GroundObservation:
         settings, camera, positions = self._settings, picture.camera, grounded.positions
         place = np.array([camera.place], float)
         if positions.origin_deg is not None:
@@ -70,7 +68,7 @@ class GroundConfirmation:
             camera.heading_rad,
             settings.ground,
         )
-        (people,) = people_in([picture.image], self._recognizer, settings.people, [regions])
+        (people,) = detect_people([picture.image], self._recognizer, settings.people, [regions])
         rows = np.zeros(len(people), np.int64)
         poses = Poses(
             np.array([camera.place], float)[rows],
@@ -79,10 +77,10 @@ class GroundConfirmation:
         )
         seen = range_people(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
         known = seen.by != "bearing"
-        view = view_of(camera, place[0], camera.heading_rad, settings.people, settings.ground)
+        view = field_of_view(camera, place[0], camera.heading_rad, settings.people, settings.ground)
         # People of a crowd mount within it, not at its middle: half its radius is about their standard deviation.
         spread = positions.covariance_m2 + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
-        found = look(
+        found = observe_ground(
             positions.east_north_m,
             spread,
             seen.east_north_m[known],

@@ -7,15 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import LinearSvm
 
 SHIPPED = {"opencv": Path(__file__).parents[1] / "models" / "opencv_people.txt"}
 
 Layout = Mapping[str, object]
-"""What a file may say of the descriptor it was trained on: the keys of `PeopleParameters.descriptor`, all or some."""
+"""Descriptor that a classifier was trained on: all or some keys of `PeopleParameters.descriptor`."""
 
-_KNOBS = {
+_PARAMETERS = {
     "window": "people.window_width_px and people.window_height_px",
     "cell": "people.cell_px",
     "block": "people.block_px",
@@ -44,14 +45,19 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
         raise InputError(f"classifier {str(name)[:200]} cannot be read: {error.strerror or error}") from None
     if not there:
         raise InputError(f"no classifier is named '{name}', nor is it a file; give {', '.join(SHIPPED)}, or a file")
-    reader = _READERS.get(path.suffix.lower(), _text)
+    reader = _READERS.get(path.suffix.lower(), _read_text)
     try:
-        numbers, told = reader(path)
+        numbers, stated = reader(path)
     except OSError as error:
         raise InputError(f"classifier {path} cannot be read: {error.strerror or error}") from None
     if wanted is not None:
-        _agree(told, wanted, path)
+        _check_layout(stated, wanted, path)
     return _svm(numbers, features, path)
+
+
+def load_classifier(parameters: PeopleParameters) -> LinearSvm:
+    """The classifier that the settings name. Raises InputError as `read_classifier`, and for one that does not fit."""
+    return read_classifier(parameters.classifier, parameters.features, parameters.descriptor)
 
 
 def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
@@ -73,44 +79,44 @@ def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
     return LinearSvm(numbers[:features], float(numbers[features:].sum()), str(path))
 
 
-def _agree(told: Layout, wanted: Layout, path: Path) -> None:
-    for name, parameter in _KNOBS.items():
-        if name in told and name in wanted and not _same(told[name], wanted[name]):
+def _check_layout(stated: Layout, wanted: Layout, path: Path) -> None:
+    for name, parameter in _PARAMETERS.items():
+        if name in stated and name in wanted and not _is_same(stated[name], wanted[name]):
             raise InputError(
-                f"classifier {path} was trained with a {name} of {_shown(told[name], wanted[name])}, the "
-                f"settings say {_shown(wanted[name], wanted[name])}; change {parameter}"
+                f"classifier {path} was trained with a {name} of {_format(stated[name], wanted[name])}, the "
+                f"settings say {_format(wanted[name], wanted[name])}; change {parameter}"
             )
 
 
-def _same(one: object, other: object) -> bool:
+def _is_same(one: object, other: object) -> bool:
     a, b = np.ravel(np.asarray(one, float)), np.ravel(np.asarray(other, float))
     return a.shape == b.shape and bool((np.abs(a - b) <= _DIGITS).all())
 
 
-def _shown(value: object, like: object) -> str:
+def _format(value: object, like: object) -> str:
     if isinstance(like, bool):
-        return "false" if _same(value, 0) else "true"
+        return "false" if _is_same(value, 0) else "true"
     return " x ".join(f"{number:g}" for number in np.ravel(np.asarray(value, float)))
 
 
-def _text(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_text(path: Path) -> tuple[np.ndarray, Layout]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"classifier {path} is no text: {error.reason}; wanted numbers, .npy, .npz or .yml") from None
+        raise InputError(f"classifier {path} is not text: {error.reason}; wanted numbers, .npy, .npz or .yml") from None
     numbers = []
     for place, line in enumerate(lines, 1):
         for cell in line.partition("#")[0].replace(",", " ").replace(";", " ").split():
             try:
                 numbers.append(float(cell.replace("_", "?")))  # 1_0 is a number to Python alone
             except ValueError:
-                raise InputError(f"classifier {path}, line {place}: '{cell[:40]}' is no number") from None
+                raise InputError(f"classifier {path}, line {place}: '{cell[:40]}' is not a number") from None
             if not math.isfinite(numbers[-1]):
                 raise InputError(f"classifier {path}, line {place}: '{cell}'; wanted finite numbers")
     return np.array(numbers, np.float64), {}
 
 
-def _numpy(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_numpy(path: Path) -> tuple[np.ndarray, Layout]:
     try:
         with path.open("rb") as file:  # NumPy leaves one that it opened itself open where an archive is broken
             held = np.load(file, allow_pickle=False)
@@ -119,7 +125,7 @@ def _numpy(path: Path) -> tuple[np.ndarray, Layout]:
             with held:
                 content = {name: held[name] for name in held.files}
     except (ValueError, EOFError, KeyError) as error:
-        raise InputError(f"classifier {path} is no array of numbers in NumPy's format: {error}") from None
+        raise InputError(f"classifier {path} is not an array of numbers in NumPy's format: {error}") from None
     except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
         if isinstance(error, OSError):
             raise
@@ -129,13 +135,13 @@ def _numpy(path: Path) -> tuple[np.ndarray, Layout]:
     parts = [np.ravel(content[name]) for name in ("weights", "bias") if name in content]
     if len(parts) == 2 and parts[1].size != 1:
         raise InputError(f"classifier {path} has a bias of {parts[1].size} numbers; wanted one")
-    told = {name: content[name] for name in _KNOBS if name in content}
-    if text := [name for name, value in told.items() if value.dtype.kind not in "fiub"]:
-        raise InputError(f"classifier {path}: {text[0]} is of type {told[text[0]].dtype}; wanted numbers")
-    return np.concatenate(parts), told
+    stated = {name: content[name] for name in _PARAMETERS if name in content}
+    if text := [name for name, value in stated.items() if value.dtype.kind not in "fiub"]:
+        raise InputError(f"classifier {path}: {text[0]} is of type {stated[text[0]].dtype}; wanted numbers")
+    return np.concatenate(parts), stated
 
 
-def _opencv(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
     try:
         text = path.read_text(encoding="utf-8")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -143,12 +149,12 @@ def _opencv(path: Path) -> tuple[np.ndarray, Layout]:
         # An SVM's node is the top one; a HOGDescriptor saved by hand may lie anywhere at the top.
         inside = set() if top.empty() else set(top.keys()) if top.isMap() else set()
     except (UnicodeDecodeError, cv2.error, SystemError):
-        raise InputError(f"classifier {path} is no file that OpenCV saved (YAML, XML or JSON)") from None
+        raise InputError(f"classifier {path} is not a file that OpenCV saved (YAML, XML or JSON)") from None
     try:
         if "SVMDetector" in inside:
-            return _hog(top)
+            return _read_hog(top)
         if "support_vectors" in inside:
-            return _support(top, path), {}
+            return _read_support_vectors(top, path), {}
     except InputError:
         raise
     except (ValueError, IndexError, cv2.error, SystemError):
@@ -158,12 +164,12 @@ def _opencv(path: Path) -> tuple[np.ndarray, Layout]:
     )
 
 
-def _hog(node: "cv2.FileNode") -> tuple[np.ndarray, Layout]:
-    told: dict[str, object] = {}
+def _read_hog(node: "cv2.FileNode") -> tuple[np.ndarray, Layout]:
+    stated: dict[str, object] = {}
     for name, key in (("window", "winSize"), ("cell", "cellSize"), ("block", "blockSize"), ("stride", "blockStride")):
         if not (entry := node.getNode(key)).empty():
             pair = _numbers(entry)
-            told[name] = tuple(pair) if name == "window" or len(set(pair)) > 1 else pair[0]
+            stated[name] = tuple(pair) if name == "window" or len(set(pair)) > 1 else pair[0]
     for name, key in (
         ("bins", "nbins"),
         ("signed", "signedGradient"),
@@ -171,11 +177,11 @@ def _hog(node: "cv2.FileNode") -> tuple[np.ndarray, Layout]:
         ("gamma", "gammaCorrection"),
     ):
         if not (entry := node.getNode(key)).empty():
-            told[name] = entry.real()
-    return _numbers(node.getNode("SVMDetector")), told
+            stated[name] = entry.real()
+    return _numbers(node.getNode("SVMDetector")), stated
 
 
-def _support(node: "cv2.FileNode", path: Path) -> np.ndarray:
+def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
     """Weights and bias of a saved cv2.ml.SVM.
 
     Its decision is alpha . K - rho. A classifier takes a positive one for its first label, the lower number; people are
@@ -195,7 +201,7 @@ def _support(node: "cv2.FileNode", path: Path) -> np.ndarray:
             f"classifier {path} is an SVM of type {kind or 'unknown'}; wanted C_SVC, NU_SVC or a regression"
         )
     if functions.size() != 1:
-        raise InputError(f"classifier {path} tells {functions.size()} pairs of classes apart; wanted two classes")
+        raise InputError(f"classifier {path} has {functions.size()} decision functions; wanted one, of two classes")
     rows = np.array([_numbers(vectors.at(i)) for i in range(vectors.size())])
     function = functions.at(0)
     if lacking := [name for name in ("alpha", "rho") if function.getNode(name).empty()]:
@@ -217,4 +223,5 @@ def _numbers(node: "cv2.FileNode") -> np.ndarray:
     return np.array([node.real()])
 
 
-_READERS = {".npy": _numpy, ".npz": _numpy, ".yml": _opencv, ".yaml": _opencv, ".xml": _opencv, ".json": _opencv}
+_READERS = dict.fromkeys((".npy", ".npz"), _read_numpy)
+_READERS |= dict.fromkeys((".yml", ".yaml", ".xml", ".json"), _read_opencv)

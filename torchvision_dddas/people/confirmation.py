@@ -1,16 +1,250 @@
-"""Tables of blobs and of people to what each blob is: frame by frame, on the ground or in one picture."""
+"""People recognized from the ground decide which blobs seen from the air are human (appendix A, III-B).
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+A blob with a person inside its gate is human; one well within a ground camera's view, near enough that a person would
+have been recognized there, and with none near is not; of any other nothing is known. Observations of several vehicles
+and frames add up as log-odds. Beyond the source, which names the idea: the gate is of both covariances, views have an
+extent and can be hidden, and detection and false-alarm rates weigh the evidence.
+"""
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import east_north, poses_at
-from torchvision_dddas.people.collaboration import Beliefs, Look, View, confirm_boxes, look, view_of
+from torchvision_dddas.geometry import east_north, poses_at, shared_px
 from torchvision_dddas.people.pyramid import smallest_body_px
-from torchvision_dddas.types import Camera, Confirmation, DetectionTable, PoseTable, Positions
+from torchvision_dddas.types import Bool, Camera, Confirmation, DetectionTable, Float, PoseTable, Positions
+
+HUMAN, NOT_HUMAN, UNSEEN = "human", "not_human", "unseen"
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a camera on the ground would recognize people.
+
+    east_north_m: where it stands, (2,). heading_rad: clockwise from north. half_rad: half the horizontal angle of view.
+    near_m, far_m: between them a body fits into the picture and is as large as the classifier needs. The sigmas are
+    standard deviations of the pose.
+    """
+
+    east_north_m: np.ndarray
+    heading_rad: float
+    half_rad: float
+    near_m: float
+    far_m: float
+    position_sigma_m: float = 0.0
+    heading_sigma_rad: float = 0.0
+
+
+def field_of_view(
+    camera: Camera, east_north_m: np.ndarray, heading_rad: float, people: PeopleParameters, ground: GroundParameters
+) -> View:
+    """The view of a camera that stands at a place, by the body heights in pixels that the people settings can find."""
+    height_m, (width_px, height_px) = ground.body_height_m, camera.size_px
+    least_px = smallest_body_px(people)
+    aside_px = min(camera.centre_px[0] + 0.5, width_px - 0.5 - camera.centre_px[0])
+    return View(
+        np.asarray(east_north_m, float),
+        heading_rad,
+        math.atan(max(aside_px, 0.0) / camera.focal_px[0]),
+        camera.focal_px[1] * height_m / height_px,
+        camera.focal_px[1] * height_m / least_px,
+        camera.position_sigma_m,
+        camera.heading_sigma_rad,
+    )
+
+
+@dataclass(frozen=True)
+class GroundObservation:
+    """What one vehicle saw of the blobs in one frame, one row a blob.
+
+    looked: (N,) bool, whether it tells anything: a person at the blob, or a clear view of it and none near.
+    people: (N,) int64, recognized at it; a blob may be a crowd. nearest_m, nearest_sigmas: (N,) to the nearest person,
+    infinite without any; in boxes NaN. best: (N,) highest probability of those at it, 0 without any; where it is below
+    confirm.least_score they are in doubt, and so is the blob. places: (N,) people that fit into the blob side by side,
+    1 or more; None: one each.
+    """
+
+    looked: np.ndarray
+    people: np.ndarray
+    nearest_m: np.ndarray
+    nearest_sigmas: np.ndarray
+    best: np.ndarray
+    places: np.ndarray | None = None
+
+
+def observe_ground(
+    blob_m: Float[np.ndarray, "N 2"],
+    blob_m2: Float[np.ndarray, "N 2 2"],
+    person_m: Float[np.ndarray, "M 2"],
+    person_m2: Float[np.ndarray, "M 2 2"],
+    score: Float[np.ndarray, "M"],
+    views: Sequence[View],
+    parameters: ConfirmParameters,
+) -> GroundObservation:
+    """One frame on the ground: places and covariances (NaN: unknown) of the blobs and of one vehicle's people.
+
+    A person is at the blob that is nearest in standard deviations, if within its gate. A blob whose gate holds only
+    improbable people, or those of another blob, is in doubt. views: of the cameras that found these people.
+    """
+    blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
+    blob_m2, person_m2 = (_known(covariance, parameters) for covariance in (blob_m2, person_m2))
+    apart = person_m[None] - blob_m[:, None]
+    # A micrometre at least: where nothing is unsure, no distance could be told in standard deviations.
+    both = blob_m2[:, None] + person_m2[None] + max(parameters.spread_m, 1e-6) ** 2 * np.eye(2)
+    sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
+    inside = sigmas <= math.sqrt(-2 * math.log(1 - parameters.gate_probability))  # chi-square of two degrees of freedom
+    people, best = _assigned(sigmas, inside, score, parameters)
+    clear = np.zeros(len(blob_m), bool)
+    for view in views:
+        clear |= _well_within(blob_m, blob_m2, view, parameters) & ~_hidden(blob_m, person_m, view, parameters)
+    nearest_m = np.linalg.norm(apart, axis=-1).min(axis=1, initial=np.inf)
+    nearest_sigmas = sigmas.min(axis=1, initial=np.inf)
+    return GroundObservation((people > 0) | (clear & ~inside.any(axis=1)), people, nearest_m, nearest_sigmas, best)
+
+
+def observe_picture(
+    blob_px: Float[np.ndarray, "N 4"],
+    person_px: Float[np.ndarray, "M 4"],
+    score: Float[np.ndarray, "M"],
+    parameters: ConfirmParameters,
+    least_px: float = 0.0,
+    aspect: float = 0.4,
+) -> GroundObservation:
+    """One picture in which both were found: boxes x, y, width, height of the blobs and of the people.
+
+    A person is at the blob with the highest IoU among those that share enough with them, measured by the smaller box: a
+    blob may be a crowd, or a part of a body. least_px: a body less tall is not recognized, so that nothing is known of
+    blobs less tall without a person. aspect: of a body, width over height.
+    """
+    blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
+    common = shared_px(blob_px[:, None], person_px)
+    areas = blob_px[:, None, 2:].prod(axis=-1), person_px[:, 2:].prod(axis=-1)
+    inside = common >= parameters.share * np.minimum(*areas)
+    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, parameters)
+    clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
+    unknown = np.full(len(blob_px), np.nan)
+    places = np.maximum(blob_px[:, 2] / np.maximum(aspect * blob_px[:, 3], 1e-9), 1.0)
+    return GroundObservation((people > 0) | clear, people, unknown, unknown, best, places)
+
+
+@dataclass
+class Beliefs:
+    """Log-odds of being human, by target; as frames go by. Targets and vehicles are named by whatever tells them apart.
+
+    Two looks of one vehicle at one target err alike, so all but the first weigh `fresh` only.
+    """
+
+    parameters: ConfirmParameters
+    _odds: dict[Hashable, float] = field(default_factory=dict)
+    _seen: set[tuple[Hashable, Hashable]] = field(default_factory=set)
+
+    def add(self, targets: Sequence[Hashable], observations: Iterable[tuple[Hashable, GroundObservation]]) -> None:
+        """Learn from the observations, (vehicle, observation), of one frame; targets: the name of each row."""
+        for vehicle, seen in observations:
+            weights = evidence(seen, self.parameters)
+            for row in np.flatnonzero(seen.looked).tolist():
+                key = targets[row]
+                weight = self.parameters.fresh if (vehicle, key) in self._seen else 1.0
+                self._seen.add((vehicle, key))
+                odds = self._odds.get(key, _log_odds(self.parameters.prior)) + weight * weights[row]
+                self._odds[key] = float(np.clip(odds, -self.parameters.limit, self.parameters.limit))
+
+    def probability(self, target: Hashable) -> float:
+        """That a target is human; the prior where nothing was seen of it."""
+        return 1 / (1 + math.exp(-self._odds.get(target, _log_odds(self.parameters.prior))))
+
+    def kind(self, target: Hashable) -> str:
+        """human, not_human or unseen."""
+        if target not in self._odds:
+            return UNSEEN
+        return HUMAN if self.probability(target) >= 0.5 else NOT_HUMAN
+
+
+def evidence(seen: GroundObservation, parameters: ConfirmParameters) -> Float[np.ndarray, "N"]:
+    """What a look adds to the log-odds, (N,); 0 without a look.
+
+    With d and f the detection and false-alarm rates: ln (1 - d)/(1 - f) where nobody is; for a person the odds of their
+    own probability, and ln d/f at most: a probability of 1 is no proof. Each further place in a blob as wide as several
+    people where nobody is says ln (1 - c d)/(1 - f), c = crowd_share: one chance hit makes no crowd of a car.
+    """
+    d, f = parameters.detection_rate, parameters.false_rate
+    sure = 1 / (1 + f / d)  # the probability whose odds are d/f
+    best = np.clip(seen.best, 0.5, max(sure, 0.5))
+    first = np.where(seen.people > 0, np.log(best / (1 - best)), math.log((1 - d) / (1 - f)))
+    places = np.ones(len(best)) if seen.places is None else seen.places
+    empty = np.maximum(places - np.maximum(seen.people, 1), 0)
+    return np.where(seen.looked, first + empty * min(math.log((1 - parameters.crowd_share * d) / (1 - f)), 0.0), 0.0)
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1 - probability))
+
+
+def _known(covariance_m2: np.ndarray, parameters: ConfirmParameters) -> np.ndarray:
+    """(N, 2, 2), with the stated standard deviation where nothing is known."""
+    covariance_m2 = np.asarray(covariance_m2, float).reshape(-1, 2, 2)
+    unknown = ~np.isfinite(covariance_m2).all(axis=(1, 2), keepdims=True)
+    return np.where(unknown, parameters.unknown_sigma_m**2 * np.eye(2), covariance_m2)
+
+
+def _assigned(
+    distance: Float[np.ndarray, "N M"],
+    inside: Bool[np.ndarray, "N M"],
+    score: Float[np.ndarray, "M"],
+    parameters: ConfirmParameters,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each person to the nearest blob whose gate they are in: (N,) probable people, (N,) the highest score of any."""
+    blobs = len(distance)
+    people, best = np.zeros(blobs, np.int64), np.zeros(blobs)
+    if not inside.any():
+        return people, best
+    ours = inside.any(axis=0)
+    nearest = np.where(inside, distance, np.inf).argmin(axis=0)[ours]
+    known = np.nan_to_num(np.asarray(score, float)[ours], nan=1.0)
+    np.add.at(people, nearest[known >= parameters.least_score], 1)
+    np.maximum.at(best, nearest, known)
+    return people, best
+
+
+def _well_within(
+    blob_m: np.ndarray, blob_m2: np.ndarray, view: View, parameters: ConfirmParameters
+) -> Bool[np.ndarray, "N"]:
+    """Whether a blob is `inside_sigmas` of its own and of the camera's standard deviations within a view."""
+    apart = blob_m - view.east_north_m
+    distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
+    along = apart / distance[:, None]
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    spread = blob_m2 + view.position_sigma_m**2 * np.eye(2)
+    # Rounded covariances may be a little below 0 along an axis.
+    variances = (np.einsum("ni,nij,nj->n", axis, spread, axis) for axis in (along, across))
+    radial, lateral = (np.sqrt(np.maximum(variance, 0)) for variance in variances)
+    bearing = np.arctan2(along[:, 0], along[:, 1]) - view.heading_rad
+    off = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
+    angle = np.hypot(np.arctan2(lateral, distance), view.heading_sigma_rad)
+    k = parameters.inside_sigmas
+    return (
+        (off + k * angle <= view.half_rad)
+        & (distance - k * radial >= view.near_m)
+        & (distance + k * radial <= view.far_m)
+    )
+
+
+def _hidden(
+    blob_m: np.ndarray, person_m: np.ndarray, view: View, parameters: ConfirmParameters
+) -> Bool[np.ndarray, "N"]:
+    """Whether another blob or a person stands before a blob, nearer the camera by a body's width at least."""
+    apart = blob_m - view.east_north_m
+    distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
+    along = apart / distance[:, None]
+    others = np.concatenate([blob_m, person_m]) - view.east_north_m
+    ahead = along @ others.T
+    aside = np.abs(along[:, :1] * others[:, 1] - along[:, 1:] * others[:, 0])
+    before = (ahead > 0) & (ahead < distance[:, None] - parameters.body_width_m) & (aside < parameters.body_width_m)
+    return before.any(axis=1)
 
 
 @dataclass(frozen=True)
@@ -43,12 +277,12 @@ def confirm_positions(
     frames = frames[(frames - 1) % interval == 0]
     views = [_views(vehicle, frames, origin, settings, rate_hz) for vehicle in vehicles]
 
-    def looks(frame: int, rows: slice) -> Iterator[tuple[str, Look]]:
+    def observations(frame: int, rows: slice) -> Iterator[tuple[str, GroundObservation]]:
         for vehicle, person_m, seen in zip(vehicles, persons_m, views, strict=True):
             there = _rows(vehicle.people.frame, frame)
             yield (
                 vehicle.name,
-                look(
+                observe_ground(
                     blob_m[rows],
                     blobs.covariance_m2[rows],
                     person_m[there],
@@ -60,7 +294,7 @@ def confirm_positions(
             )
 
     identity = blobs.target if lasting else np.full(len(blobs), -1)
-    return _frames(blobs.frame, identity, looks, settings, interval)
+    return _frames(blobs.frame, identity, observations, settings, interval)
 
 
 def confirm_pictures(
@@ -73,21 +307,21 @@ def confirm_pictures(
         parameters.width_share * parameters.window_width_px / (parameters.height_share * parameters.window_height_px)
     )
 
-    def looks(frame: int, rows: slice) -> Iterator[tuple[str, Look]]:
+    def observations(frame: int, rows: slice) -> Iterator[tuple[str, GroundObservation]]:
         for name, table in zip(names, people, strict=True):
             there = table.rows(frame)
             score = table.score[there] if table.probable else np.ones(there.stop - there.start)
             box_px = blobs.box_px[rows]
-            yield name, confirm_boxes(box_px, table.box_px[there], score, settings.confirm, least_px, aspect)
+            yield name, observe_picture(box_px, table.box_px[there], score, settings.confirm, least_px, aspect)
 
     identity = blobs.identity if blobs.identity is not None else np.full(len(blobs), -1)
-    return _frames(blobs.frame, identity, looks, settings, interval)
+    return _frames(blobs.frame, identity, observations, settings, interval)
 
 
 def _frames(
     frame: np.ndarray,
     identity: np.ndarray,
-    looks: Callable[[int, slice], Iterator[tuple[str, Look]]],
+    observations: Callable[[int, slice], Iterator[tuple[str, GroundObservation]]],
     settings: Settings,
     interval: int,
 ) -> Iterator[Confirmation]:
@@ -97,26 +331,31 @@ def _frames(
         targets: list[Hashable] = [
             ("row", row) if name < 1 else name for row, name in enumerate(identity[rows].tolist(), rows.start)
         ]
-        seen = list(looks(number, rows)) if (number - 1) % interval == 0 else []
+        seen = list(observations(number, rows)) if (number - 1) % interval == 0 else []
         if twice := {name for name in targets if targets.count(name) > 1}:
             raise InputError(
                 f"target {min(map(str, twice))} is twice in frame {number}; a target is there once a frame"
             )
         beliefs.add(targets, seen)
-        yield confirmed_by(number, rows, targets, beliefs, seen)
+        yield summarize(number, rows, targets, beliefs, seen)
 
 
-def confirmed_by(
-    number: int, rows: slice, targets: Sequence[Hashable], beliefs: Beliefs, seen: Sequence[tuple[str, Look]]
+def summarize(
+    number: int,
+    rows: slice,
+    targets: Sequence[Hashable],
+    beliefs: Beliefs,
+    seen: Sequence[tuple[str, GroundObservation]],
 ) -> Confirmation:
     """What is believed of the targets of a frame. rows: their places in their table; seen: who looked in this frame."""
     count = len(targets)
-    nothing = Look(*(np.zeros(count, kind) for kind in (bool, np.int64)), *(np.full(count, np.nan) for _ in range(3)))
-    all_looks = [nothing, *(one for _, one in seen)]
-    least = [np.stack([getattr(one, name) for one in all_looks]) for name in ("nearest_m", "nearest_sigmas")]
+    unknown = (np.full(count, np.nan) for _ in range(3))
+    nothing = GroundObservation(np.zeros(count, bool), np.zeros(count, np.int64), *unknown)
+    all_seen = [nothing, *(one for _, one in seen)]
+    least = [np.stack([getattr(one, name) for one in all_seen]) for name in ("nearest_m", "nearest_sigmas")]
     nearest_m, nearest_sigmas = (np.where(np.isfinite(v), v, np.inf).min(axis=0) for v in least)
-    people = np.stack([one.people for one in all_looks]).max(axis=0)
-    best = np.stack([np.nan_to_num(one.best) for one in all_looks]).max(axis=0)
+    people = np.stack([one.people for one in all_seen]).max(axis=0)
+    best = np.stack([np.nan_to_num(one.best) for one in all_seen]).max(axis=0)
     return Confirmation(
         number,
         np.arange(rows.start, rows.stop),
@@ -184,5 +423,5 @@ def _views(
         stood, poses = poses_at(camera, table, frames, rate_hz)
         place_m = poses.place if origin is None else east_north(poses.place, origin)
         for frame, place, heading in zip(frames.tolist(), place_m, poses.heading_rad.tolist(), strict=True):
-            views[frame].append(view_of(stood, place, heading, settings.people, settings.ground))
+            views[frame].append(field_of_view(stood, place, heading, settings.people, settings.ground))
     return views

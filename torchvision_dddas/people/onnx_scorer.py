@@ -1,7 +1,7 @@
-"""Scores of windows by OpenCV and ONNX Runtime, for a small CPU: no torch.
+"""Scores of windows by OpenCV and ONNX Runtime, for a small CPU without torch.
 
-The graphs are made from `ops.hog` by `dddas export`. A part goes through them in tiles that stay in the
-cache; parts are shared among threads, each of which runs the graphs on itself alone.
+The graphs are made from `functional.hog` by `dddas export`. A part goes through them in tiles that stay in the cache;
+parts are shared among threads, each of which runs the graphs on one thread.
 """
 
 import math
@@ -19,8 +19,6 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.opencv_gradient import Gradient
-from torchvision_dddas.people.scratch import spans
 from torchvision_dddas.runtime import SHIPPED, manifest, verified
 from torchvision_dddas.runtime import opened as open_graph
 from torchvision_dddas.types import LinearSvm, Part
@@ -32,6 +30,8 @@ BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 # Side of a tile: its 16 maps take 1.8 MB, about what stays in a core's cache; smaller ones overlap their neighbours
 # for a larger share (104 px: 1.2 times the time), and larger ones gain nothing.
 _TILE_PX = 168
+# Pixels of a band: with three channels its buffers take 1 MB, which should stay in a core's cache.
+_BAND_PX = 20_000
 # Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
 _GRADIENT_PX = 160_000
 _BLOCKS = 2_500
@@ -44,9 +44,9 @@ class OnnxScorer:
 
     def __init__(self, parameters: PeopleParameters, svm: LinearSvm) -> None:
         """Raises InputError where the SVM has another length than the descriptor, or the graphs another layout."""
-        self.parameters, self.svm, self.graphs = parameters, svm, graphs(parameters)
+        self.parameters, self.svm, self.graphs = parameters, svm, find_graphs(parameters)
         self.svm_feed = {
-            "weights": arranged(svm, parameters),
+            "weights": arrange_weights(svm, parameters),
             "bias": np.array(svm.bias, np.float32),
             "clip": np.array(parameters.clip, np.float32),
         }
@@ -55,11 +55,11 @@ class OnnxScorer:
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
         """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
-        return opened(self.graphs, GRAPHS[0]), opened(self.graphs, GRAPHS[1])
+        return open_people_graph(self.graphs, GRAPHS[0]), open_people_graph(self.graphs, GRAPHS[1])
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
-        """As many threads as OpenCV takes; each holds some 15 MB at 640x480."""
+        """As many threads as OpenCV uses; each holds some 15 MB at 640x480."""
         return ThreadPoolExecutor(max(1, cv2.getNumThreads()))
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
@@ -69,7 +69,7 @@ class OnnxScorer:
         for picture, wanted in enumerate(parts):
             for index, part in enumerate(wanted):
                 jobs[picture, part.level].append(index)
-        # A fourth channel that nobody looks at: OpenCV resizes four of them quicker than three.
+        # With an unused fourth channel: OpenCV resizes four channels quicker than three.
         sources = [cv2.cvtColor(image, cv2.COLOR_BGR2BGRA) if image.ndim == 3 else image for image in images]
         maps: list[list[np.ndarray]] = [[np.empty(0)] * len(wanted) for wanted in parts]
 
@@ -79,7 +79,7 @@ class OnnxScorer:
             if size != level.shape[1::-1]:
                 level = cv2.resize(level, size, interpolation=cv2.INTER_LINEAR_EXACT)
             for index in jobs[job]:
-                maps[picture][index] = self._of_part(level, parts[picture][index])
+                maps[picture][index] = self._score_part(level, parts[picture][index])
 
         # The largest first, so that the threads end together.
         order = sorted(jobs, key=lambda job: -sum(parts[job[0]][i].width * parts[job[0]][i].height for i in jobs[job]))
@@ -87,7 +87,7 @@ class OnnxScorer:
             pass
         return maps
 
-    def _of_part(self, level: np.ndarray, part: Part) -> np.ndarray:
+    def _score_part(self, level: np.ndarray, part: Part) -> np.ndarray:
         """A part's scores, every window stride. level: uint8 (H, W) or (H, W, 4) BGRA."""
         parameters, stride = self.parameters, self.parameters.window_stride_px
         width = max(0, (part.width - parameters.window_width_px) // stride + 1)
@@ -102,24 +102,24 @@ class OnnxScorer:
             for column in range(min(phases, width)):
                 x, y = column * stride, row * stride
                 inner = replace(part, x=part.x + x, y=part.y + y, width=part.width - x, height=part.height - y)
-                found = self._scored(level, inner)[::every, ::every]
+                found = self._score_at_block_stride(level, inner)[::every, ::every]
                 here = scores[row::phases, column::phases]
                 here[:] = found[: here.shape[0], : here.shape[1]]
         return scores
 
-    def _scored(self, level: np.ndarray, part: Part) -> np.ndarray:
+    def _score_at_block_stride(self, level: np.ndarray, part: Part) -> np.ndarray:
         """Scores of the windows at every block stride."""
-        histograms = self._histograms(level, part)
+        histograms = self._compute_histograms(level, part)
         _, ny, nx = histograms.shape
         down, across, _ = self.svm_feed["weights"].shape
         found = np.empty((ny - down + 1, nx - across + 1), np.float32)
         # Each block takes as many numbers as a window has blocks: some rows at a time bound the memory.
-        for top, bottom in spans(len(found), max(down, _BLOCKS // nx)):
+        for top, bottom in split_evenly(len(found), max(down, _BLOCKS // nx)):
             rows = np.ascontiguousarray(histograms[:, top : bottom + down - 1])
             (found[top:bottom],) = self.sessions[1].run(None, {"histograms": rows, **self.svm_feed})
         return found
 
-    def _histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
+    def _compute_histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
         gradient = self._gradient
         block, stride = self.parameters.block_px, self.parameters.block_stride_px
@@ -128,14 +128,14 @@ class OnnxScorer:
         side = max(1, (_TILE_PX - block) // stride + 1)
         size = self.parameters.bins * (block // self.parameters.cell_px) ** 2
         found = gradient.scratch("histograms", (size, down, across))
-        for first, last in spans(down, max(side, _GRADIENT_PX // (part.width + 2) // stride)):
+        for first, last in split_evenly(down, max(side, _GRADIENT_PX // (part.width + 2) // stride)):
             # The channels of these rows alone: those of the whole would take 6 MB at 1280x720.
             rows_px = (last - 1 - first) * stride + block
             planes = gradient.scratch("planes", (channels, rows_px + 2, part.width + 2), np.uint8)
-            fill(planes, level, replace(part, y=part.y + first * stride, height=rows_px))
+            fill_planes(planes, level, replace(part, y=part.y + first * stride, height=rows_px))
             polar = gradient(planes)
-            for top, bottom in spans(last - first, side):
-                for left, right in spans(across, side):
+            for top, bottom in split_evenly(last - first, side):
+                for left, right in split_evenly(across, side):
                     rows = slice(top * stride, (bottom - 1) * stride + block)
                     here = polar[:, rows, left * stride : (right - 1) * stride + block]
                     tile = gradient.scratch("tile", here.shape)
@@ -146,7 +146,7 @@ class OnnxScorer:
         return found
 
     @property
-    def _gradient(self) -> Gradient:
+    def _gradient(self) -> "Gradient":
         """This thread's."""
         if not hasattr(self.local, "gradient"):
             self.local.gradient = Gradient(self.parameters.gamma, self.parameters.signed)
@@ -154,7 +154,7 @@ class OnnxScorer:
         return held
 
 
-def graphs(parameters: PeopleParameters) -> Path:
+def find_graphs(parameters: PeopleParameters) -> Path:
     """The folder of the graphs. Raises InputError where they are not those of the manifest, or of another layout."""
     folder = SHIPPED if parameters.graphs == "shipped" else Path(parameters.graphs)
     wanted = {name: int(getattr(parameters, name)) for name in BAKED}
@@ -176,13 +176,13 @@ def graphs(parameters: PeopleParameters) -> Path:
     return folder
 
 
-def opened(folder: Path, name: str) -> Any:
+def open_people_graph(folder: Path, name: str) -> Any:
     """An ONNX Runtime session of a graph."""
     # A memory pattern is a plan for every size of a level, which is no quicker and takes 9 MB.
     return open_graph(folder, name, enable_mem_pattern=False)
 
 
-def fill(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
+def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
     """Channels (C, H + 2, W + 2) of a part with one pixel more on each side.
 
     That is its neighbour in the level, which is reflected beyond its own edge.
@@ -203,8 +203,8 @@ def fill(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
         cv2.copyMakeBorder(held, top, bottom, left, right, cv2.BORDER_REFLECT_101, dst=plane)
 
 
-def arranged(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
-    """(down, across, F) weights as `ops.hog.arranged` has them.
+def arrange_weights(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
+    """(down, across, F) weights as `functional.hog.arranged` has them.
 
     Raises InputError where the SVM is of another length than the descriptor.
     """
@@ -216,3 +216,77 @@ def arranged(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
         )
     weights = svm.weights.astype(np.float32).reshape(across, down, cells, cells, parameters.bins)
     return np.ascontiguousarray(weights.transpose(1, 0, 4, 3, 2)).reshape(down, across, -1)
+
+
+class Gradient:
+    """`functional.hog.gradient` and `angle` by a few passes of OpenCV, in bands that stay in the cache.
+
+    It takes a quarter of the time that ONNX Runtime does for the same. One object a thread.
+    """
+
+    def __init__(self, gamma: bool, signed: bool) -> None:
+        """gamma: of square roots of the levels. signed: directions of a whole turn; false: folded into half of it."""
+        self.gamma, self.signed = gamma, signed
+        self.scratch = Scratch()
+
+    def __call__(self, planes: np.ndarray) -> np.ndarray:
+        """(2, H, W) float32 of planes uint8 (C, H + 2, W + 2): magnitude, and magnitude x direction in radians.
+
+        Valid until the next call. Of channels whose magnitudes are equal the first wins.
+        """
+        height, width = planes.shape[1] - 2, planes.shape[2] - 2
+        polar = self.scratch("polar", (2, height, width))
+        for begin, end in split_evenly(height, max(8, _BAND_PX // width)):
+            self._band(planes[:, begin : end + 2], polar[0, begin:end], polar[1, begin:end])
+        return polar
+
+    def _band(self, planes: np.ndarray, magnitude: np.ndarray, moment: np.ndarray) -> None:
+        channels, height, width = planes.shape[0], planes.shape[1] - 2, planes.shape[2] - 2
+        # Planes stand above one another, each with its border: rows of the differences between two planes mean nothing.
+        tall = channels * (height + 2)
+        levels = self.scratch("levels", (tall, width + 2))
+        dx, dy, square = (self.scratch(name, (tall - 2, width)) for name in ("dx", "dy", "square"))
+        np.copyto(levels.reshape(planes.shape), planes)
+        if self.gamma:
+            cv2.sqrt(levels, dst=levels)
+        cv2.subtract(levels[1:-1, 2:], levels[1:-1, :-2], dst=dx)
+        cv2.subtract(levels[2:, 1:-1], levels[:-2, 1:-1], dst=dy)
+        best_dx, best_dy = dx[:height], dy[:height]
+        if channels > 1:
+            other = self.scratch("levels", square.shape)  # the levels are no longer needed
+            # Not `accumulateSquare`, which rounds but once: of channels nearly equal another would win.
+            cv2.add(cv2.multiply(dx, dx, dst=square), cv2.multiply(dy, dy, dst=other), dst=square)
+            largest = square[:height]
+            for begin in range(height + 2, tall, height + 2):
+                end = begin + height
+                wins = cv2.compare(square[begin:end], largest, cv2.CMP_GT)
+                cv2.copyTo(dx[begin:end], wins, best_dx)
+                cv2.copyTo(dy[begin:end], wins, best_dy)
+                if end < len(square):
+                    cv2.max(square[begin:end], largest, dst=largest)
+        cv2.cartToPolar(best_dx, best_dy, magnitude=magnitude, angle=moment)
+        if not self.signed:
+            half_turn = cv2.threshold(moment, math.pi, math.pi, cv2.THRESH_BINARY, dst=best_dx)[1]
+            cv2.subtract(moment, half_turn, dst=moment)
+        cv2.multiply(moment, magnitude, dst=moment)
+
+
+class Scratch:
+    """Arrays by name; each is what it was given last, until it is asked for again. One object a thread."""
+
+    def __init__(self) -> None:
+        self.held: dict[str, np.ndarray] = {}
+
+    def __call__(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        """A contiguous array of any content."""
+        size = math.prod(shape)
+        held = self.held.get(name)
+        if held is None or held.size < size or held.dtype != dtype:
+            held = self.held[name] = np.empty(size, dtype)
+        return held[:size].reshape(shape)
+
+
+def split_evenly(length: int, most: int) -> list[tuple[int, int]]:
+    """(begin, end) of the fewest stretches, of about equal length, that make up the whole."""
+    count = -(-length // most)
+    return [(length * i // count, length * (i + 1) // count) for i in range(count)]

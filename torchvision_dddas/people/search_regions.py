@@ -1,8 +1,8 @@
-"""Where people are looked for in a frame: everywhere, around those seen before, around what moves; the feedback rule.
+"""Where people are searched in a frame: everywhere, around those seen before, around what moves; the feedback rule.
 
-The surroundings of people who are expected are searched in every frame, the rest of the picture a few levels at a time,
-so that the cost follows the need. A person scores at several neighbouring levels: the first of them to have its turn
-shows him, so that searching a tenth of the levels in each frame finds newcomers sooner than all levels in each tenth.
+The surroundings of expected people are searched in every frame, the rest of the picture a few levels at a time. A
+person scores at several neighbouring levels, and is found at the first of them: so a tenth of the levels in each frame
+finds newcomers sooner than all levels in each tenth frame.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.geometry import shared_px
-from torchvision_dddas.people import pyramid as scan
+from torchvision_dddas.people import pyramid
 from torchvision_dddas.types import Adjustment, Float, Part, People
 
 Regions = tuple[np.ndarray, np.ndarray]
@@ -35,10 +35,10 @@ _TURN = 0.382  # levels that have their turn in frames after one another are so 
 
 
 @dataclass(frozen=True)
-class Look:
-    """What of a frame is searched. regions_px: (R, 4) where, beside the levels whose turn it is; None: everywhere.
+class SearchPlan:
+    """The parts of a frame to search. regions_px: (R, 4), beside the levels whose turn it is; None: everywhere.
 
-    share: windows searched, of all that there are.
+    share: of all windows that are searched.
     """
 
     parts: list[Part]
@@ -59,11 +59,11 @@ def grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: 
     return box_px + box_px[:, 3:] * more
 
 
-class Expected:
-    """Who is expected where: people that were found, moved on by their velocity.
+class ExpectedPeople:
+    """Predicts where people are, from where they were found and their velocity.
 
-    One who is not found stays expected for four times as many frames as he was found in, at most twice `rescan_frames`:
-    a person who was missed comes back, and a window that looked like one for a frame is soon forgotten.
+    A person who is not found stays expected for four times as many frames as they were found in, at most twice
+    `rescan_frames`: a person who was missed comes back, and a false alarm of one frame is soon forgotten.
     """
 
     def __init__(self, parameters: PeopleParameters) -> None:
@@ -92,16 +92,16 @@ class Expected:
             parameters.region_scales,
         )
 
-    def learn(self, frame: int, people: People) -> int:
-        """Take in whom a look found; returns how many of those expected are among them."""
+    def update(self, frame: int, people: People) -> int:
+        """Correct by the people found; returns how many of those expected are among them."""
         steps = max(frame - self.frame, 1)
         box_px = self.box_px(frame)
         place, size = people.box_px[:, :2] + people.box_px[:, 2:] / 2, people.box_px[:, 2:]
         row, column = _pairs(box_px, people.box_px, self.parameters.region_scales)
         self.place_px = box_px[:, :2] + box_px[:, 2:] / 2
-        miss = place[column] - self.place_px[row]
-        self.place_px[row] += _PLACE_GAIN * miss
-        self.velocity_px[row] += _VELOCITY_GAIN * miss / steps
+        innovation = place[column] - self.place_px[row]
+        self.place_px[row] += _PLACE_GAIN * innovation
+        self.velocity_px[row] += _VELOCITY_GAIN * innovation / steps
         self.size_px[row] *= (size[column] / self.size_px[row]) ** _PLACE_GAIN
         self.found[row] += 1
         self.seen[row] = frame
@@ -137,7 +137,7 @@ def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tupl
     return np.array(rows, int), np.array(columns, int)
 
 
-def _covered(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
+def _covered_share(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     """(N,) share of each box that the others cover, those that overlap counted twice."""
     return shared_px(box_px[:, None], other_px).sum(axis=1) / box_px[:, 2:].prod(axis=1)
 
@@ -147,7 +147,7 @@ def _both(some: Regions, others: Regions) -> Regions:
 
 
 class Search:
-    """Decides for frame after frame where to look; a Look for each, and what it found, go through here in order.
+    """Plans where to search frame after frame; `update` takes what was found by each plan.
 
     `people.search = everywhere`: the whole picture. `regions`: around those expected, and the whole picture level by
     level in `rescan_frames` frames; all of it in one look at first, and when all who were expected are lost, as after
@@ -159,61 +159,62 @@ class Search:
     def __init__(self, parameters: PeopleParameters, blobs: Callable[[int], np.ndarray] | None = None) -> None:
         self.blobs = blobs
         self.steered = parameters.search == "regions"
-        self.expected = Expected(parameters)
-        self.looks = 0
+        self.expected = ExpectedPeople(parameters)
+        self.plans = 0
         self.retune(parameters)
         self.there = 0  # people whom the last look found
         self.lost = 0  # how many the look before it had found, where it found none of them
-        self.told = 1.0  # share of windows in the last line of the record
+        self.reported = 1.0  # share of windows in the last line of the record
 
     def retune(self, parameters: PeopleParameters) -> None:
         """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
         self.parameters = self.expected.parameters = parameters
         self.bound = parameters.look_share < 1
 
-    def look(self, frame: int, size: tuple[int, int]) -> Look:
+    def plan(self, frame: int, size: tuple[int, int]) -> SearchPlan:
         """Where to search a frame of (width, height)."""
-        everywhere = scan.everywhere(size, self.parameters)
+        everywhere = pyramid.everywhere(size, self.parameters)
         if not self.steered and self.blobs is None:
-            return Look(everywhere, None, 1.0)
-        all_windows = scan.cost(everywhere, self.parameters)
+            return SearchPlan(everywhere, None, 1.0)
+        all_windows = pyramid.cost(everywhere, self.parameters)
         if self.steered and not self.bound:
-            if not self.looks or frame - self.expected.frame > self.parameters.rescan_frames:
-                return Look(everywhere, None, 1.0)
+            if not self.plans or frame - self.expected.frame > self.parameters.rescan_frames:
+                return SearchPlan(everywhere, None, 1.0)
             if self.lost:
                 return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
         known, moving = self._regions(frame)
         if self.steered and self.bound:
             return self._bounded(frame, known, moving, everywhere, size)
         region_px, heights_px = _both(known, moving)
-        parts = scan.within(region_px, heights_px, size, self.parameters)
-        around = scan.cost(parts, self.parameters) / all_windows
+        parts = pyramid.within(region_px, heights_px, size, self.parameters)
+        around = pyramid.cost(parts, self.parameters) / all_windows
         if not self.steered:
-            return Look(parts, region_px, around)
+            return SearchPlan(parts, region_px, around)
         if around > _DEAR:
             return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
         due = self._due(everywhere, self.parameters.rescan_frames)
         levels = {part.level for part in due}
         parts = due + [part for part in parts if part.level not in levels]
-        return Look(parts, region_px, scan.cost(parts, self.parameters) / all_windows, self._told(frame, around))
+        share = pyramid.cost(parts, self.parameters) / all_windows
+        return SearchPlan(parts, region_px, share, self._report(frame, around))
 
     def _bounded(
         self, frame: int, known: Regions, moving: Regions, everywhere: list[Part], size: tuple[int, int]
-    ) -> Look:
+    ) -> SearchPlan:
         """A look that costs `people.look_share` of one at all: what is due, around those expected, around movers."""
-        whole = scan.pixels(everywhere)
+        whole = pyramid.pixels(everywhere)
         most = self.parameters.look_share * whole
-        tiles = scan.tiles(everywhere, most / 2, self.parameters)
+        tiles = pyramid.tiles(everywhere, most / 2, self.parameters)
         # Half of what a look may take is for the rest of the picture.
-        parts = self._due(tiles, max(self.parameters.rescan_frames, math.ceil(scan.pixels(tiles) / (most / 2))))
+        parts = self._due(tiles, max(self.parameters.rescan_frames, math.ceil(pyramid.pixels(tiles) / (most / 2))))
         around = 0.0
         for regions in (known, moving):
-            wanted = scan.within(*regions, size, self.parameters)
-            around += scan.pixels(wanted)
-            parts += self._thinned(wanted, most - scan.pixels(parts))
+            wanted = pyramid.within(*regions, size, self.parameters)
+            around += pyramid.pixels(wanted)
+            parts += self._thinned(wanted, most - pyramid.pixels(parts))
         region_px, _ = _both(known, moving)
-        share = scan.cost(parts, self.parameters) / scan.cost(everywhere, self.parameters)
-        return Look(parts, region_px, share, self._told(frame, min(around / whole, self.parameters.look_share)))
+        share = pyramid.cost(parts, self.parameters) / pyramid.cost(everywhere, self.parameters)
+        return SearchPlan(parts, region_px, share, self._report(frame, min(around / whole, self.parameters.look_share)))
 
     def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
         """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.
@@ -221,24 +222,24 @@ class Search:
         A body scores at several levels that lie together.
         """
         levels = sorted({part.level for part in parts})
-        every = min(math.ceil(scan.pixels(parts) / max(most_px, 1)), len(levels))
-        due = set(levels[self.looks % every :: every]) if every else set()
+        every = min(math.ceil(pyramid.pixels(parts) / max(most_px, 1)), len(levels))
+        due = set(levels[self.plans % every :: every]) if every else set()
         return [part for part in parts if part.level in due]
 
-    def learn(self, frame: int, people: People, look: Look) -> None:
-        """Take in what a look found."""
-        self.looks += 1
+    def update(self, frame: int, people: People, plan: SearchPlan) -> None:
+        """Add what was found by a plan."""
+        self.plans += 1
         if not self.steered:
             return
-        again = self.expected.learn(frame, people)
+        again = self.expected.update(frame, people)
         # One alone is often missed for a frame, and after a look that found nobody none is new.
-        self.lost = self.there if self.there > 1 and not again and look.regions_px is not None else 0
+        self.lost = self.there if self.there > 1 and not again and plan.regions_px is not None else 0
         self.there = len(people)
 
     def _due(self, parts: list[Part], rounds: int) -> list[Part]:
         """Those whose turn it is: each comes once in so many looks, far from those before."""
         step = min((k for k in range(1, rounds + 1) if math.gcd(k, rounds) == 1), key=lambda k: abs(k - _TURN * rounds))
-        return parts[self.looks * step % rounds :: rounds]
+        return parts[self.plans * step % rounds :: rounds]
 
     def _regions(self, frame: int) -> tuple[Regions, Regions]:
         """Around those expected, and around what moves."""
@@ -248,24 +249,24 @@ class Search:
         if self.blobs is not None:
             box_px = self.blobs(frame)
             if self.steered:
-                box_px = box_px[_covered(box_px, self.expected.box_px(frame)) < _EXPLAINED]
+                box_px = box_px[_covered_share(box_px, self.expected.box_px(frame)) < _EXPLAINED]
             moving = around_blobs(box_px)
         return known, moving
 
-    def _whole(self, frame: int, everywhere: list[Part], why: str) -> Look:
+    def _whole(self, frame: int, everywhere: list[Part], why: str) -> SearchPlan:
         """A look at all, which the record explains."""
-        old, self.told = self.told, 1.0
+        old, self.reported = self.reported, 1.0
         moved = (Adjustment(frame, "people.regions_share", old, 1.0, why),) if old != 1.0 else ()
-        return Look(everywhere, None, 1.0, moved)
+        return SearchPlan(everywhere, None, 1.0, moved)
 
-    def _told(self, frame: int, share: float) -> tuple[Adjustment, ...]:
+    def _report(self, frame: int, share: float) -> tuple[Adjustment, ...]:
         """A line of the record, where the share of windows in regions has changed much since the last one."""
-        low, high = sorted((max(share, _LITTLE), max(self.told, _LITTLE)))
+        low, high = sorted((max(share, _LITTLE), max(self.reported, _LITTLE)))
         if high < _CHANGED * low:
             return ()
         why = f"{_persons(len(self.expected))} expected" + ("" if self.blobs is None else ", and what moves")
-        old, self.told = self.told, round(share, 4)
-        return (Adjustment(frame, "people.regions_share", old, self.told, why),)
+        old, self.reported = self.reported, round(share, 4)
+        return (Adjustment(frame, "people.regions_share", old, self.reported, why),)
 
 
 def _persons(count: int) -> str:

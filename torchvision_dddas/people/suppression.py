@@ -1,21 +1,87 @@
-"""One box a person: many windows around each score, and either the best of them stays, or OpenCV's grouping decides."""
+"""From windows that score to people: non-maximum suppression, one body box a person, and its probability."""
+
+from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.geometry import shared_px
-from torchvision_dddas.types import Float, Int
+from torchvision_dddas.types import Float, Int, People
 
-# A little less than one: a box that lies in another shares no more than all of itself, whatever the rounding.
+# A little below one: whatever the rounding, a box inside another shares no more than all of itself.
 _WHOLE = 1 - 1e-9
+# A body nearer to the picture's border, in its own heights, may be cut by it: twice the error of foot rows.
+_NEAR = 0.05
+
+# Arrays here, tensors where parameters are tuned by gradient: one formula for both.
+Column = Any
+Share = Any
 
 
-def nms(
+def people_from_windows(
+    window_px: Float[np.ndarray, "N 4"],
+    margin: Float[np.ndarray, " N"],
+    size: tuple[int, int],
+    parameters: PeopleParameters,
+) -> People:
+    """The people that windows show, best first. size: (width, height) of the picture."""
+    window_px, margin = np.asarray(window_px, float).reshape(-1, 4), np.asarray(margin, float)
+    if parameters.suppression == "nms":
+        boxes = body_boxes(window_px, parameters)
+        kept = non_maximum_suppression(boxes, margin, parameters.overlap, parameters.contained)
+        # The best windows are placed best: the cube leaves little weight to those just above the threshold.
+        window_px = refine_boxes(window_px, (margin - parameters.threshold) ** 3, kept, parameters.settle)
+        margin = margin[kept]
+    else:
+        if parameters.suppression == "opencv":
+            window_px, margin = group_rectangles(window_px, margin, parameters.group, parameters.group_distance)
+        order = np.argsort(-margin, kind="stable")
+        window_px, margin = window_px[order], margin[order]
+    box_px = body_boxes(window_px, parameters)
+    return People(box_px, probability(margin, parameters), margin, is_cut(box_px, size), window_px)
+
+
+def body_boxes(window_px: Float[np.ndarray, "N 4"], parameters: PeopleParameters) -> Float[np.ndarray, "N 4"]:
+    """The body's box in each window, by ratios that were calibrated on true boxes."""
+    x, y, width, height = window_px.T
+    sides = body_sides(x, y, width, height, parameters.height_share, parameters.width_share, parameters.feet_share)
+    return np.stack(sides, axis=1)
+
+
+def body_sides(
+    x: Column, y: Column, width: Column, height: Column, height_share: Share, width_share: Share, feet_share: Share
+) -> tuple[Column, Column, Column, Column]:
+    """Left, top, width, height of the body, as arrays, numbers or tensors."""
+    wide, tall = width_share * width, height_share * height
+    return x + (width - wide) / 2, y + feet_share * height - tall, wide, tall
+
+
+def probability(margin: Float[np.ndarray, " N"], parameters: PeopleParameters) -> Float[np.ndarray, " N"]:
+    """Probability that a window of this score shows a person (Platt scaling)."""
+    return 1 / (
+        1 + np.exp(-np.clip(log_odds(margin, parameters.probability_slope, parameters.probability_even), -50, 50))
+    )
+
+
+def log_odds(margin: Column, slope: Share, even: Share) -> Column:
+    """Log-odds of that probability, as array, number or tensor."""
+    return slope * (margin - even)
+
+
+def is_cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarray:
+    """(N,) bool: the picture's border cuts the body, or comes so near that it may."""
+    near = _NEAR * box_px[:, 3:]
+    low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
+    return (low < near).any(axis=1) | (high > np.array(size) - near).any(axis=1)
+
+
+def non_maximum_suppression(
     box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], overlap: float, contained: float = 1.0
 ) -> Int[np.ndarray, " K"]:
-    """Rows of the boxes that stay, best first; of equal scores the first row.
+    """Rows of the boxes that are kept, best first; of equal scores the first row.
 
-    A box goes where a better one that stays shares more than `overlap` of their union with it, or more than `contained`
-    of the smaller of the two: legs and heads score as small people inside the box of the whole one.
+    A box is dropped if a better kept one shares more than `overlap` of their union with it, or more than `contained` of
+    the smaller of the two: legs and heads score as small people inside the box of the whole person.
     """
     order = np.argsort(-np.asarray(score, float), kind="stable")
     box = np.asarray(box_px, float).reshape(-1, 4)[order]
@@ -33,7 +99,7 @@ def nms(
     return order[np.array(kept, np.int64)]
 
 
-def settled(
+def refine_boxes(
     box_px: Float[np.ndarray, "N 4"],
     weight: Float[np.ndarray, " N"],
     kept: Int[np.ndarray, " K"],
@@ -58,7 +124,7 @@ def settled(
     return np.concatenate([mean[:, :2] - size / 2, size], axis=1)
 
 
-def group(
+def group_rectangles(
     box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], least: int, distance: float = 0.2
 ) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, " G"]]:
     """OpenCV's grouping of HOG detections: means of boxes that are alike, in whole pixels, and their best score.

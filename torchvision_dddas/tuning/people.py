@@ -18,9 +18,9 @@ from torchvision_dddas.evaluation.metrics.ignored_regions import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.functional.soft import step
-from torchvision_dddas.people import pyramid as scan
-from torchvision_dddas.people.boxes import body_sides, log_odds, people_of
-from torchvision_dddas.people.scorer import WindowScorer
+from torchvision_dddas.people import pyramid
+from torchvision_dddas.people.detector import WindowScorer
+from torchvision_dddas.people.suppression import body_sides, log_odds, people_from_windows
 from torchvision_dddas.tuning.family import Example, Tick
 
 MOST = 80
@@ -62,14 +62,14 @@ class Recognition:
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The pictures whose people are labelled, each scored once. See `family.Family`."""
-        from torchvision_dddas.people.detector import recognizer_of
+        from torchvision_dddas.people.detector import load_scorer
 
         parameters = settings.people
         if parameters.suppression != "nms":
             raise InputError(
                 f"people.suppression = {parameters.suppression} cannot be tuned by gradient; set it to nms"
             )
-        recognizer, found = recognizer_of(parameters), list[Example]()
+        recognizer, found = load_scorer(parameters), list[Example]()
         for clip in clips:
             for example in _pictures(clip, parameters, recognizer):
                 found.append(example)
@@ -100,14 +100,14 @@ def scored(
     truth_px: (M, 4). counted: which of boxes (N, 4) are right or wrong; the others are left out.
     """
     size = (image.shape[1], image.shape[0])
-    parts = scan.everywhere(size, parameters)
+    parts = pyramid.everywhere(size, parameters)
     (maps,) = recognizer.scores([image], [parts])
     low = parameters.model_copy(update={"threshold": parameters.threshold - BELOW})
-    window_px, margin = scan.windows(parts, maps, size, low)
-    every = people_of(window_px, margin, size, low)
+    window_px, margin = pyramid.windows(parts, maps, size, low)
+    every = people_from_windows(window_px, margin, size, low)
     above = margin >= parameters.threshold
     # Boxes are means of windows, weighed by how far they are above the threshold: those of the settings' own.
-    shown = people_of(window_px[above], margin[above], size, parameters)
+    shown = people_from_windows(window_px[above], margin[above], size, parameters)
     box_px = np.concatenate([shown.box_px, every.box_px[len(shown) :]])
     kept = counted(box_px)
     sure = int(kept[: len(shown)].sum())
@@ -122,7 +122,7 @@ def scored(
 
 def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer) -> Iterator[Example]:
     from torchvision_dddas.evaluation.studies.stages import open_clip
-    from torchvision_dddas.people.detector import checked
+    from torchvision_dddas.people.detector import check_image
 
     truth = clip.truth
     if truth is None or truth.kind != "boxes" or not truth.boxes:
@@ -131,7 +131,7 @@ def _pictures(clip: Clip, parameters: PeopleParameters, recognizer: WindowScorer
     some = {numbers[i * len(numbers) // MOST] for i in range(MOST)} if len(numbers) > MOST else set(numbers)
     for frame in open_clip(clip):
         if frame.number in some:
-            image = checked(frame.image, f"{clip.name}, frame {frame.number}")
+            image = check_image(frame.image, f"{clip.name}, frame {frame.number}")
             true_px = np.asarray(truth.boxes[frame.number], float).reshape(-1, 4)
             told = partial(_counted, truth, frame.number)
             yield Example(clip.name, frame.number, scored(image, true_px, parameters, recognizer, told))

@@ -23,7 +23,7 @@ from torchvision_dddas.io.detection_tables import check_table, read_detections
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource
 from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.people.detector import recognize, recognizer_of
+from torchvision_dddas.people.detector import detect_in_clip, load_scorer
 from torchvision_dddas.pipeline import survey
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
@@ -271,7 +271,7 @@ def _find_associations(job: _Job) -> Rows:
 def _find_people(job: _Job) -> Rows:
     """People by their shape: `dddas people`."""
     source, rows = open_clip(job.clip), Rows()
-    for here in recognize(source, recognizer_of(job.settings.people, job.backend), job.settings):
+    for here in detect_in_clip(source, load_scorer(job.settings.people, job.backend), job.settings):
         people = here.people
         rows.add(here.frame.number, here.seconds, box_px=round_as_written(people.box_px), score=people.score)
         job.tick()

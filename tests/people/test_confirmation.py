@@ -1,4 +1,4 @@
-"""People seen from the ground decide what blobs are: gates, views, what hides, and looks that add up."""
+"""Blobs confirmed by people recognized from the ground."""
 
 import math
 
@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters
-from torchvision_dddas.people.collaboration import Beliefs, Look, View, confirm_boxes, evidence, look, view_of
+from torchvision_dddas.people.confirmation import (
+    Beliefs,
+    GroundObservation,
+    View,
+    evidence,
+    field_of_view,
+    observe_ground,
+    observe_picture,
+)
 from torchvision_dddas.types import Camera
 
 KNOBS = ConfirmParameters(spread_m=0.0)
@@ -22,7 +30,7 @@ def square(sigma_m, n):
 def seen(blobs, people=(), views=(NORTH,), parameters=KNOBS, blob_sigma=0.3, person_sigma=0.1, score=None):
     blobs, people = np.reshape(blobs, (-1, 2)).astype(float), np.reshape(people, (-1, 2)).astype(float)
     score = np.ones(len(people)) if score is None else np.array(score)
-    return look(
+    return observe_ground(
         blobs, square(blob_sigma, len(blobs)), people, square(person_sigma, len(people)), score, views, parameters
     )
 
@@ -41,13 +49,6 @@ def test_the_gate_is_the_chi_square_of_both_covariances():
     assert seen([0, 10], [edge * 1.001, 10]).people[0] == 0
 
 
-def test_the_gate_is_an_ellipse_where_the_covariance_is():
-    long = np.array([[[0.04, 0], [0, 4.0]]])
-    for person, inside in (((0, 13.0), 1), ((3.0, 10), 0)):
-        found = look(np.array([[0, 10.0]]), long, np.array([person]), square(0.1, 1), np.ones(1), [NORTH], KNOBS)
-        assert found.people[0] == inside
-
-
 def test_a_blob_well_within_view_with_none_near_is_looked_at_and_empty():
     found = seen([0, 10])
     assert (found.looked[0], found.people[0], found.nearest_m[0]) == (True, 0, np.inf)
@@ -62,39 +63,10 @@ def test_a_blob_outside_the_view_or_at_its_edge_is_unseen(blob):
     assert not seen(blob).looked[0]
 
 
-def test_a_blob_that_is_little_known_is_not_well_within():
-    assert seen([0, 10], blob_sigma=0.3).looked[0]
-    assert not seen([0, 10], blob_sigma=5.0).looked[0]
-
-
-def test_an_unsure_heading_narrows_the_view():
-    blob, steady = [4, 10], View(np.zeros(2), 0.0, math.radians(30), 2, 20)
-    swaying = View(np.zeros(2), 0.0, math.radians(30), 2, 20, heading_sigma_rad=math.radians(10))
-    assert seen(blob, views=[steady]).looked[0]
-    assert not seen(blob, views=[swaying]).looked[0]
-
-
-def test_without_views_blobs_are_human_or_unseen():
-    found = seen([[0, 10], [5, 10]], [0, 10], views=())
-    assert found.looked.tolist() == [True, False]
-
-
 def test_a_blob_behind_another_is_hidden_and_one_beside_it_is_not():
     assert seen([[0, 5], [0, 10]]).looked.tolist() == [True, False]
     assert seen([[-1, 5], [1, 10]]).looked.tolist() == [True, True]
     assert seen([[0, 10]], [[0, 5]]).looked.tolist() == [False]
-
-
-def test_what_one_camera_does_not_see_another_may():
-    east = View(np.array([-10.0, 10.0]), math.pi / 2, math.radians(30), 2.0, 20.0)
-    assert not seen([[0, 5], [0, 10]], views=[NORTH]).looked[1]
-    assert seen([[0, 5], [0, 10]], views=[NORTH, east]).looked[1]
-
-
-def test_places_known_exactly_can_be_compared():
-    found = seen([[0, 10], [3, 10]], [[0, 10]], blob_sigma=0.0, person_sigma=0.0)
-    assert found.people.tolist() == [1, 0]
-    assert found.nearest_sigmas[0] == 0 and np.isfinite(found.nearest_sigmas).all()
 
 
 def test_a_crowd_is_counted():
@@ -107,12 +79,6 @@ def test_a_crowd_is_counted():
 def test_a_person_between_two_blobs_is_at_one_and_leaves_the_other_in_doubt():
     found = seen([[0, 10], [0.8, 10]], [0.2, 10])
     assert (found.people.tolist(), found.looked.tolist()) == ([1, 0], [True, False])
-
-
-def test_a_position_without_covariance_has_the_stated_one():
-    unknown = np.full((1, 2, 2), np.nan)
-    stated = look(np.array([[0, 10.0]]), unknown, np.array([[3.0, 10]]), square(0.0, 1), np.ones(1), [], KNOBS)
-    assert stated.nearest_sigmas[0] == pytest.approx(3.0 / KNOBS.unknown_sigma_m)
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
@@ -132,20 +98,20 @@ def test_nothing_changes_when_the_whole_scene_is_turned_and_moved(angle, east, n
 
 def test_a_cameras_view_reaches_as_far_as_bodies_are_large_enough():
     camera = Camera("ugv", (800, 600), (1000.0, 1000.0), (399.5, 299.5))
-    view = view_of(
+    view = field_of_view(
         camera, np.zeros(2), 0.0, PeopleParameters(enlarge=1.0, height_share=0.75), GroundParameters(body_height_m=1.8)
     )
     assert view.far_m == pytest.approx(1000 * 1.8 / 96)
     assert view.near_m == pytest.approx(3.0)
     assert view.half_rad == pytest.approx(math.atan(0.4))
     twice = PeopleParameters(enlarge=2.0, scale_step=2**0.25, height_share=0.75)  # whole steps to twice the size
-    closer = view_of(camera, np.zeros(2), 0.0, twice, GroundParameters(body_height_m=1.8))
+    closer = field_of_view(camera, np.zeros(2), 0.0, twice, GroundParameters(body_height_m=1.8))
     assert closer.far_m == pytest.approx(2 * view.far_m)
 
 
 def one(looked, people=0, best=0.0):
     nothing = np.full(1, np.nan)
-    return Look(np.array([looked]), np.array([people]), nothing, nothing, np.array([best]))
+    return GroundObservation(np.array([looked]), np.array([people]), nothing, nothing, np.array([best]))
 
 
 def test_a_look_weighs_as_bayes_says():
@@ -157,29 +123,12 @@ def test_a_look_weighs_as_bayes_says():
     assert evidence(one(False), parameters)[0] == 0
 
 
-def test_a_less_probable_person_is_weaker_evidence_and_none_is_proof():
-    parameters = ConfirmParameters()
-    weights = [evidence(one(True, 1, score), parameters)[0] for score in (0.5, 0.7, 0.9, 1.0)]
-    assert weights == sorted(weights)
-    assert weights[0] == 0
-    assert weights[1] == pytest.approx(math.log(0.7 / 0.3))
-    assert weights[-1] == pytest.approx(math.log(parameters.detection_rate / parameters.false_rate))
-
-
-def test_an_improbable_person_leaves_the_blob_in_doubt():
-    for view in ((NORTH,), ()):
-        found = seen([0, 10], [0, 10], views=view, score=[0.4])
-        assert (found.looked[0], found.people[0], found.best[0]) == (False, 0, 0.4)
-    boxes = confirm_boxes(np.array([[0, 0, 400, 180.0]]), np.array([[90, 10, 60, 150.0]]), np.array([0.4]), KNOBS)
-    assert (boxes.looked[0], boxes.people[0]) == (False, 0)
-
-
 def test_one_chance_hit_makes_no_crowd_of_a_car():
     person, car, crowd = [[0, 0, 50, 130]], [[0, 0, 400, 130]], [[0, 0, 400, 130]]
     one_hit, many = [[5, 5, 45, 120.0]], [[x, 5, 45, 120.0] for x in range(5, 350, 80)]
 
     def weight(blob, people):
-        found = confirm_boxes(np.array(blob, float), np.array(people), np.full(len(people), 0.8), KNOBS)
+        found = observe_picture(np.array(blob, float), np.array(people), np.full(len(people), 0.8), KNOBS)
         return evidence(found, KNOBS)[0]
 
     assert weight(person, one_hit) > 0.5
@@ -208,23 +157,6 @@ def test_looks_of_two_vehicles_add_up_and_later_ones_of_the_same_weigh_less():
     )
 
 
-def test_a_belief_can_still_be_turned_after_a_long_time():
-    beliefs = Beliefs(ConfirmParameters())
-    for _ in range(1000):
-        beliefs.add(["blob"], [("a", one(True))])
-    assert (beliefs.kind("blob"), beliefs.probability("blob") < 0.01) == ("not_human", True)
-    for _ in range(12):
-        beliefs.add(["blob"], [("a", one(True, 1, 1.0))])
-    assert beliefs.kind("blob") == "human"
-
-
-def test_targets_do_not_mix():
-    beliefs = Beliefs(ConfirmParameters())
-    looks = Look(np.array([True, True]), np.array([1, 0]), *(np.full(2, np.nan),) * 2, np.array([1.0, 0.0]))
-    beliefs.add(["one", "other"], [("a", looks)])
-    assert (beliefs.kind("one"), beliefs.kind("other")) == ("human", "not_human")
-
-
 def test_with_rates_as_stated_the_probabilities_are_calibrated():
     # Simulated: half of the blobs are people, each is looked at by two vehicles once.
     rng = np.random.default_rng(0)
@@ -237,7 +169,7 @@ def test_with_rates_as_stated_the_probabilities_are_calibrated():
             int
         )
         nothing = np.full(len(human), np.nan)
-        looks = Look(np.ones(len(human), bool), people, nothing, nothing, people.astype(float))
+        looks = GroundObservation(np.ones(len(human), bool), people, nothing, nothing, people.astype(float))
         beliefs.add(names, [(vehicle, looks)])
     said = np.array([beliefs.probability(name) for name in names])
     for value in np.unique(said.round(9)):
@@ -248,18 +180,11 @@ def test_with_rates_as_stated_the_probabilities_are_calibrated():
 def test_boxes_are_confirmed_by_the_people_they_share():
     blobs = np.array([[100, 100, 60, 130], [300, 100, 60, 130], [500, 150, 30, 40], [0, 0, 200, 20.0]])
     people = np.array([[110, 95, 40, 120], [500, 120, 40, 110.0], [330, 400, 40, 100]])
-    found = confirm_boxes(blobs, people, np.array([0.9, 0.6, 0.8]), KNOBS, least_px=96)
+    found = observe_picture(blobs, people, np.array([0.9, 0.6, 0.8]), KNOBS, least_px=96)
     assert found.people.tolist() == [1, 0, 1, 0]
     # The second is tall enough for a person to have been found in it, the last is not.
     assert found.looked.tolist() == [True, True, True, False]
     assert found.best.tolist() == [0.9, 0, 0.6, 0]
-
-
-def test_a_crowd_in_one_box_is_counted_and_a_person_is_in_one_blob():
-    crowd, beside = [0, 0, 200, 130], [60, 0, 50, 130]
-    people = np.array([[5, 5, 40, 120], [75, 5, 40, 120], [140, 5, 40, 120.0]])
-    found = confirm_boxes(np.array([crowd, beside], float), people, np.ones(3), KNOBS)
-    assert found.people.tolist() == [2, 1]
 
 
 @pytest.mark.parametrize("which", ["blobs", "people", "both"])
@@ -267,5 +192,5 @@ def test_nothing_to_compare_is_fine(which):
     blobs = np.zeros((0, 2)) if which != "people" else np.array([[0, 10.0]])
     people = np.zeros((0, 2)) if which != "blobs" else np.array([[0, 10.0]])
     assert len(seen(blobs, people).looked) == len(blobs)
-    boxes = confirm_boxes(np.zeros((len(blobs), 4)), np.zeros((len(people), 4)), np.ones(len(people)), KNOBS)
+    boxes = observe_picture(np.zeros((len(blobs), 4)), np.zeros((len(people), 4)), np.ones(len(people)), KNOBS)
     assert len(boxes.people) == len(blobs)

@@ -1,4 +1,4 @@
-"""People along a clip: every frame in order, whatever the batch, and clear words for what is no picture."""
+"""People in pictures and clips."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.detector import UNREAD, checked, people_in, recognize
+from torchvision_dddas.people.detector import UNREAD, PersonDetector, detect_in_clip, detect_people
 from torchvision_dddas.types import DetectionTable, Frame, People
 
 SIZE = (320, 240)
@@ -73,7 +73,7 @@ def same(one, other):
 
 
 def test_who_is_there_is_found_where_he_is_in_every_frame():
-    made = list(recognize(Clip(), Brightest(), settings()))
+    made = list(detect_in_clip(Clip(), Brightest(), settings()))
     assert [r.frame.number for r in made] == list(range(1, 13))
     for r in made:
         middle = r.people.window_px[0, :2] + r.people.window_px[0, 2:] / 2
@@ -86,9 +86,9 @@ def test_who_is_there_is_found_where_he_is_in_every_frame():
 @pytest.mark.parametrize("batch", [2, 5, 40])
 def test_the_result_does_not_depend_on_the_batch(batch, around):
     clip = Clip(numbers=(1, 2, 3, 5, 6, 9, 10), last=11)
-    alone = list(recognize(clip, Brightest(), settings(), around, batch=1))
+    alone = list(detect_in_clip(clip, Brightest(), settings(), around, batch=1))
     engine = Brightest()
-    together = list(recognize(clip, engine, settings(), around, batch=batch))
+    together = list(detect_in_clip(clip, engine, settings(), around, batch=batch))
     assert max(engine.calls) > 1
     assert [r.frame.number for r in together] == list(range(1, 12))
     for one, other in zip(alone, together, strict=True):
@@ -98,8 +98,8 @@ def test_the_result_does_not_depend_on_the_batch(batch, around):
 
 def test_in_regions_a_frame_waits_for_the_one_before_and_finds_the_same_with_fewer_windows():
     whole, parts = Brightest(), Brightest()
-    everywhere = list(recognize(Clip(), whole, settings()))
-    regions = list(recognize(Clip(), parts, settings(search="regions"), batch=8))
+    everywhere = list(detect_in_clip(Clip(), whole, settings()))
+    regions = list(detect_in_clip(Clip(), parts, settings(search="regions"), batch=8))
     assert set(parts.calls) == {1}
     assert parts.windows < 0.5 * whole.windows
     assert len(everywhere) == len(regions) == 12
@@ -110,7 +110,7 @@ def test_in_regions_a_frame_waits_for_the_one_before_and_finds_the_same_with_few
 
 
 def test_frames_that_could_not_be_read_are_black_and_say_so():
-    made = list(recognize(Clip(numbers=(2, 3, 6), last=8), Brightest(), settings(), batch=2))
+    made = list(detect_in_clip(Clip(numbers=(2, 3, 6), last=8), Brightest(), settings(), batch=2))
     assert [r.frame.number for r in made] == list(range(1, 9))
     unread = [r for r in made if r.cause]
     assert [r.frame.number for r in unread] == [1, 4, 5, 7, 8]
@@ -122,24 +122,11 @@ def test_frames_that_could_not_be_read_are_black_and_say_so():
 
 def test_around_a_table_nobody_is_found_elsewhere():
     boxes = table([[2, 68, 70, 40, 100], [3, 200, 70, 40, 100]])
-    made = {r.frame.number: r for r in recognize(Clip(), Brightest(), settings(), boxes)}
+    made = {r.frame.number: r for r in detect_in_clip(Clip(), Brightest(), settings(), boxes)}
     assert len(made[2].people) and not len(made[3].people)
     assert made[1].share == 0 and len(made[1].people) == 0
     assert 0 < made[2].share < 1
     assert made[2].regions_px is not None and made[2].regions_px.shape == (1, 4)
-
-
-def test_pictures_of_any_size_go_together():
-    clip = Clip(numbers=(1, 2), last=2, images={2: np.zeros((150, 90), np.uint8)})
-    made = list(recognize(clip, Brightest(), settings(), batch=2))
-    assert len(made[0].people) and not len(made[1].people)
-
-
-def test_a_picture_smaller_than_the_window_is_one_line_with_both_sizes():
-    small = Clip(numbers=(1,), last=1, images={1: np.zeros((100, 60), np.uint8)})
-    with pytest.raises(InputError, match=r"60 x 100 px.* smaller than the window of 64 x 128 px.*people\.enlarge"):
-        list(recognize(small, Brightest(), settings(enlarge=1.0)))
-    assert len(list(recognize(small, Brightest(), settings(enlarge=1.5)))) == 1
 
 
 BAD_PICTURES = [
@@ -158,29 +145,39 @@ BAD_PICTURES = [
 @pytest.mark.parametrize(("image", "says"), BAD_PICTURES)
 def test_what_is_no_picture_is_one_line(image, says):
     with pytest.raises(InputError) as error:
-        list(recognize(Clip(numbers=(1,), images={1: image}), Brightest(), settings()))
+        list(detect_in_clip(Clip(numbers=(1,), images={1: image}), Brightest(), settings()))
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
 def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
     images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
     with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
-        people_in(images, Brightest(), PeopleParameters())
-
-
-def test_one_channel_is_grey():
-    image = np.arange(12, dtype=np.uint8).reshape(3, 4, 1)
-    assert np.array_equal(checked(image, "it"), image[..., 0])
+        detect_people(images, Brightest(), PeopleParameters())
 
 
 def test_pictures_at_hand_give_the_people_of_the_clip():
     clip = Clip(numbers=(1, 2, 3), last=3)
     images = [frame.image for frame in clip]
     for one, r in zip(
-        people_in(images, Brightest(), PeopleParameters()), recognize(clip, Brightest(), settings()), strict=True
+        detect_people(images, Brightest(), PeopleParameters()),
+        detect_in_clip(clip, Brightest(), settings()),
+        strict=True,
     ):
         assert isinstance(one, People) and same(one, r.people)
 
 
-def test_a_clip_without_frames_gives_nothing():
-    assert list(recognize(Clip(numbers=(), last=0), Brightest(), settings())) == []
+def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypatch):
+    monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", lambda parameters, backend: Brightest())
+    detector = PersonDetector()
+    picture = np.zeros((160, 120), np.uint8)
+    alone, both = detector(picture), detector([picture, picture])
+    assert len(both) == 2 and len(alone) == len(both[0]) == len(both[1])
+    with pytest.raises(InputError, match="float64 pixels"):
+        detector(np.zeros((160, 120)))
+    with pytest.raises(InputError, match="picture 1"):
+        detector(np.zeros((16, 12), np.uint8))
+
+
+def test_the_public_detector_refuses_an_unknown_backend():
+    with pytest.raises(InputError, match="no back end is named"):
+        PersonDetector(backend="quantum")
