@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people import pyramid
+from torchvision_dddas.people import pyramid, suppression
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import WindowScorer, load_scorer
 from torchvision_dddas.people.torch_scorer import TorchScorer
@@ -249,8 +249,8 @@ def same_boxes(picture: np.ndarray, parameters: PeopleParameters, svm: LinearSvm
     )
     wanted = np.column_stack([np.reshape(rectangles, (-1, 4)), np.ravel(weights)])
     parts = pyramid.everywhere(size, parameters)
-    (maps,) = load_scorer(backend, parameters, svm).scores([picture], [parts])
-    boxes, scores = suppress.group(
+    (maps,) = load_scorer(parameters, backend, svm).scores([picture], [parts])
+    boxes, scores = suppression.group_rectangles(
         *pyramid.windows(parts, maps, size, parameters), parameters.group, parameters.group_distance
     )
     # OpenCV cuts the boxes at the picture's border, last of all; here a body's place in its window needs all of it.
