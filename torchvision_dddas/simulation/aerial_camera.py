@@ -61,22 +61,22 @@ class AerialCamera:
         return self._shutter.ways(moment, ground, self._exposure_s).reshape(3, 3, 2).astype(np.float32)
 
 
-# Paints people and vehicles into a picture from the air, with their shadows, and tells which pixels are theirs.
+# Paint people and vehicles with their shadows into a picture from the air, and label their pixels.
 
 
 _BITS = 4  # of sub-pixel accuracy that OpenCV draws with
-_REACH_M = 5.0  # a body with its shadow reaches about so far
+_REACH_M = 5.0  # reach of a body with its shadow
 _TALLEST_M = 2.5
-_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # canvases are enlarged so many times for bodies of these sizes
+_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # enlargement of canvases for bodies up to these sizes
 _WIDEST_PX = 400  # canvases of targets whose people are further apart would be large
 _CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
-_HIDDEN_M = 0.35  # what stands must be higher than a limb by so much to hide it
+_HIDDEN_M = 0.35  # an object hides a limb if it is higher by this
 _SIGHTS = 12  # places on the line of sight at which a hill may hide a body
 _SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
 
 
 class Sheet(NamedTuple):
-    """A canvas that is enlarged so many times, (h * step, w * step, ...), and which part of the picture it covers."""
+    """A canvas enlarged `step` times, (h * step, w * step, ...), and the part of the picture that it covers."""
 
     body: int
     at: tuple[slice, slice]

@@ -1,4 +1,4 @@
-"""The ground of a world as a camera above it sees it: where each pixel lies, and its colour."""
+"""The ground of a world seen from above: where each pixel lies, and its colour."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -22,9 +22,9 @@ _MARCH_STEPS = (3, 6, 12, 24)  # on the way down of a pixel's line of sight
 _STRIDE_PX = 1.5  # that a step should be long in the picture
 _HALVINGS = 4
 _HEIGHT_LEVELS = 5
-_STEEP = 3.0  # what rises so many metres for each metre is a wall,
-_BELOW_M = 0.3  # where it is met so far below its edge
-_INSIDE_M = 0.4  # walls have the colour of the roof so far from its edge
+_STEEP = 3.0  # metres of rise for each metre from which on a surface is a wall
+_BELOW_M = 0.3  # and below whose edge by this it counts as one
+_INSIDE_M = 0.4  # walls take the colour of the roof at this distance from its edge
 _SKYLIGHT = 0.42
 _WIDE = 30_000  # OpenCV remaps no picture wider than 32767
 
@@ -42,12 +42,12 @@ class SightLines(NamedTuple):
     pixel_m: np.ndarray
 
     def at(self, up_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places east and north at which they pass so high; up_m (N,) or (K, N)."""
+        """Places east and north where they pass at a height up_m, (N,) or (K, N)."""
         return self.east_m + self.lean_east * up_m, self.north_m + self.lean_north * up_m
 
     @property
     def lean(self) -> np.ndarray:
-        """(N,) how far they lean, whither ever."""
+        """(N,) metres of lean for each metre up, in any direction."""
         return np.hypot(self.lean_east, self.lean_north)
 
     def of(self, which: np.ndarray) -> "SightLines":
@@ -124,7 +124,7 @@ class StandingSurface:
         """
         top, bottom = (np.zeros(len(reach_m), np.float32) for _ in range(2))
         whole = np.full(len(reach_m), self.tallest_m + _LOWEST_M, np.float32)
-        # Most of them have nothing near at all, which one look tells.
+        # Most of them have nothing near, which one look-up shows.
         some, _ = self.narrowed(sights, reach_m, whole, top, 1)
         part = np.flatnonzero(some)
         if len(part):
@@ -138,7 +138,7 @@ class StandingSurface:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Between which heights (N,) of those given (N,) something is at most reach_m (N,) beside lines of sight.
 
-        They are told to a slice of so many. Where nothing is in reach, both are 0.
+        The heights are found to one of `slices` steps. Where nothing is in reach, both are 0.
         """
         slice_m = (top_m - bottom_m) / np.float32(slices)
         ring = rings(reach_m + sights.lean * slice_m / 2)
@@ -190,7 +190,7 @@ class StandingSurface:
         return up
 
     def _looked(self, texture: np.ndarray, sights: SightLines, up_m: np.ndarray, how: int) -> np.ndarray:
-        """(K, N) what a texture (H, W) of the whole world says of where N lines of sight pass so high (K, N)."""
+        """(K, N) values of a texture (H, W) of the whole world where N lines of sight pass at heights up_m (K, N)."""
         half = self._side_m / 2
         across, down = (np.float32(n / self._side_m) for n in texture.shape[1::-1])
         u = up_m * (sights.lean_east * across)
@@ -229,7 +229,7 @@ def equal_runs(values: np.ndarray) -> Iterable[tuple[int, int]]:
     return pairwise([0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)])
 
 
-_STEP_PX = 8  # rays are cast so many pixels apart, and what lies between them is interpolated
+_STEP_PX = 8  # distance between rays; what lies between them is interpolated
 _LEVELS = 8
 _BETWEEN = 32  # shares in which two levels are mixed
 _SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
@@ -238,7 +238,7 @@ _HORIZON = 0.005  # rays that sink less for each metre along the axis see the sk
 _GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
 _GRAIN_TILES = 6
 _FLAT_PX, _LOW_M = 0.8, 1.4
-_LEAST_M, _MOST_LEAN = 1.0, 8.0  # below the camera; lines of sight further from upright are taken to lean so much
+_LEAST_M, _MOST_LEAN = 1.0, 8.0  # least height of the camera; greatest lean
 
 
 class PixelPlaces(NamedTuple):
@@ -315,7 +315,7 @@ class Terrain:
         height, width = lie.east_m.shape
         hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
         some = cv2.resize(hopeful, None, fx=_STEP_PX // 2, fy=_STEP_PX // 2, interpolation=cv2.INTER_NEAREST)
-        # Most pixels of such blocks pass it by. Pixels are told apart by fours: their first, and so far about it.
+        # Most pixels of such blocks miss it. Pixels are tested by fours: the first of four with a reach about it.
         across = (width + 1) // 2
         four = np.flatnonzero(some[: (height + 1) // 2, :across].ravel()).astype(np.int32)
         row, column = 2 * (four // across), 2 * (four % across)
@@ -381,7 +381,7 @@ class Terrain:
         # Enlarged, a texture is smooth: it gets the grain that it is too coarse to show.
         wanted = float(np.clip(np.log2(world.texel_m / np.median(lie.pixel_m)), 0, 1))
         if wanted > 0.25:
-            # OpenCV is slow beyond a texture's edge: the pattern is laid out often enough, and moved by whole patterns.
+            # OpenCV is slow beyond a texture's edge: the pattern is tiled, and moved by whole tiles.
             side = _GRAIN_PX * _GRAIN_M
             corner = (float(np.floor(place[::16, ::16].min() / side)) for place in (lie.east_m, lie.north_m))
             u, v = (
@@ -404,7 +404,7 @@ class Terrain:
 def _lines_of_sight(
     place_m: Sequence[np.ndarray], eye_m: Sequence[np.ndarray | float], up_m: np.ndarray, pixel_m: np.ndarray
 ) -> SightLines:
-    """The lines of sight to places (east, north; N each) so high (N,), from eyes (east, north, up; N each, or one)."""
+    """The lines of sight to places (east, north; N each) at heights up_m (N,), from eyes (east, north, up)."""
     east, north = (eye - place for eye, place in zip(eye_m, place_m, strict=False))
     down = np.maximum(eye_m[2] - up_m, np.maximum(np.hypot(east, north) / _MOST_LEAN, _LEAST_M))
     columns = *place_m, east / down, north / down, pixel_m

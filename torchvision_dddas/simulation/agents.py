@@ -19,8 +19,8 @@ from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
 class Report:
     """What a ground vehicle says by radio. vehicle: its row in the team, from 0. frame: may be broken.
 
-    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was; plans are told
-    anew each second, and of two waypoints for one frame the one that was told last counts. sigma_m: along each axis, of
+    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was; plans are
+    sent each second, and of two waypoints for one frame the later one counts. sigma_m: along each axis, of
     what the receivers do not share.
     """
 
@@ -104,17 +104,17 @@ class Agents:
 
     @property
     def time_s(self) -> float:
-        """Of the frame at hand."""
+        """Time of the current frame."""
         return (self._number - 1) / self._rate
 
     def moment(self) -> Moment:
-        """The world at the frame at hand, with all that was said since the moment before."""
+        """The world at the current frame, with all reports since the moment before."""
         if self._last is None:
             self._last = self._moment()
         return self._last
 
     def step(self, every: int = 1) -> None:
-        """On by so many frames."""
+        """Advance by `every` frames."""
         if every < 1:
             raise ValueError(f"a step of {every} frames; wanted 1 or more")
         if self._last is not None:
@@ -123,7 +123,7 @@ class Agents:
             self._frame()
 
     def steer(self, command: Command) -> None:
-        """What the instruments do from now on; what a command does not name goes on as before."""
+        """Set what the instruments do from now on; what a command does not name goes on as before."""
         self._aircraft.steer(self._local(command.fly_to), self._local(command.look_at), command.altitude_m)
         for order in command.orders:
             if order.vehicle in self._team.names:
@@ -193,10 +193,10 @@ class Agents:
             share = np.clip((time - begin) / (end - begin), 0, 1) if end > begin else 1.0
             place = before + share * (after - before) + self._gps.error_m
             wrong = self._faults.at(time)
-            said = self._lonlat(place + self._jumped(wrong))
+            reported = self._lonlat(place + self._jumped(wrong))
             for k in range(len(self._team)):
                 if k not in wrong.lost and k not in wrong.silent:
-                    self._reports.append(Report(k, round(time * self._rate + 1, 6), said[k], self._gps.sigma_m))
+                    self._reports.append(Report(k, round(time * self._rate + 1, 6), reported[k], self._gps.sigma_m))
             self._reported += 1
 
     def _jumped(self, wrong: ActiveFaults) -> np.ndarray:
@@ -208,14 +208,16 @@ class Agents:
         return off
 
     def _plan(self, time_s: float) -> None:
-        """What they mean to pass in the coming seconds, this one included; told anew each second."""
+        """Report the waypoints of the coming seconds, this one included; called each second."""
         if not self._scenario.team.planned or not len(self._team):
             return
         wrong = self._faults.at(time_s)
         places = self._team.waypoints(time_s, _PLANNED_S, sorted(wrong.lost))
         # A vehicle knows where it is no better than its receiver does, and plans from there.
-        said = self._lonlat((places + self._gps.lasting_m + self._jumped(wrong)).reshape(-1, 2)).reshape(places.shape)
-        for ahead, points in enumerate(said):
+        reported = self._lonlat((places + self._gps.lasting_m + self._jumped(wrong)).reshape(-1, 2)).reshape(
+            places.shape
+        )
+        for ahead, points in enumerate(reported):
             frame = round((time_s + ahead) * self._rate + 1, 6)
             sigma = float(np.hypot(self._gps.sigma_m, _STRAYS_M * ahead))
             self._reports += [
@@ -229,10 +231,10 @@ class Agents:
         # The UAV's place is the last.
         places = np.concatenate([team.place, pose.place_m[None, :2]])
         errors = np.concatenate([self._gps.error_m + self._jumped(wrong), self._telemetry_errors[None, 4:]])
-        said = self._lonlat(places + errors)
-        said, own = said[:-1], said[-1]
+        reported = self._lonlat(places + errors)
+        reported, own = reported[:-1], reported[-1]
         silent = [k for k in range(len(team)) if k in wrong.lost or k in wrong.silent]
-        said[silent] = np.nan
+        reported[silent] = np.nan
         return Moment(
             self._number,
             time,
@@ -243,7 +245,7 @@ class Agents:
             None if wrong.mute else self._flight(pose, velocity, own),
             tuple(self._reports),
             team.heading.copy(),
-            said,
+            reported,
             (team.heading + team.heading_error) % (2 * np.pi),
             wrong.picture,
             tuple(self._events),
@@ -254,8 +256,8 @@ class Agents:
         wrong, place = self._telemetry_errors, pose.place_m
         ground = float(self._world.up_m(place[None, :2])[0])
         high = (place[2] - ground) * (1 + wrong[3])
-        said = CameraPose(place, rotation_matrix(wrong[:3]) @ pose.axes)
-        heading, pitch, roll = said.angles_rad
+        reported = CameraPose(place, rotation_matrix(wrong[:3]) @ pose.axes)
+        heading, pitch, roll = reported.angles_rad
         longitude, latitude = lonlat_deg.tolist()
         hfov = float(np.radians(self._scenario.camera.hfov_deg))
         return Flight(

@@ -168,6 +168,6 @@ def _joined(some: Outlines, others: Outlines, rank: np.ndarray) -> Outlines:
 
 
 def _filled(outlines: np.ndarray, corners: int) -> np.ndarray:
-    """Outlines (M, C, n) with the last corner repeated until they have so many."""
+    """Outlines (M, C, n) with the last corner repeated up to `corners`."""
     missing = corners - outlines.shape[1]
     return outlines if missing == 0 else np.concatenate([outlines, outlines[:, -1:].repeat(missing, axis=1)], axis=1)

@@ -37,7 +37,7 @@ _SHIRTS = np.array(
 
 @dataclass
 class _Groups:
-    """One row a crowd. way: (G, W, 2), the first `places` of them count; at, step: whither it goes among them.
+    """One row a crowd. way: (G, W, 2), the first `places` of them count; at, step: which it goes to, and the next step.
 
     course, clockwise from north; unit: the time unit for which its velocity was drawn; runs: bool, from all others.
     """
@@ -135,13 +135,13 @@ class Crowds:
         return place
 
     def step(self, time_s: float, seconds: float, vehicles: np.ndarray) -> list[str]:
-        """On by so long, to time_s; what happened, in words.
+        """Advance by `seconds` to time_s; returns what happened, in words.
 
         vehicles: (V, 5) of those that people walk round: east, north, course, half their length and half their width.
         """
-        said = self._happen(time_s)
+        events = self._happen(time_s)
         if not len(self):
-            return said
+            return events
         self._lead(time_s, seconds)
         groups, mine = self._groups, self.group
         started = (time_s >= groups.from_s) & (groups.behaviour != _STAND)
@@ -163,7 +163,7 @@ class Crowds:
         self.velocity = (place - self.place) / seconds
         self.place = place
         self._walk(seconds)
-        return said
+        return events
 
     def _walk(self, seconds: float) -> None:
         """Legs move with the way gone, faces turn to where it goes."""
@@ -248,17 +248,17 @@ class Crowds:
             groups.unit[due] = unit
 
     def _happen(self, time_s: float) -> list[str]:
-        said = []
+        events = []
         while self._done < len(self._happenings) and self._happenings[self._done].time_s <= time_s + 1e-9:
             happening = self._happenings[self._done]
             self._done += 1
             rows = [one - 1 for one in happening.crowds]
             if happening.what == "join":
-                said += self._walk_together(rows, time_s)
+                events += self._walk_together(rows, time_s)
             else:
                 for row in rows:
-                    said += self._split(row, happening.turn_deg) if happening.what == "split" else self._scatter(row)
-        return said + self._meet(time_s)
+                    events += self._split(row, happening.turn_deg) if happening.what == "split" else self._scatter(row)
+        return events + self._meet(time_s)
 
     def _walk_together(self, rows: list[int], time_s: float) -> list[str]:
         groups = self._groups
@@ -277,7 +277,7 @@ class Crowds:
 
     def _meet(self, time_s: float) -> list[str]:
         """Crowds that have come together are one."""
-        groups, said = self._groups, []
+        groups, events = self._groups, []
         for meeting in list(self._meetings):
             rows, first = meeting.rows, meeting.rows[0]
             reach = np.sqrt((groups.radius[rows] ** 2).sum())
@@ -293,11 +293,11 @@ class Crowds:
             self._gather(first)
             groups.behaviour[first], groups.speed[first] = meeting.behaviour, meeting.speed_m_s
             groups.course[first], groups.unit[first] = meeting.course_rad, -1
-            said.append(f"crowds {_listed(numbers)} are one, crowd {numbers[0]}")
-        return said
+            events.append(f"crowds {_listed(numbers)} are one, crowd {numbers[0]}")
+        return events
 
     def _gather(self, row: int) -> None:
-        """A crowd's middle and places anew, by where its people are; those far out come nearer."""
+        """Set a crowd's middle and places from where its people are; those far out come nearer."""
         mine = np.flatnonzero(self.group == row)
         middle = self.place[mine].mean(axis=0)
         away = self.place[mine] - middle
@@ -377,7 +377,7 @@ def _groups_of(plans: tuple[CrowdPlan, ...], limit_m: float) -> _Groups:
 
 
 def _radius(people: int, radius_m: float) -> float:
-    """Of a disc in which so many have room; one alone is its own middle."""
+    """Radius of a disc with room for a number of people; one alone is its own middle."""
     return max(radius_m, 0.36 * float(np.sqrt(people))) if people > 1 else 0.0
 
 
@@ -405,7 +405,7 @@ def _apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: floa
 
 
 def _from_box(place: np.ndarray, vehicle: np.ndarray, within_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, 2) ways off from a vehicle's sides, (n,) metres to them, below 0 inside, and (n,) rows of who is so near."""
+    """(n, 2) ways off from the sides of a vehicle, (n,) metres to them, below 0 inside, and (n,) rows within_m near."""
     east, north, course, length, width = vehicle
     near = np.flatnonzero(np.abs(place - (east, north)).max(axis=1) < np.hypot(length, width) + within_m)
     ahead = np.array([np.sin(course), np.cos(course)])

@@ -1,4 +1,4 @@
-"""Sky and ground as a camera near the ground sees them: hills hide what lies behind, haze takes what is far."""
+"""Sky and ground seen from near the ground: hills hide what lies behind, haze hides what is far."""
 
 from typing import NamedTuple
 
@@ -14,12 +14,12 @@ _ZENITH = np.array([196.0, 140, 84], np.float32)
 _RIDGE = np.array([150.0, 128, 116], np.float32)  # of far mountains
 VISIBILITY_M = 2500.0  # over which the ground has lost all but 1 / e of its contrast
 _FAR_M = 1500.0
-_COLUMN_PX = 16  # rays are cast so many columns apart
+_COLUMN_PX = 16  # columns between rays
 _STEPS = 110  # places on the ground on each ray
 _LEVELS = 7
 _BETWEEN = 32  # shares in which two levels, or ground and air, are mixed
 _TILE = 512  # side of the pattern of pebbles, in its own texels
-_GRAIN_M = (0.007, 0.031)  # its texels, laid out twice
+_GRAIN_M = (0.007, 0.031)  # sizes of its texels: the pattern is used twice
 
 
 class BackdropView(NamedTuple):
@@ -143,14 +143,14 @@ class Backdrop:
             strength = np.clip(1.3 - along_m / (6 * grain), 0, 1).astype(np.float32)
             if strength.max() > 0:
                 near = slice(int(np.argmax(strength > 0)), None)  # farther rows are above
-                laid = []
+                texels = []
                 for way, start in zip((x, y), place_m, strict=True):
                     texel = cv2.addWeighted(way[near], 1 / grain, way[near], 0, float(np.mod(start / grain, _TILE)))
                     # Beyond 16 bits OpenCV would lose count of the tiles.
                     tiles = np.floor(texel * np.float32(1 / _TILE))
                     texel -= np.multiply(tiles, np.float32(_TILE), out=tiles)
-                    laid.append(texel)
-                u, v = laid
+                    texels.append(texel)
+                u, v = texels
                 pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
                 weight = np.repeat(64 * strength[near, None], pebbles.shape[1], axis=1)
                 bright = cv2.multiply(pebbles, weight)

@@ -25,7 +25,7 @@ from torchvision_dddas.types import Bodies, Camera, CameraPose, GroundPicture
 
 SHAKE_RAD = float(np.radians(0.3))  # standard deviation of the camera's pitch and roll about level
 
-HEADING_SIGMA_RAD = float(np.radians(2.0))  # how well a vehicle knows whither its camera looks
+HEADING_SIGMA_RAD = float(np.radians(2.0))  # how well a vehicle knows the heading of its camera
 
 _LEAST_SIGMA_M = 0.02
 _SENSOR = CameraParameters(sharpness_px=0.7, shot_noise=0.12, read_noise=1.2, drift=0.03, quality=90)
@@ -33,7 +33,7 @@ _STREAM = 100  # of the sensors' noise, so that no vehicle shares it with the ca
 _SHADE = 0.5  # of the light that is left in a shadow
 _SHADED_M = 120.0  # beyond, no shadow is drawn
 _LEAST_PX = 2.0  # what is lower in the picture is not drawn
-_SLACK_PX = 4.0  # by so many rows the ground must be nearer than what it hides
+_SLACK_PX = 4.0  # rows by which the ground must be nearer than what it hides
 
 
 class GroundTruthView(NamedTuple):
@@ -75,8 +75,8 @@ class GroundCamera:
 
         None where the vehicle is silent: nobody would know from where the picture was taken.
         """
-        said = moment.reported_lonlat_deg[vehicle]
-        if not np.isfinite(said).all():
+        reported = moment.reported_lonlat_deg[vehicle]
+        if not np.isfinite(reported).all():
             return None
         name = f"ugv{vehicle + 1}"
         camera = Camera(
@@ -84,7 +84,7 @@ class GroundCamera:
             self.size_px,
             self.focal_px,
             self.centre_px,
-            (float(said[0]), float(said[1])),
+            (float(reported[0]), float(reported[1])),
             geographic=True,
             heading_rad=float(np.mod(moment.reported_heading_rad[vehicle], 2 * np.pi)),
             height_m=self._scenario.team.camera_m,
@@ -105,7 +105,7 @@ class GroundCamera:
         return GroundTruthView(image, mask, number, boxes, shares, view)
 
     def view(self, moment: Moment, vehicle: int) -> View:
-        """From where and whither a vehicle truly looks."""
+        """The true view of a vehicle's camera."""
         own = np.flatnonzero(moment.bodies.kind == "ugv")[vehicle]
         rng = np.random.default_rng([self._scenario.seed, 63, vehicle, moment.number])
         pitch, roll = rng.normal(0, SHAKE_RAD, 2)
@@ -116,7 +116,7 @@ class GroundCamera:
     def _drawn(self, moment: Moment, vehicle: int) -> tuple[np.ndarray, np.ndarray, View, dict[int, np.ndarray]]:
         """Picture, mask, view, and by number the outlines of each person's limbs."""
         view = self.view(moment, vehicle)
-        # The ground is looked up while the bodies and their shadows are laid out.
+        # The ground is looked up while the bodies and their shadows are posed.
         with ThreadPoolExecutor(1) as other:
             canvas, whole = self._draw(
                 moment.bodies, vehicle, view, other.submit(self._backdrop.seen, view, self.size_px)
@@ -203,7 +203,7 @@ class GroundCamera:
         return np.stack([u - half, top[:, 1] / np.maximum(top[:, 2], NEAR_M), u + half, low], axis=1)
 
     def _before(self, view: View, east_north_m: np.ndarray, reach_m: np.ndarray, small: np.ndarray) -> np.ndarray:
-        """(N,) bool, whether things that reach so far about their places may be in the picture; small: over 1, no."""
+        """(N,) bool, whether objects with a reach reach_m may be in the picture; those with small > 1 are not."""
         offset = east_north_m - view.position_m[:2]
         ahead = view.image_from_world[2, :2]
         right = view.image_from_world[0, :2] / self.focal_px[0] - ahead * (self.centre_px[0] / self.focal_px[0])

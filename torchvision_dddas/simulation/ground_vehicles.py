@@ -14,11 +14,11 @@ from torchvision_dddas.types import Colours
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
 UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)  # half the length and half the width
 _APART_M, _ROOM_M = 2.1, 3.0  # how near another's middle they can be, and how far from it they mean to pass
-_KEPT_OFF_M = 6.0  # how far from people they mean to pass while nobody tells them where to go
+_KEPT_OFF_M = 6.0  # distance from people at which they pass while nobody steers them
 _LOOK_S = 0.25  # steps in which they think ahead
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
-_STOP_M = UGV_HALF_M[0] + 1.0  # they stop so far from those before them, middle to middle
-# Gather: so many times as fast far from the middle as within near_m of it; there they stand on a ring.
+_STOP_M = UGV_HALF_M[0] + 1.0  # they stop at this distance before others, middle to middle
+# Patrol "gather": speed factor beyond _NEAR_M from the middle, and the ring on which they stand at last.
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
 # In OpenCV's units; those furthest from sand and scrub come first.
 _HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
@@ -80,7 +80,7 @@ class Team:
         self._look_at[row] = np.nan if look_at_m is None else look_at_m
 
     def step(self, time_s: float, seconds: float, lost: Sequence[int], people: np.ndarray) -> None:
-        """On by so long, to time_s; the lost stand still. people: (M, 2), before whom they stop."""
+        """Advance by `seconds` to time_s; the lost stand still. They stop for people (M, 2)."""
         if not len(self):
             return
         goal, most = self._goals(time_s)
@@ -119,7 +119,7 @@ class Team:
         return np.array(found).reshape(seconds + 1, len(self), 2)
 
     def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 2) whither, (K,) how fast."""
+        """(K, 2) goals and (K,) speeds."""
         parameters, patrol = self._parameters, self._parameters.patrol
         speed = np.full(len(self), parameters.patrol_m_s)
         if patrol == "random":
@@ -142,7 +142,7 @@ class Team:
         return self._inside(goal), np.where(sent, self._ordered_speed, speed)
 
     def _there(self, goal: np.ndarray, within_m: float) -> np.ndarray:
-        """(K,) who is at the goal; as near as another lets come who stands there is near enough."""
+        """(K,) whether each is at its goal; close behind another that stands there counts."""
         distance = np.hypot(*(goal - self.place).T)
         taken = np.linalg.norm(goal[:, None] - self.place, axis=2) < _ROOM_M
         np.fill_diagonal(taken, False)
@@ -157,7 +157,7 @@ class Team:
         return self._drawn[k, n]
 
     def _round_people(self, direction: np.ndarray, people: np.ndarray) -> np.ndarray:
-        """Who goes by himself keeps off people: beside them a vehicle is no landmark, and hides who they are."""
+        """Vehicles without orders keep off people: beside them a vehicle is no landmark, and hides them."""
         free = np.flatnonzero(np.isnan(self._ordered[:, 0]))
         if not len(free) or not len(people):
             return direction
@@ -175,7 +175,7 @@ class Team:
         return steer_round_discs(self.place, direction, np.broadcast_to(self.place, (*radius.shape, 2)), radius)
 
     def _clear(self, people: np.ndarray) -> np.ndarray:
-        """(K,) how fast they may go for who is ahead: people, and vehicles that come before them in the list."""
+        """(K,) greatest speeds allowed by people ahead, and by vehicles ahead with a lower row."""
         count = len(self)
         others = np.concatenate([people, self.place])
         ahead = _ahead(self.course)
@@ -215,7 +215,7 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-# Vehicles that are no landmarks: they drive their way, turn as wide as they must, and brake for who is ahead.
+# Vehicles that are no landmarks: they follow their way with a least turning radius and brake for those ahead.
 
 
 CAR_HALF_M = (2.2, 0.9)  # half the length and half the width
@@ -259,7 +259,7 @@ class Cars:
         return self.speed[:, None] * np.stack([np.sin(self.course), np.cos(self.course)], axis=1)
 
     def step(self, time_s: float, seconds: float, others: np.ndarray) -> None:
-        """On by so long, to time_s; others: (M, 2) people and vehicles that they must not run over."""
+        """Advance by `seconds` to time_s; others: (M, 2) people and vehicles that they avoid."""
         for row in range(len(self)):
             wanted = self._wanted(row)
             around = np.delete(self.place, row, axis=0)

@@ -1,4 +1,4 @@
-"""What stands in the way: how those who move go round it."""
+"""How those who move avoid what stands in the way and one another, and follow their waypoints."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from torchvision_dddas.simulation.cover import StandingObjects
 
 _CELL_M = 4.0
 _REACH_M = 8.0
-_NEAREST = 6  # so many things, those whose edges are nearest, are looked at from a cell
-_TOUCHING = 3  # and so many of them by who may be inside
+_NEAREST = 6  # objects with the nearest edges that are considered from a cell
+_TOUCHING = 3  # objects of those that somebody may stand in
 
 
 class Obstacles:

@@ -93,7 +93,7 @@ def pose_figures(
     phase: np.ndarray,
     wear: list[Dress],
 ) -> Figures:
-    """People who stand at (N, 3) or walk, with so many strides behind them; facing is clockwise from north."""
+    """People who stand at (N, 3) or walk, at a phase of their gait in strides; facing is clockwise from north."""
     count = len(feet_m)
     h = np.asarray(height_m, float)[:, None]
     w = h * np.array([one.wide for one in wear])[:, None]
@@ -168,7 +168,7 @@ def pose_figures(
 def limb_outlines(
     ends_m: np.ndarray, radius_m: np.ndarray, view: View, widen: float = 1.0, aside: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """(L, 16, 2) pixels of limbs (L, 2, 3), (L, 2), so much wider, moved aside by shares of their radius."""
+    """(L, 16, 2) pixels of limbs (L, 2, 3), (L, 2), widened by a factor, moved aside by shares of their radius."""
     seen = ends_m.reshape(-1, 3) @ view.image_from_world[:, :3].T + view.image_from_world[:, 3]
     seen = seen.reshape(ends_m.shape)
     depth = seen[..., 2]

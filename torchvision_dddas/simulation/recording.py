@@ -50,7 +50,7 @@ class RadioReport:
 class RecordedFrame:
     """All that a frame of a simulated run gives. image: None where the camera dropped it.
 
-    flights: what the UAV said since the frame before, and when. heard: what the ground vehicles did.
+    flights: what the UAV reported since the frame before, and when. heard: what the ground vehicles did.
     ground: what they saw. seconds: spent on it, per stage.
     """
 
@@ -155,10 +155,10 @@ class _Reports:
         self._plans: dict[tuple[str, float], str] = {}
 
     def write(self, item: RecordedFrame) -> None:
-        said = [_flight_line(time_s, flight) for time_s, flight in item.flights]
+        flights = [_flight_line(time_s, flight) for time_s, flight in item.flights]
         self._plans |= {(h.vehicle, round(h.frame, 6)): _report_line(h) for h in item.heard if h.planned}
         heard = [_report_line(h) for h in item.heard if not h.planned]
-        self._files.write("".join(said), "".join(heard))
+        self._files.write("".join(flights), "".join(heard))
 
     def close(self, complete: bool) -> None:
         self._files.write("", "".join(self._plans.values()))

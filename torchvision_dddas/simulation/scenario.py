@@ -41,7 +41,7 @@ class CrowdPlan(Group):
         "walk", "-", meaning="walk: along way_m or heading_deg; random: a new velocity each time unit; stand"
     )
     speed_m_s: float = parameter(1.4, "m/s", 0, 10, meaning="how fast they walk")
-    heading_deg: float = parameter(90.0, "deg", -360, 360, meaning="whither, clockwise from north, without way_m")
+    heading_deg: float = parameter(90.0, "deg", -360, 360, meaning="direction, clockwise from north, without way_m")
     way_m: tuple[Place, ...] = parameter(
         (), "m", meaning="places they walk through, one after the other, and back again"
     )
@@ -52,9 +52,7 @@ class CarPlan(Group):
     """A vehicle that is no landmark: clutter, which no person is."""
 
     start_m: Place = parameter((0.0, 0.0), "m", meaning="where it is at first")
-    heading_deg: float = parameter(
-        90.0, "deg", -360, 360, meaning="whither it drives, clockwise from north, without way_m"
-    )
+    heading_deg: float = parameter(90.0, "deg", -360, 360, meaning="direction, clockwise from north, without way_m")
     speed_m_s: float = parameter(6.0, "m/s", 0, 40, meaning="how fast it drives")
     way_m: tuple[Place, ...] = parameter(
         (), "m", meaning="places it drives through, one after the other, and back again"
@@ -139,7 +137,7 @@ class CameraParameters(Group):
     height_px: int = parameter(480, "px", 64, 2160, meaning="height of the picture")
     hfov_deg: float = parameter(60.0, "deg", 5, 120, meaning="width of the field of view")
     exposure_s: float = parameter(0.002, "s", 0, 0.5, meaning="time of exposure: what moves is blurred along its way")
-    readout_s: float = parameter(0.015, "s", 0, 0.5, meaning="rolling shutter: the last row is read so much later")
+    readout_s: float = parameter(0.015, "s", 0, 0.5, meaning="rolling shutter: how much later the last row is read")
     vibration_px: float = parameter(
         0.04, "px", 0, 10, meaning="rolling shutter: standard deviation of how far vibration moves rows aside"
     )

@@ -120,7 +120,7 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(entry) for entry in value) if isinstance(value, list) else value
 
 
-# What of a scenario cannot be, whatever the world looks like: told in one line before anything is made.
+# Checks of a scenario that need no world.
 
 
 FEWEST = 4  # landmarks that lay a picture on the ground
@@ -129,14 +129,14 @@ FEWEST = 4  # landmarks that lay a picture on the ground
 HIGHEST_DEG = 85.0  # near the poles longitudes run together
 
 
-MARGIN_M = 2.0  # what moves begins and goes so far inside the world
+MARGIN_M = 2.0  # least distance of what moves from the edge of the world
 
 
 OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")  # faults of one ground vehicle
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Raises InputError with one line for what cannot be: something outside the world, happening to no crowd, ..."""
+    """Raises InputError with one line for an impossible scenario: places outside the world, no such crowd, ..."""
     _check_origin(scenario)
     _check_places(scenario)
     _check_times(scenario)
@@ -157,7 +157,7 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 def scenario_settings(scenario: Scenario) -> dict[str, object]:
-    """The parameters of the system that a scenario sets: `{"group.knob": value}`."""
+    """The parameters of the system that a scenario sets: `{"group.parameter": value}`."""
     return {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
 
 
@@ -226,7 +226,7 @@ def _check_time(name: str, time_s: float, end_s: float) -> None:
 # What is wrong with the values of a scenario, in words: the parameter by its name, what came, what was wanted.
 
 
-def explain_error(loc: tuple[int | str, ...], kind: str, said: str, value: object) -> str:
+def explain_error(loc: tuple[int | str, ...], kind: str, message: str, value: object) -> str:
     """One line of what pydantic found first."""
     fields, name, field, listed = Scenario.model_fields, "", None, False
     for part in loc:
@@ -243,7 +243,7 @@ def explain_error(loc: tuple[int | str, ...], kind: str, said: str, value: objec
         full = ".".join(str(part + 1) if isinstance(part, int) else part for part in loc)
         return f"unknown parameter '{full}'; {nearest_parameter(full)}"
     if kind == "value_error":  # a rule across parameters
-        return f"{name}: {said.removeprefix('Value error, ')}"
+        return f"{name}: {message.removeprefix('Value error, ')}"
     if name == "settings" and len(loc) > 1 and not isinstance(value, dict):
         name = f"settings.{loc[1]}"
     if field is None or _group(field) is not None or name.startswith("settings"):

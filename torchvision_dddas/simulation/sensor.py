@@ -1,4 +1,4 @@
-"""From light to a file: the lens blurs, exposure drifts, the sensor adds noise, the compression its blocks."""
+"""The sensor model: lens blur, drifting exposure, noise, and JPEG compression."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,11 +8,11 @@ import numpy as np
 from torchvision_dddas.simulation.scenario import CameraParameters
 
 _BAND, _BLOCK = 32, 16  # rows
-_SPARE_PX = 192  # a tile of noise is so much larger than the picture, so that its start can vary
+_SPARE_PX = 192  # margin of the tile of noise, so that its start can vary
 
 
 class Sensor:
-    """The sensor of a camera. stream tells cameras of one seed apart.
+    """The sensor of a camera. stream distinguishes cameras of one seed.
 
     What happens to a picture depends on the seed, the stream and the picture's number alone.
     """

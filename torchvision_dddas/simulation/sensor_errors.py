@@ -1,4 +1,4 @@
-"""What satellite receivers say of their places: errors that last, errors that are new each time."""
+"""Errors of satellite receivers, lasting and new in each report; and the faults of a scenario."""
 
 from dataclasses import dataclass, field
 
@@ -34,7 +34,7 @@ class Receivers:
         self._new = rng.standard_normal((count, 2))
 
     def advance(self, seconds: float) -> None:
-        """On to the next report, so much later."""
+        """Advance to the next report, `seconds` later."""
         kept = np.exp(-seconds / self._correlation_s)
         self._state = kept * self._state + np.sqrt(1 - kept**2) * self._rng.standard_normal(self._state.shape)
         self._new = self._rng.standard_normal(self._new.shape)
@@ -50,7 +50,7 @@ class Receivers:
         return self.lasting_m + self._white * self._new
 
 
-# What goes wrong, when, and how it is said.
+# What goes wrong, when, and its events in words.
 
 
 _WORDS = {
@@ -110,13 +110,13 @@ class Faults:
 
     def events(self, before_s: float, now_s: float) -> list[str]:
         """What began or ended after the one time, and until the other, in words."""
-        said = []
+        events = []
         for fault in self._faults:
             who = f"ugv{fault.vehicle}"
             for words, time_s in zip(_WORDS[fault.what], (fault.time_s, fault.time_s + fault.seconds), strict=True):
                 if before_s < time_s - _EARLY_S <= now_s:
-                    said.append((time_s, words.format(who=who, size=fault.size)))
-        return [words for _, words in sorted(said)]
+                    events.append((time_s, words.format(who=who, size=fault.size)))
+        return [words for _, words in sorted(events)]
 
 
 _EARLY_S = 1e-9  # times of frames are rounded; a fault begins at the frame of its time, not one later

@@ -10,7 +10,7 @@ import numpy as np
 from torchvision_dddas.simulation.agents import Moment
 from torchvision_dddas.types import Camera
 
-_LOWEST = 0.004  # rays sink at least so much for each metre along the axis: those above the horizon never land
+_LOWEST = 0.004  # least sink of a ray for each metre along the axis: rays above the horizon never meet the ground
 _FURTHEST_M = 20_000.0
 _LANDINGS = 8
 _CLOSE_M = 0.004
@@ -41,7 +41,7 @@ class Shutter:
         return np.sqrt(2) * self._vibration_px * np.sin(turns + _phases(self._seed, number))
 
     def rays(self, moment: Moment, image_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the rays through pixels (N, 2) start and whither they go, (N, 3) each, a metre along the axis long."""
+        """Starts and directions (N, 3) of the rays through pixels (N, 2), a metre long along the axis."""
         camera, pose = self.camera, moment.pose
         focal = np.array(camera.focal_px) * pose.focal
         steady_px = image_px - self.aside_px(moment.number, image_px[:, 1])
@@ -142,7 +142,7 @@ _MOST = 40  # pictures that are averaged for one that is blurred
 
 
 def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
-    """A picture (H, W, C) uint8 whose parts moved so far while it was exposed.
+    """A picture (H, W, C) uint8 blurred by the way that its parts moved during the exposure.
 
     way_px: (r, c, 2) float32 from the beginning to the end, at points that span the picture from corner to corner.
     """

@@ -59,7 +59,7 @@ class Simulator:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew: the same world, and the same happenings in it."""
+        """Begin again: the same world, and the same events in it."""
         self._agents = Agents(self.scenario, self.world)
         self._every = 1
         self._number = 0
@@ -68,7 +68,7 @@ class Simulator:
         self._now: Moment | None = None
 
     def steer(self, command: Command) -> None:
-        """Do as told from the next frame on. Raises InputError where the command names a vehicle that is not there."""
+        """Carry out a command from the next frame on. Raises InputError if it names an unknown vehicle."""
         for order in command.orders:
             if order.vehicle not in self.names:
                 raise InputError(f"no ground vehicle is named {order.vehicle!r}; there are {', '.join(self.names)}")

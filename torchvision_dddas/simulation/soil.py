@@ -1,6 +1,6 @@
 """Bare ground of a desert in southern Arizona: soils, dry creek beds, a dirt road, trails, grass, stones.
 
-Colours are BGR as a photo shows them in full sun. Broad patterns are laid on a grid 8 times coarser than the texture
+Colours are BGR as a photo shows them in full sun. Broad patterns lie on a grid 8 times coarser than the texture
 and enlarged; what is finer is added band by band, so that a large world needs little memory.
 """
 
@@ -102,7 +102,7 @@ def soil_rows(
 ) -> np.ndarray:
     """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, in the sun."""
     columns = ground.grass.shape[1] * COARSE
-    # What the sun's light strikes beside a pixel matters to it: so many more rows, which are cut off at the end.
+    # Light and shade of a pixel depend on its neighbours: these extra rows are cut off at the end.
     edge = max(int(np.ceil(0.3 / texel_m)), 1)
     wide = rows[0] - edge, rows[1] + edge
 

@@ -30,15 +30,15 @@ from torchvision_dddas.types import (
     is_sampled,
 )
 
-KEPT = 100  # pictures and truths that nobody asked for yet: a megabyte each
+KEPT = 100  # pictures and truths kept until they are fetched: a megabyte each
 
 
 class SimulatorSource:
-    """A scenario as a Source, its frames drawn when they are asked for.
+    """A scenario as a Source, its frames rendered on demand.
 
     Beside what every source offers: scenario; camera, the aerial one; colours of the landmarks; elevation, of the
     ground about origin_deg; steer; and what is there of the run until now: landmarks, telemetry, pictures, truths.
-    Every new iteration starts the run anew. Frames that a command leaves out are not drawn; those that the camera
+    Every iteration starts the run again. Frames that a command leaves out are not drawn; those that the camera
     drops are missing numbers.
     """
 
@@ -90,9 +90,9 @@ class SimulatorSource:
         return (frame for frame in self if is_sampled(frame.number, interval))
 
     def steer(self, command: Command) -> None:
-        """Do as told from the next frame on; places in longitude and latitude. Raises InputError as Simulator does."""
+        """Carry out a command from the next frame on; places in longitude and latitude. Raises as `Simulator.steer`."""
         self._simulator.steer(command)
-        # A later command before the next frame takes nothing back: what was asked for is one look.
+        # A later command before the next frame takes no request for a picture back.
         asked = [order.vehicle for order in command.orders if order.picture]
         self._wanted += [name for name in asked if name not in self._wanted]
 

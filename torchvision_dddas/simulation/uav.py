@@ -1,4 +1,4 @@
-"""The UAV: where it flies, how its camera hangs, how gusts move both, and what it says of itself."""
+"""The UAV: its flight, its camera's pose, how gusts move both, and the errors of its telemetry."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ class Swaying:
         self.value, self.rate = self._sigma * drawn[0], self._sigma * self._rate * drawn[1]
 
     def step(self, seconds: float, push: np.ndarray | float = 0.0, rougher: float = 1.0) -> None:
-        """On by so long, exactly; push: a constant acceleration meanwhile; rougher: factor of the random pushes."""
+        """Advance by `seconds`, exactly; push: a constant acceleration; rougher: factor of the random pushes."""
         if seconds not in self._steps:
             self._steps[seconds] = self._step_of(seconds)
         step, factor = self._steps[seconds]
@@ -69,7 +69,7 @@ class _Pursuer:
 
 
 class Aircraft:
-    """Flies along its way, or whither it is steered; pose and rates are those of its camera.
+    """Flies along its way, or where it is steered; pose and rates are those of its camera.
 
     Unsteered it looks at a point that moves along the way, always from the same side and under the same angle.
     """
@@ -123,7 +123,7 @@ class Aircraft:
             self._altitude = float(np.clip(altitude_m, 2.0, 2000.0))
 
     def step(self, time_s: float, seconds: float, push: np.ndarray | None = None, rougher: float = 1.0) -> None:
-        """On by so long, to time_s. push: acceleration by a gust, (3,) m/s2; rougher: how much more all shakes."""
+        """Advance by `seconds` to time_s. push: acceleration by a gust, (3,) m/s2; rougher: factor of all shaking."""
         point, going = self._way.at(time_s - seconds)
         back = (self._back_m() + self._relief_m * (self._cotangent() > 0)) * self._ahead()
         if self._fly_to is not None:
@@ -149,7 +149,7 @@ class Aircraft:
         self._shaken.step(seconds, 0.0, rougher)
 
     def _turn(self, seconds: float) -> None:
-        """The picture's upper edge turns to where the camera looks, if that is aslant and was asked for."""
+        """The picture's upper edge turns to where the camera looks, if that is oblique and was ordered."""
         to = self._aim.place - self._craft.place
         slanted = np.hypot(to[0], to[1]) > _SLANTED * abs(to[2])
         error = 0.0
@@ -182,7 +182,7 @@ class Aircraft:
 
 
 class ReportedPose:
-    """What the UAV says of itself: lasting errors of the knobs' standard deviations, and a tenth of it anew.
+    """The UAV's report of itself: lasting errors with the parameters' standard deviations, and a tenth new each time.
 
     Angles near straight down are what they are: a heading that swings with a tiny tilt, and a roll that undoes it.
     """
@@ -197,7 +197,7 @@ class ReportedPose:
         self.receiver = Receivers(1, parameters.place_error95_m, 0.02, 60.0, 0.0, self._rng)
 
     def errors(self, seconds: float) -> np.ndarray:
-        """(6,) rotation about east, north and up, rad; share of the altitude; metres east, north; so much later."""
+        """(6,) rotation about east, north and up, rad; share of the altitude; metres east, north; `seconds` later."""
         self.receiver.advance(seconds)
         new = self.NEW * self._sigma * self._rng.standard_normal(4)
         wrong = self._lasting + new

@@ -127,7 +127,7 @@ def _on_texels(field: np.ndarray, cells: int) -> np.ndarray:
     )[::-1].copy()  # fmt: skip
 
 
-# An ortho-photo laid on the world's ground in place of the synthetic soil.
+# An ortho-photo on the world's ground in place of the synthetic soil.
 
 
 _EMPTY_SHARE = 1e-3  # a white or black area of less of the photo, inside it, is a thing in it and no hole
