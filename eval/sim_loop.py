@@ -31,7 +31,7 @@ from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.control import StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-from torchvision_dddas.pipeline import survey
+from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import SimulatorSource, scenario_settings
 from torchvision_dddas.simulation import load_scenario as load_scenario
 from torchvision_dddas.types import Command, Frame
@@ -100,7 +100,8 @@ def work(case: Case) -> Case:
     stages: Counter[str] = Counter()
     judging = 0.0
     timed.cpu_s, start = 0.0, time.process_time()
-    for surveyed in survey(begun, engine, mission.settings, None, mission.watch, 1, mission):
+    pipeline = Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)
+    for surveyed in pipeline(begun):
         grounded = surveyed.grounded
         stages.update(grounded.seconds if grounded is not None else surveyed.followed.seconds)
         before = time.process_time()

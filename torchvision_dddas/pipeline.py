@@ -1,25 +1,39 @@
-"""The whole path, frame by frame: what moves, who is who, where on the ground; and where an instrument goes next."""
+"""The whole path from frames to results: detection, identities, places on the ground, and commands in a closed loop."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from torchvision_dddas import detection, geometry
-from torchvision_dddas.config import Settings
-from torchvision_dddas.detection import Engine, Retune, detect_motion
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, group_crowds
+from torchvision_dddas.config import Settings, load_config, with_parameters
+from torchvision_dddas.detection import Engine, MotionDetector, Retune, detect_motion, load_engine
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, check_colours, group_crowds
 from torchvision_dddas.geo.aerial_locator import tracked_targets
-from torchvision_dddas.tracking import CrowdIdentities, track_scenes, without_picture
-from torchvision_dddas.types import Fix, FrameResult, Scene, Telemetry, TrackedFrame
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
+from torchvision_dddas.types import (
+    Camera,
+    Colours,
+    Elevation,
+    Frame,
+    FrameResult,
+    Landmarks,
+    Scene,
+    Telemetry,
+    TrackedFrame,
+)
 
 if TYPE_CHECKING:
     from torchvision_dddas.control import Mission
 
 
 class Clip(detection.Clip, Protocol):
-    """What the whole path needs of a source."""
+    """A source of frames with a known size and rate."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -27,80 +41,228 @@ class Clip(detection.Clip, Protocol):
         ...
 
 
-def survey(
-    source: Clip,
-    engine: Engine,
-    settings: Settings,
-    telemetry: Telemetry | None = None,
-    watch: LandmarkWatch | None = None,
-    interval: int = 1,
-    mission: "Mission | None" = None,
-    seen: Callable[[Scene], object] | None = None,
-    retune: Retune | None = None,
-    pictures: bool = True,
-) -> Iterator[FrameResult]:
-    """Everything of each frame that is followed, in order.
+class Pipeline:
+    """Detects, tracks and locates what moves in the frames of a camera in the air.
 
-    Pictures are laid on the ground frame by frame as their scenes come; who is who is settled some frames later, and a
-    target is located by the picture in which it was seen. seen: called with each scene, the landmarks left out.
-    retune: as in detect_motion. pictures: as `tracking.FrameTracker` has it.
+    >>> for result in Pipeline("fast")("clip.mp4"):
+    ...     print(result.frame, result.tracks.xyxy, result.tracks.id)
+
+    Call it with a source, or give it single frames with `update` and take the last results with `flush`. A frame's
+    result is settled some frames later. Targets are located where landmarks are given, or telemetry with places.
     """
-    waiting: dict[int, WatchedScene] = {}
-    crowds = CrowdIdentities() if settings.crowds.join_m else None
 
-    def scenes() -> Iterator[Scene]:
-        for scene in detect_motion(source, settings, engine, telemetry, retune=retune):
-            if watch is None:
-                if seen is not None:
-                    seen(scene)
-                yield scene
-                continue
-            if mission is not None:
-                mission.take_reports(scene)
-            watched = group_crowds(watch.update(scene), watch.locator, source.rate_hz)
-            waiting[scene.frame.number] = watched if pictures else _unpictured(watched)
-            if seen is not None:
-                seen(watched.scene)
-            yield watched.scene
+    def __init__(
+        self,
+        settings: Settings | str | Path | None = None,
+        backend: str = "auto",
+        telemetry: Telemetry | None = None,
+        landmarks: Landmarks | None = None,
+        camera: Camera | None = None,
+        *,
+        colours: Colours | None = None,
+        elevation: Elevation | None = None,
+        interval: int = 1,
+        rate_hz: float = 10.0,
+    ) -> None:
+        """settings: a record, the name of a shipped configuration, or a TOML file. backend: auto, onboard or torch.
 
-    for followed in track_scenes(scenes(), settings, interval, source.size, pictures):
-        if watch is None:
-            yield FrameResult(followed)
-            continue
-        past = [waiting.pop(number) for number in sorted(waiting) if number <= followed.number]
-        if crowds is not None:
-            followed = _with_crowd_identities(followed, past[-1].fixed.fix, watch.locator, crowds)
-        surveyed = _located(followed, past, watch.locator)
-        yield surveyed if mission is None else mission.steer(surveyed, past[-1].scene.step)
+        landmarks: where they were; places in the pictures come from the table, or by colours if these are given.
+        elevation: as for AerialLocator. interval: frames from one tracked frame to the next. rate_hz: frames a second,
+        of frames that come one by one; a source has its own rate.
+        Raises InputError for values of a wrong type, and for colours, camera or elevation without anything to locate.
+        """
+        if interval < 1 or not rate_hz > 0:
+            raise InputError(f"interval must be at least 1 and rate_hz positive, got {interval} and {rate_hz}")
+        if isinstance(settings, str | Path):
+            settings = load_config(settings)
+        for name, value, kind in (
+            ("settings", settings, Settings),
+            ("telemetry", telemetry, Telemetry),
+            ("landmarks", landmarks, Landmarks),
+            ("camera", camera, Camera),
+            ("colours", colours, Colours),
+            ("elevation", elevation, Elevation),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
+        self.settings, self.telemetry, self.interval, self.rate_hz = (
+            settings or Settings(),
+            telemetry,
+            interval,
+            rate_hz,
+        )
+        self.notes: list[str] = []
+        self._engine: Engine | None = None
+        self._backend, self._landmarks, self._camera = backend, landmarks, camera
+        self._flown, self._colours, self._elevation = telemetry, colours, elevation
+        has_places = telemetry is not None and bool(np.isfinite(telemetry.place).all(axis=1).any())
+        self._locates = landmarks is not None or has_places
+        if not self._locates and (colours or camera or elevation):
+            raise InputError("camera, colours and elevation are of no use without landmarks, or telemetry with places")
+        self._watch: LandmarkWatch | None = None
+        self._mission: Mission | None = None
+        self._seen: Callable[[Scene], object] | None = None
+        self._retune: Retune | None = None
+        self._pictures = True
+        self._detector: MotionDetector | None = None
+
+    @classmethod
+    def from_parts(
+        cls,
+        engine: Engine,
+        settings: Settings,
+        telemetry: Telemetry | None = None,
+        watch: LandmarkWatch | None = None,
+        interval: int = 1,
+        mission: "Mission | None" = None,
+        seen: Callable[[Scene], object] | None = None,
+        retune: Retune | None = None,
+        pictures: bool = True,
+    ) -> "Pipeline":
+        """A pipeline of prepared parts. watch: locates its frames; None: nothing is located.
+
+        mission: closes the loop with a source that can be steered. seen: called with each scene, without its landmarks.
+        retune: as for `detect_motion`. pictures: whether results keep their pictures, most of a long run's memory.
+        """
+        pipeline = cls(settings, interval=interval)
+        pipeline.telemetry, pipeline._engine, pipeline._watch, pipeline._mission = telemetry, engine, watch, mission
+        pipeline._seen, pipeline._retune, pipeline._pictures = seen, retune, pictures
+        return pipeline
+
+    def __call__(self, source: "str | Path | Clip | Iterable[Frame | np.ndarray]") -> Iterator[FrameResult]:
+        """The result of each tracked frame of a source, in order. A source is used from its beginning.
+
+        source: what `open_video` opens, a record with `rate_hz` and `size`, or an iterable of frames or BGR images.
+        Raises InputError for another source, for frames of a wrong shape or type, and for fewer than three frames.
+        """
+        if isinstance(source, str | Path):
+            # The front door lies above this module; it is asked for only here.
+            source = import_module("torchvision_dddas").open_video(str(source))
+        if not hasattr(source, "__iter__"):
+            raise InputError(f"a pipeline wants a path or frames, got {type(source).__name__}")
+        self._detector = None
+        return self._run(source)
+
+    def update(self, frame: Frame | np.ndarray) -> list[FrameResult]:
+        """Take one frame; returns the results that are settled by it. Raises InputError for anything but a picture."""
+        if self._detector is None:
+            image = frame.image if isinstance(frame, Frame) else frame
+            if not isinstance(image, np.ndarray) or image.ndim < 2:
+                raise InputError(f"a frame must be a Frame or a NumPy image, got {type(frame).__name__}")
+            engine = self._begin((image.shape[1], image.shape[0]), self.rate_hz)
+            self._detector = MotionDetector(self.settings, engine, self.rate_hz, self.telemetry)
+        return [result for scene in self._detector.update(frame) for result in self._take(scene)]
+
+    def flush(self) -> list[FrameResult]:
+        """End the clip; returns all remaining results. Raises InputError if there were fewer than three frames."""
+        if self._detector is None:
+            return []
+        detector, self._detector = self._detector, None
+        results = [result for scene in detector.flush() for result in self._take(scene)]
+        return results + list(self._rest())
+
+    def _run(self, source: Any) -> Iterator[FrameResult]:
+        if not hasattr(source, "rate_hz") or not hasattr(source, "size"):
+            for frame in source:
+                yield from self.update(frame)
+            yield from self.flush()
+            return
+        engine = self._begin(source.size, source.rate_hz)
+        for scene in detect_motion(source, self.settings, engine, self.telemetry, retune=self._retune):
+            yield from self._take(scene)
+        yield from self._rest()
+
+    def _begin(self, size_px: tuple[int, int], rate_hz: float) -> Engine:
+        """Start a clip: a tracker, and what locates its frames."""
+        if self._locates:
+            self._watch = self._build_watch(size_px, rate_hz)
+            self.settings, more = with_focal_length(self.settings, self._watch.locator)
+            self.telemetry = self._watch.locator.site.telemetry
+            self.notes += more
+        self._clip_rate_hz = rate_hz
+        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures)
+        self._crowds = CrowdIdentities() if self.settings.crowds.join_m and self._watch is not None else None
+        self._waiting: dict[int, WatchedScene] = {}
+        return self._engine or load_engine(self._backend, self.settings)
+
+    def _build_watch(self, size_px: tuple[int, int], rate_hz: float) -> LandmarkWatch:
+        landmarks, colours = self._landmarks, self._colours
+        locator = AerialLocator(
+            self._camera,
+            self._flown,
+            landmarks,
+            self._elevation,
+            self.settings,
+            rate_hz=rate_hz,
+            backend=self._backend,
+            size_px=size_px,
+        )
+        self.notes = list(locator.notes)
+        if landmarks is not None:
+            check_colours(landmarks, colours, self._flown is not None and self.settings.aerial.mode == "pose")
+        return LandmarkWatch(locator, colours, load_colours(self._backend) if colours is not None else None)
+
+    def _take(self, scene: Scene) -> Iterator[FrameResult]:
+        """Locate a scene's landmarks, give its targets identities, and finish the frames that are settled by it."""
+        if self._watch is not None:
+            if self._mission is not None:
+                self._mission.take_reports(scene)
+            watched = group_crowds(self._watch.update(scene), self._watch.locator, self._clip_rate_hz)
+            scene = watched.scene
+            if not self._pictures:
+                watched = replace(watched, scene=replace(scene, frame=without_picture(scene.frame)))
+            self._waiting[scene.frame.number] = watched
+        if self._seen is not None:
+            self._seen(scene)
+        for tracked in self._tracker.update(scene):
+            yield self._finish(tracked)
+
+    def _rest(self) -> Iterator[FrameResult]:
+        for tracked in self._tracker.flush():
+            yield self._finish(tracked)
+
+    def _finish(self, tracked: TrackedFrame) -> FrameResult:
+        """Locate the targets of a settled frame by the picture that shows them."""
+        if self._watch is None:
+            return FrameResult(tracked)
+        past = [self._waiting.pop(number) for number in sorted(self._waiting) if number <= tracked.number]
+        if self._crowds is not None:
+            tracked = _with_crowd_identities(tracked, past[-1], self._watch.locator, self._crowds)
+        result = _locate(tracked, past, self._watch.locator)
+        return result if self._mission is None else self._mission.steer(result, past[-1].scene.step)
+
+
+def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
+    """The settings with the camera's focal length if telemetry gives the size of targets, unless another is set."""
+    focal = locator.camera.focal_px[0]
+    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
+        return settings, []
+    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
 def _with_crowd_identities(
-    followed: TrackedFrame, fix: Fix, locator: AerialLocator, crowds: CrowdIdentities
+    tracked: TrackedFrame, watched: WatchedScene, locator: AerialLocator, crowds: CrowdIdentities
 ) -> TrackedFrame:
-    """A tracked frame with the identities that its crowds have on the ground. fix: how its picture lies there."""
-    tracks = followed.tracks
+    """A tracked frame with the identities that its crowds have on the ground."""
+    tracks, fix = tracked.tracks, watched.fixed.fix
     seen = tracks.row >= 0
-    box, middle = tracks.box_px[seen], followed.detections.middle_px[tracks.row[seen]]
+    box, middle = tracks.box_px[seen], tracked.detections.middle_px[tracks.row[seen]]
     middle = np.where(np.isfinite(middle), middle, box[:, :2] + (box[:, 2:] - 1) / 2)
     place, radius = locator.ground_places(fix, middle), locator.ground_radii(fix, box)
-    return replace(followed, tracks=crowds.rename(tracks, locator.time_s(followed.number), place, radius))
+    return replace(tracked, tracks=crowds.rename(tracks, locator.time_s(tracked.number), place, radius))
 
 
-def _unpictured(watched: WatchedScene) -> WatchedScene:
-    return replace(watched, scene=replace(watched.scene, frame=without_picture(watched.scene.frame)))
-
-
-def _located(followed: TrackedFrame, past: Sequence[WatchedScene], locator: AerialLocator) -> FrameResult:
-    """A followed frame on the ground. past: what was seen since the one before, it at the end."""
-    here, targets = past[-1], tracked_targets(followed, bool(locator.settings.crowds.join_m))
+def _locate(tracked: TrackedFrame, past: Sequence[WatchedScene], locator: AerialLocator) -> FrameResult:
+    """A tracked frame on the ground. past: the scenes since the last tracked frame, this one at the end."""
+    here, targets = past[-1], tracked_targets(tracked, bool(locator.settings.crowds.join_m))
     earlier = tuple(a for watched in past[:-1] for a in watched.fixed.adjustments)
-    seconds = dict(followed.seconds)
+    seconds = dict(tracked.seconds)
     for watched in past:
         for stage, spent in watched.fixed.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + spent
-    grounded = locator.locate_targets(
-        replace(here.fixed, seconds={}), targets, (*followed.adjustments, *earlier), seconds
-    )
+    fixed, adjustments = replace(here.fixed, seconds={}), (*tracked.adjustments, *earlier)
+    grounded = locator.locate_targets(fixed, targets, adjustments, seconds)
     origin = locator.site.origin_deg
     degrees = None if origin is None else geometry.lonlat(grounded.marks.east_north_m, origin)
-    return FrameResult(followed, grounded, here.sighted_by, degrees)
+    return FrameResult(tracked, grounded, here.sighted_by, degrees)

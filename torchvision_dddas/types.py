@@ -938,6 +938,21 @@ class FrameResult:
     confirmed: Confirmation | None = None
     command: "Command | None" = None
 
+    @property
+    def frame(self) -> Frame | None:
+        """The frame; None where it could not be read."""
+        return self.followed.frame
+
+    @property
+    def number(self) -> int:
+        """1-based number of the frame."""
+        return self.followed.number
+
+    @property
+    def tracks(self) -> Tracks:
+        """The targets of the frame with their identities."""
+        return self.followed.tracks
+
 
 @dataclass(frozen=True)
 class Order:

@@ -10,7 +10,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control import Mission, StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.pipeline import survey
+from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Command, FrameResult
 
@@ -57,7 +57,8 @@ def fly(overrides=(), seconds=6.0, **tables) -> Flight:
     mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
     flown = Flight(simulated, mission, steered=steered)
     engine = load_engine("onboard", mission.settings)
-    for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):
+    pipeline = Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)
+    for surveyed in pipeline(source):
         flown.surveyed.append(surveyed)
         flown.noticed += [(notice.frame, notice.text) for notice in mission.notices()]
         for truth in simulated.truths():

@@ -20,7 +20,7 @@ def path(
     from torchvision_dddas.config import with_parameters
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.live.load_shedding import LoadShedding
-    from torchvision_dddas.pipeline import survey
+    from torchvision_dddas.pipeline import Pipeline
 
     settings, recognizer = ready.settings, None
     if people:
@@ -49,9 +49,10 @@ def path(
             return settings, moved
 
         seen = None if people_tracker is None else people_tracker.update
-        for surveyed in survey(
-            feed, engine, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
-        ):
+        pipeline = Pipeline.from_parts(
+            engine, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
+        )
+        for surveyed in pipeline(feed):
             number = surveyed.followed.number
             yield surveyed, None if people_tracker is None else people_tracker.people_of(number, feed.ended)
 

@@ -77,7 +77,7 @@ def fly_into(
         from torchvision_dddas.control import StartedSource, build_mission
         from torchvision_dddas.detection import load_engine
         from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-        from torchvision_dddas.pipeline import survey
+        from torchvision_dddas.pipeline import Pipeline
         from torchvision_dddas.simulation import SimulatorSource, name_scenario_in_errors, scenario_settings
         from torchvision_dddas.simulation import load_scenario as load_scenario
 
@@ -101,7 +101,8 @@ def fly_into(
         try:
             with progress(simulated.name, simulated.count, quiet) as tick:
                 done = 0
-                for surveyed in survey(source, engine, mission.settings, None, mission.watch, 1, mission):
+                pipeline = Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)
+                for surveyed in pipeline(source):
                     for truth in simulated.truths():
                         scorer.feed(truth)
                         output.add_truth(truth)

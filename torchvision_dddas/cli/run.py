@@ -157,7 +157,7 @@ def run_into(
     refuse_own_input([Path(clip), *files], [folder / name for name in PipelineRecorder.files], "folder with --out")
     with PipelineRecorder(folder, save) as output:
         from torchvision_dddas import open_video
-        from torchvision_dddas.pipeline import survey
+        from torchvision_dddas.pipeline import Pipeline
 
         source = open_video(clip, rate_hz=rate_hz)
         ready = prepare_run(given, telemetry, settings, source, backend, clip)
@@ -181,7 +181,8 @@ def run_into(
         try:
             count = None if source.count is None else -(-source.count // interval)
             with progress(source.name, count, quiet) as tick:
-                for surveyed in survey(source, engine, settings, ready.flight, watch, interval):
+                pipeline = Pipeline.from_parts(engine, settings, ready.flight, watch, interval)
+                for surveyed in pipeline(source):
                     output.write(surveyed)
                     tick()
         finally:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import Engine, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
@@ -24,6 +24,7 @@ from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.pipeline import with_focal_length
 from torchvision_dddas.types import Colours, Source, Telemetry
 
 
@@ -78,7 +79,7 @@ def prepare_run(
     flight = None
     if watch is not None:
         flight = watch.locator.site.telemetry
-        settings, more = _with_focal_length(settings, watch.locator)
+        settings, more = with_focal_length(settings, watch.locator)
         notes += more
     elif telemetry is not None:
         flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
@@ -141,12 +142,3 @@ def _watch(given: AerialInput, settings: Settings, source: Source, backend: str)
     if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
         notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
     return LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None), notes
-
-
-def _with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """Take the camera's own focal length if telemetry gives the size of targets, unless another is set."""
-    focal = locator.camera.focal_px[0]
-    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
-        return settings, []
-    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
-    return with_parameters(settings, {"gates.focal_px": focal}), [note]

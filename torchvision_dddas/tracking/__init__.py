@@ -4,6 +4,7 @@ from torchvision_dddas.tracking.camera_motion import CameraMotion
 from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
 from torchvision_dddas.tracking.tracker import (
     FrameTracker,
+    SceneTracker,
     Tracker,
     track_clip,
     track_scenes,
@@ -15,6 +16,7 @@ __all__ = [
     "CameraMotion",
     "CrowdIdentities",
     "FrameTracker",
+    "SceneTracker",
     "Tracker",
     "track_clip",
     "track_scenes",

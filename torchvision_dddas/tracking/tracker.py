@@ -214,37 +214,52 @@ def without_picture(frame: Frame) -> Frame:
     return replace(frame, image=np.broadcast_to(np.uint8(0), frame.image.shape))
 
 
-def track_scenes(
-    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
-) -> Iterator[TrackedFrame]:
-    """Identities of a clip's own detections at frames 1, 1 + interval, ... The scenes' registrations are chained."""
-    tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures)
-    steps: list[np.ndarray] = []
-    adjustments: tuple[Adjustment, ...] = ()
-    seconds: dict[str, float] = {}
-    for scene in scenes:
+class SceneTracker:
+    """Gives the targets of a clip's own scenes identities, at frames 1, 1 + interval, ... Registrations are chained."""
+
+    def __init__(self, settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True) -> None:
+        self._interval = interval
+        self._tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures)
+        self._steps: list[np.ndarray] = []
+        self._adjustments: tuple[Adjustment, ...] = ()
+        self._seconds: dict[str, float] = {}
+
+    def update(self, scene: Scene) -> Iterator[TrackedFrame]:
+        """Add the next scene; yields the frames that are settled by it."""
         # An unknown step is left out: the product of the others is nearer to the truth than a camera that stood still.
         if scene.step is not None and scene.step.reliable:
-            steps.append(scene.step.later_from_earlier)
-        adjustments += scene.adjustments
+            self._steps.append(scene.step.later_from_earlier)
+        self._adjustments += scene.adjustments
         for stage, spent in scene.seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + spent
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + spent
         number = scene.frame.number
-        if not is_sampled(number, interval):
-            continue
-        motion = chain(steps) if steps else None
+        if not is_sampled(number, self._interval):
+            return
         found = TrackedFrame(
             number,
             scene.frame,
             scene.detections,
             Tracks(number),
-            motion,
+            chain(self._steps) if self._steps else None,
             cause=scene.cause,
-            adjustments=adjustments,
-            seconds=seconds,
+            adjustments=self._adjustments,
+            seconds=self._seconds,
         )
-        yield from tracker.update(found)
-        steps, adjustments, seconds = [], (), {}
+        self._steps, self._adjustments, self._seconds = [], (), {}
+        yield from self._tracker.update(found)
+
+    def flush(self) -> Iterator[TrackedFrame]:
+        """The frames that were still waiting."""
+        yield from self._tracker.flush()
+
+
+def track_scenes(
+    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
+) -> Iterator[TrackedFrame]:
+    """Identities of a clip's own detections, as by `SceneTracker`."""
+    tracker = SceneTracker(settings, interval, size, pictures)
+    for scene in scenes:
+        yield from tracker.update(scene)
     yield from tracker.flush()
 
 

@@ -361,12 +361,13 @@ def _given(clip: Clip) -> "AerialInput":
 def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
     from torchvision_dddas.evaluation.studies.stages import open_clip
     from torchvision_dddas.io.run_inputs import prepare_run
-    from torchvision_dddas.pipeline import survey
+    from torchvision_dddas.pipeline import Pipeline
 
     source = open_clip(clip)
     ready = prepare_run(_given(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
     assert ready.watch is not None, "there are landmarks"
-    for surveyed in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, pictures=False):
+    pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, pictures=False)
+    for surveyed in pipeline(source):
         grounded = surveyed.grounded
         if grounded is not None:
             count = len(grounded.box_px)

@@ -24,7 +24,7 @@ from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource
 from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.detector import detect_in_clip, load_scorer
-from torchvision_dddas.pipeline import survey
+from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
     AerialLocations,
@@ -325,7 +325,10 @@ def _rows_of_tracks(frames: Iterable[TrackedFrame], tick: Tick) -> Rows:
 def _locate_along(job: _Job, files: AerialInput) -> Rows:
     source, rows = open_clip(job.clip), Rows()
     ready = prepare_run(files, job.clip.telemetry, job.settings, source, job.backend, str(job.clip.pictures[0]))
-    for result in survey(source, ready.engine, ready.settings, ready.flight, ready.watch, job.interval, pictures=False):
+    pipeline = Pipeline.from_parts(
+        ready.engine, ready.settings, ready.flight, ready.watch, job.interval, pictures=False
+    )
+    for result in pipeline(source):
         tracks, located = result.followed.tracks, result.grounded
         seen = tracks.row >= 0
         columns = {"box_px": tracks.box_px[seen], "identity": tracks.identity[seen], "score": tracks.score[seen]}
