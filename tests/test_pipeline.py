@@ -1,5 +1,7 @@
 """The public classes over whole clips: the pipeline on frames, and locating by records alone."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -55,22 +57,26 @@ def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     assert all(r.grounded is not None and r.grounded.fix.by == "telemetry" for r in results)
 
 
+WRONG: Any = "flight.csv"  # where a record is wanted
+LIST: Any = [5]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Pipeline(interval=0), "interval must be at least 1"),
         (lambda: Pipeline("no_such"), "no_such"),
-        (lambda: Pipeline(telemetry="flight.csv"), "telemetry must be of type Telemetry, got str"),
+        (lambda: Pipeline(telemetry=WRONG), "telemetry must be of type Telemetry, got str"),
         (lambda: Pipeline(camera=CAMERA), "of no use without landmarks"),
-        (lambda: Pipeline()(5), "wants a path or frames, got int"),
-        (lambda: Pipeline().update(None), "must be a Frame or a NumPy image, got NoneType"),
+        (lambda: Pipeline()(LIST[0]), "wants a path or frames, got int"),
+        (lambda: Pipeline().update(WRONG), "must be a Frame or a NumPy image, got str"),
         (lambda: list(Pipeline()([np.zeros((8, 8, 3))] * 4)), "must be uint8"),
         (lambda: AerialLocator(CAMERA), "landmarks, or telemetry"),
-        (lambda: AerialLocator(CAMERA, "flight.csv"), "got str where a Telemetry is wanted"),
+        (lambda: AerialLocator(CAMERA, WRONG), "got str where a Telemetry is wanted"),
         (lambda: AerialLocator(CAMERA, DOWN, rate_hz=0), "rate_hz must be positive"),
-        (lambda: AerialLocator(CAMERA, DOWN).locate([1]), "wants Tracks or a TrackedFrame, got list"),
+        (lambda: AerialLocator(CAMERA, DOWN).locate(LIST), "wants Tracks or a TrackedFrame, got list"),
         (lambda: GroundLocator([]), "wants one Camera or several"),
-        (lambda: GroundLocator(CAMERA).locate([[1]]), "wants the People of each camera"),
+        (lambda: GroundLocator(CAMERA).locate([WRONG]), "wants the People of each camera"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_line(make, message):

@@ -193,17 +193,17 @@ def test_positions_of_someone_else_are_neither_replaced_nor_removed(dddas, clip,
 
 
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
-    from torchvision_dddas.tracking import track_scenes
+    from torchvision_dddas.pipeline import Pipeline
 
-    whole_of = track_scenes
+    whole = Pipeline.__call__
 
     def stopped(*how):
-        for count, followed in enumerate(whole_of(*how)):
+        for count, result in enumerate(whole(*how)):
             if count == 4:
                 raise KeyboardInterrupt
-            yield followed
+            yield result
 
-    monkeypatch.setattr("torchvision_dddas.pipeline.track_scenes", stopped)
+    monkeypatch.setattr(Pipeline, "__call__", stopped)
     result = dddas(*given(flown), *FLAT, "--save", "none", "--out", tmp_path / "out")
     assert result.exit_code == 130
     record = json.loads((tmp_path / "out" / "run.json").read_text())
