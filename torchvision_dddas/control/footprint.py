@@ -7,9 +7,9 @@ import numpy as np
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.types import Camera, CameraPose, Fix, Flight
 
-# A camera that looks down as steeply is meant to look straight down.
+# A camera that looks down more steeply counts as looking straight down.
 _DOWN = float(np.cos(np.radians(8)))
-# One that looks down less steeply shows the horizon, and has no footprint.
+# A camera that looks down less steeply shows the horizon, and has no footprint.
 _LEVEL = float(np.sin(np.radians(10)))
 
 
@@ -51,7 +51,7 @@ class CameraMount:
         turn = np.stack([[ahead[1], -ahead[0]], ahead])  # to the right, and ahead
         along = np.asarray(points_m, float) @ turn.T
         low, high = along.min(axis=0), along.max(axis=0)
-        # Seen at a slant what is near takes more of the picture than what is far.
+        # Seen at a slant, near ground takes more of the picture than far ground.
         shifts = np.linspace(-0.5, 0.5, 9) if self.down < _DOWN and len(along) > 1 else np.zeros(1)
         tried = [((low + high) / 2 + [0.0, shift * (high[1] - low[1])]) @ turn for shift in shifts]
         within = [float(self.inside(points_m, place, altitude_m).min()) for place in tried]

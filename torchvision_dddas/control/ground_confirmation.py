@@ -13,12 +13,12 @@ from torchvision_dddas.people.confirmation import Beliefs, GroundObservation, fi
 from torchvision_dddas.people.detector import WindowScorer, detect_people
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundPicture, Poses
 
-# People do not run faster.
+# Nobody runs faster.
 _RUNNING_M_S = 4.0
 
 
 def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
-    """The look without the people at what goes faster than people do, (N, 2): they mount beside its way."""
+    """The look without the people at targets faster than people, (N, 2): they stand beside its way."""
     fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
     return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
 
@@ -38,7 +38,7 @@ class GroundConfirmation:
         self._waiting += pictures
 
     def confirm(self, grounded: AerialLocations, extent_m: np.ndarray) -> Confirmation:
-        """What is known of the targets of a frame, by the pictures taken at it and all before.
+        """The confirmation of the targets of a frame, by the pictures taken at it and before.
 
         extent_m: (P,) radius of each located target: its people mount about its middle.
         """
@@ -78,7 +78,7 @@ class GroundConfirmation:
         seen = range_people(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
         known = seen.by != "bearing"
         view = field_of_view(camera, place[0], camera.heading_rad, settings.people, settings.ground)
-        # People of a crowd mount within it, not at its middle: half its radius is about their standard deviation.
+        # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
         spread = positions.covariance_m2 + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
         found = observe_ground(
             positions.east_north_m,
@@ -92,7 +92,7 @@ class GroundConfirmation:
         return drop_fast_targets(found, grounded.velocity_m_s)
 
 
-# People are as tall as within so many standard deviations, and the camera looks where it says within as many.
+# Bounds of body heights and of the camera's heading, in standard deviations.
 _SIGMAS = 2.0
 # Targets are within one of where they are said to be: most of it is that of the middle within the outline, and the
 # whole outline is searched, with so much about it.

@@ -6,18 +6,18 @@ import numpy as np
 
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation
 
-# A target steers nothing before it was located so often and for so long: most false alarms are gone by then.
+# A target counts only after this many locations over this time: most false alarms are gone by then.
 _SIGHTINGS, _LASTING_S = 3, 0.8
-# A place moves by this share of what it is off its prediction, and a velocity by this share of its change: the blob of
-# a crowd swings about as parts of it are seen or not. A place further off is taken as it is.
+# Gain of the filter of places and velocities, and the distance from which a place is taken as it is: the blob of
+# a crowd swings about as parts of it are detected or not.
 _BELIEVED, _FAR_M = 0.4, 5.0
-# People do not run faster, nor cars go slower for long: what does is not wanted unless it is surely human.
+# Speeds above which a target is fast and below which it is so no more; a fast target must be this surely human.
 _RUNNING_M_S, _WALKING_M_S, _SURE = 4.5, 3.5, 0.95
-# One that is not located any more is remembered so long; its velocity is believed for a shorter time.
+# A lost target is kept for the first time, and moved on by its velocity for the second.
 _KEPT_S, _HORIZON_S = 8.0, 3.0
-# What is lost where another was found within its reach goes on under that one's name.
+# A lost target is dropped where another one is within this distance: it goes on as that one.
 _RENAMED_M = 3.0
-# A target is given up once it is so surely not human, and taken up again where that is as likely as not.
+# A target is given up below the first probability of being human, and taken up again above the second.
 _GIVEN_UP, _TAKEN_UP = 0.2, 0.5
 # Half of a target's width where no box tells it.
 _RADIUS_M = 1.0
@@ -25,7 +25,7 @@ _RADIUS_M = 1.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """The targets that are believed in, as they are expected now, one row a target.
+    """The established targets as predicted for now, one row a target.
 
     target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
     probability: (N,) of being human. unseen: (N,) bool, no ground vehicle could tell. wanted: (N,) bool, human or
@@ -55,7 +55,7 @@ class Prediction:
 
 @dataclass
 class _Remembered:
-    """One target as it was last located."""
+    """A target as it was last located."""
 
     place_m: np.ndarray
     velocity_m_s: np.ndarray
@@ -71,7 +71,7 @@ class _Remembered:
     steady: bool = False
 
     def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
-        """It was located again."""
+        """Take over a new location."""
         predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
         off = place_m - predicted
         self.place_m = predicted + (_BELIEVED * off if np.linalg.norm(off) < _FAR_M else off)
@@ -86,12 +86,12 @@ class _Remembered:
 
     @property
     def lasting(self) -> bool:
-        """Whether it has been there for long enough to be believed in."""
+        """Whether it was located often and long enough to be established."""
         return self.sightings >= _SIGHTINGS and self.seen_s - self.first_s >= _LASTING_S - 1e-6
 
     @property
     def wanted(self) -> bool:
-        """Whether it is human, or may be."""
+        """Whether it is or may be human."""
         return self.human and (not self.fast or (not self.unseen and self.probability >= _SURE))
 
 

@@ -7,13 +7,13 @@ import numpy as np
 
 from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 
-# Who has said nothing for so long is silent, if reports came faster before.
+# A vehicle without reports for this time is silent, if reports came faster before.
 SILENT_S = 2.0
-# So many times the usual time between its reports is silence where they come seldom.
+# For rare reports, silence is this many times the usual time between them.
 _SLOWER = 3.0
-# No vehicle's report is so much further from its last one than it could have driven.
+# A report further from the last one than the vehicle could have driven, by this much, is a leap.
 _LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
-# The ground below the picture's middle does not move so much faster than it did, but for a gust.
+# A change of the ground's velocity in the picture's middle above this is a jerk, as by a gust.
 _JERK_M_S = 4.0
 _USUAL_S = 2.0
 

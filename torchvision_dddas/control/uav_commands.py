@@ -7,32 +7,32 @@ from torchvision_dddas.control.footprint import CameraMount
 from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 
-# Landmarks that a picture needs to lie on the ground.
+# Landmarks that a picture needs for its fix.
 NEEDED = 4
-# How far within the picture what is followed should be, as a share of its half: at least; from where it climbs to; and
+# Margin of the targets inside the picture, as a share of its half: at least; after a climb; and
 # so that it may come down again.
 _LEAST, _AIMED, _EASY = 0.1, 0.2, 0.35
-# The same of landmarks, which their receivers place.
+# The same for landmarks.
 _LANDMARK = 0.08
-# The middle of the picture is drawn along by what is followed once that is further off than this share of its half.
+# The picture's middle follows the targets once they are further off than this share of its half.
 _LEASH = 0.12
-# It crosses half the picture in so long at the fastest, or goes so many times as fast as what it follows: a picture
+# It crosses half the picture in this time at the fastest, or goes this many times as fast as the targets: a picture
 # that sweeps over the ground shows nothing that moves.
 _CROSSING_S, _FASTER = 5.0, 1.5
-# Targets are to be in the picture for so long.
+# Targets should stay in the picture for this time.
 _AHEAD_S = 3.0
 # One step of altitude, and the time between a change and a step down.
 _STEP, _SETTLED_S = 1.1, 5.0
-# Without targets it climbs two steps after so long, and again, and goes back to the team at last.
+# Without targets it climbs two steps each time after the first, and returns to the team after the second.
 _WIDEN_S, _GIVEN_UP_S = 4.0, 30.0
-# At the highest a body of the expected size measures so much.
+# Smallest size of a body of the expected size, which limits the altitude.
 _LEAST_PX = 6.0
-# A way of the picture's middle by this share of its half is a line in the log.
+# A move of the picture's middle by this share of its half is logged.
 _NOTED = 0.5
 
 
 class UavSteering:
-    """Where the aerial vehicle was asked to look, and how high to be; None: as it does by itself."""
+    """Commanded view and altitude of the aerial vehicle; None: as by itself."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -54,7 +54,7 @@ class UavSteering:
         now_s: float,
         log: AdjustmentLog,
     ) -> None:
-        """Move on what is asked, by the targets expected now and the places (V, 2) of the team's vehicles.
+        """Update view and altitude by the predicted targets and the places (V, 2) of the team's vehicles.
 
         ground_in_middle: (2,) the ground in the middle of the picture. Nothing is asked where the view is not known.
         """

@@ -12,26 +12,26 @@ from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 from torchvision_dddas.types import LandmarkObservations, Order
 
-# A vehicle that reports no place is count_of on for so long: planned waypoints bridge dropouts.
+# A vehicle that reports no place still counts for this time: planned waypoints bridge dropouts.
 _SILENT_S = 10.0
-# A vehicle that was near counts as far again beyond this many times near_m.
+# A vehicle that was near becomes far beyond this many times near_m.
 _FAR = 1.5
-# A target this surely human or not is seldom looked at: at every so many-th picture; and below it often again.
+# A target is sure above the first probability until it falls below the second; then only every n-th picture is taken.
 _SURE, _UNSURE, _SELDOM = 0.95, 0.9, 5
-# A vehicle sent to a target stays so long at most, and that target is let be for a while.
+# A vehicle sent to a target stays for the first time at most; the target is left alone for the second.
 _TRIED_S, _LET_BE_S = 15.0, 30.0
-# A vehicle looks at a target for so long at least.
+# A vehicle looks at a target for this time at least.
 _LOOK_S = 2.0
-# The ring is no wider than so many times station_m, however far apart targets are: vehicles are sent to those afar.
+# The ring is at most this many times station_m wide: vehicles are sent to targets further away.
 _WIDEST = 1.5
-# Stations are where the crowd will be so much later.
+# Stations are around the crowd as predicted this much later.
 _LEAD_S = 1.0
 NEEDED = 4
 
 
 @dataclass
 class _Vehicle:
-    """What is known of one vehicle, and what it was asked to do."""
+    """State of one vehicle, and its orders."""
 
     place_m: np.ndarray
     heard_s: float
@@ -56,7 +56,7 @@ class UgvTeam:
         self._let_be: dict[int, float] = {}
 
     def hear(self, marks: LandmarkObservations, now_s: float, log: AdjustmentLog) -> np.ndarray:
-        """Take on the places that the team reports; the places (V, 2) of those that are count_of on."""
+        """Take over the places that the team reports; returns those (V, 2) of the present vehicles."""
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
                 if row not in self._known:
@@ -72,13 +72,13 @@ class UgvTeam:
 
     @property
     def present(self) -> list[int]:
-        """The vehicles that are count_of on."""
+        """The vehicles that count as present."""
         return sorted(self._known)
 
     def orders(
         self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None, now_s: float, log: AdjustmentLog
     ) -> tuple[Order, ...]:
-        """What each is asked to do; none while there is nothing to go to. rows: the targets that are followed."""
+        """Orders for each vehicle; none without targets. rows: the targets that are followed."""
         present = self.present
         if not len(rows) or not present:
             self._ring = None
@@ -96,7 +96,7 @@ class UgvTeam:
         )
 
     def _middle(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None) -> np.ndarray:
-        """Of what the ring is about: the targets that are wanted, a little later."""
+        """Centre of the ring: the wanted targets, a little later."""
         later = prediction.east_north_m[rows] + _LEAD_S * prediction.velocity_m_s[rows]
         return later.mean(axis=0) if mount is None else mount.centre(later, mount.altitude_m)[0]
 

@@ -1,4 +1,4 @@
-"""Where ground vehicles mount and look: on a ring about the crowd, never on one line, and near what needs a look."""
+"""Where ground vehicles stand and look: on a ring about the crowd, never on one line, near targets in doubt."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from torchvision_dddas.control.prediction import Prediction
 KEEP_OFF_M = 5.0
 # A station is this far within the aerial picture, as a share of its half.
 _WITHIN = 0.2
-# Turns of the ring that are tried; it is turned, or vehicles change places, where the ways become so much shorter, ...
+# Turns of the ring that are tried; the assignment changes where the total way shrinks below this share, ...
 _TURNS, _BETTER = 12, 0.75
 # ... and are longer than this share of the ring's radius.
 _NEAR = 0.5

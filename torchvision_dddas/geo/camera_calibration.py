@@ -13,19 +13,19 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import level
 from torchvision_dddas.types import Bool, Camera, Float
 
-# Boxes that it takes.
+# Fewest boxes for a calibration.
 FEWEST = 20
-# The rows that hold the feet of all but a tenth on either side must be so many body heights at least.
+# The rows of the feet, without a tenth on either side, must span this many body heights at least.
 NARROW = 0.3
-# The boxes are left out in so many stretches of time in turn, to learn how much the answer hangs on single people.
+# Jackknife: this many stretches of time are left out in turn, for the standard deviations.
 BLOCKS = 10
-# Where the search begins, each with HEIGHTS.
+# Starts of the search: pitches, each with all heights.
 PITCHES = np.radians([0.0, 5.0, 15.0, 30.0, 50.0])
-# In typical people's heights.
+# In heights of the typical person.
 HEIGHTS = (0.5, 1.2, 2.5, 8.0)
-# Where the typical body misses by so many of its heights, nothing was found.
+# A fit whose median residual exceeds this many body heights is refused.
 POOR = 0.5
-# A standard deviation of the height that is a larger share of it is no answer.
+# A fit whose height has a larger relative standard deviation is refused.
 UNSURE = 0.2
 
 
@@ -108,7 +108,7 @@ def calibrate_pose(
 
 
 def with_pose(camera: Camera, found: MountedPose) -> Camera:
-    """The camera, with what was found."""
+    """The camera with the calibrated height and pitch."""
     return replace(
         camera,
         height_m=found.height_m,

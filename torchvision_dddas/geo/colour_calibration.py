@@ -11,18 +11,18 @@ from torchvision_dddas.geo.colours import Patches, find_patches
 # Names of hues, in OpenCV's units.
 HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
 
-# A patch is looked for in windows of hue of this half width and step, above these saturations and this value.
+# Windows of hue in which patches are searched: half width and step; lowest saturations and value.
 _HALF, _STEP = 7, 4
 _SATURATIONS, _VALUE = (80, 120, 160), 50
-# It fills so much of its box, which is not longer than so many times its width, and covers no more of the picture.
+# Least fill of a patch's box; its greatest length over width; its greatest share of the picture.
 _FILL, _LONG, _MOST = 0.4, 3.0, 0.02
-# A hue of which a larger share of the picture is belongs to the ground.
+# A hue that covers a larger share of the picture belongs to the ground.
 _GROUND = 0.05
-# Colours are further apart in hue than this.
+# Least difference in hue between colours.
 _APART = 10
-# From this area on size says nothing; and a clear colour has a score of at least the second.
+# Area from which size no longer raises the score, and the score of a clear colour.
 _AREA_PX, _CLEAR = 150.0, 0.24
-# Ranges go beyond what was seen by these, hue, saturation and value: the widest that marks the least else is taken.
+# Margins of ranges in hue, saturation and value that are tried: the widest that marks least else is taken.
 _MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
 _LOWEST = (40, 30)
 _ENDS = (2, 98)
@@ -150,7 +150,7 @@ def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: 
     x, y, width, height = (int(v) for v in patches.box_px[k])
     seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
     hue = _mean_hue(seen[:, 0])
-    # What is rare in the picture, and alone of its kind where it is.
+    # High for what is rare in the picture and in its surroundings.
     around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
     share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
     # The middle of the box is all of it, also what the window of hue and saturation left out.
@@ -165,7 +165,7 @@ def _mean_hue(hues: np.ndarray) -> float:
 
 
 def _compact(patches: Patches, picture_px: int) -> np.ndarray:
-    """The rows of patches like a vehicle's plate."""
+    """The rows of patches that are compact like a vehicle's plate."""
     sides = patches.box_px[:, 2:]
     fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
     long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
@@ -200,7 +200,7 @@ def _rooms(k: int, middle: np.ndarray, ends: Sequence[tuple[float, ...]]) -> tup
 def _others(
     hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[ColourSample], picture: int, least_area_px: int
 ) -> int:
-    """How many patches a range marks in a picture that are none of the colour's own."""
+    """Number of patches that a range marks in a picture beside the colour's own."""
     patches = find_patches(mask_range(hsv, low, high), least_area_px)
     own = [one.box_px for one in group if one.picture == picture]
     boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in patches.box_px]

@@ -1,4 +1,4 @@
-"""Crowds: targets that are close together on the ground and go the same way are one.
+"""Crowds: targets that are close together on the ground and move alike count as one target.
 
 Source: appendix A takes each crowd for one target of the aerial camera. How far its people may be apart is in metres
 here, not in pixels of a closing kernel, so that it is the same at every altitude.

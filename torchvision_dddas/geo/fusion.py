@@ -1,4 +1,4 @@
-"""One person seen by several vehicles: which sightings are of the same person, and where all of them together put it.
+"""Sightings of people by several vehicles: which are of the same person, and where that person stands.
 
 What is common to sightings is estimated with the places, not counted anew with each: a vehicle's position, heading,
 pitch, camera height and focal length are common to all that it sees, a person's height to all that see the person. So
@@ -16,11 +16,11 @@ import numpy as np
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Float, Int, Sightings
 
-# Each vehicle's sightings are matched anew to what the others see so many times at most.
+# Rounds in which each vehicle's sightings are matched anew to the others'.
 ROUNDS = 3
-# So many pairs at most are tried as the one that tells how far a vehicle is off.
+# Most pairs that are tried as hypotheses of a vehicle's common error.
 BELIEFS = 60
-# Beliefs times pairs that are worked out at once: a few megabytes.
+# Hypotheses times pairs that are computed at once: a few megabytes.
 MATRICES = 20_000
 
 
@@ -72,7 +72,7 @@ def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.nda
 
 
 def gate_distance(sigmas: float) -> float:
-    """The squared distance, by its covariance in the plane, that is as likely exceeded as so many sigmas on a line."""
+    """Squared Mahalanobis distance in the plane with the tail probability of this many sigmas on a line."""
     return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
 
 

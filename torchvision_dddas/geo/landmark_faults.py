@@ -1,4 +1,4 @@
-"""Whether the landmarks are where they are said to be: swapped identities and places far off, found and repaired.
+"""Test of the landmarks: swapped identities and wrong places are found and repaired.
 
 The sum of squares of the likeliest pose is chi-square where all is right: it weighs the landmarks' pixels against what
 telemetry and reports expect, with the errors of both. Above the gate something is wrong. Tried are then, in this order,
@@ -22,23 +22,23 @@ from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import Bool, Camera, Int, LandmarkObservations
 
 Hypothesis = tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]
-"""Whose pixel each landmark has in truth, and which landmarks count."""
+"""The landmark whose pixel each one gets, and which landmarks are used."""
 
-# Of the changes that look best to first order so many are tried in full.
+# This many changes, the best to first order, are tried in full.
 FITTED = 6
-# Landmarks that may overrule the telemetry: fewer fit anything too easily.
+# Fewest landmarks that may overrule the telemetry: fewer fit any pose too easily.
 ENOUGH_ALONE = 5
-# Landmarks alone that fit no better than so many times their errors are not what they are said to be, and tell
-# nothing. Beside telemetry, which may be what is wrong, they still do.
+# Without telemetry, landmarks that fit only with errors this many times as large are not used at
+# all. Beside telemetry, which may be wrong itself, they are.
 HOPELESS = 8.0
-# They do so only where they lie this many standard deviations off their own best line, on the ground and in the
+# Landmarks overrule the telemetry only if they are this many standard deviations off one line, on the ground and in the
 # picture: a row of them agrees with poses of all kinds.
 APART = 3.0
 
 
 @dataclass(frozen=True)
 class LandmarkCheck:
-    """What came of the test. order: (n,) whose pixel each landmark has got; used: (n,) whether it counts.
+    """Result of the test. order: (n,) the landmark whose pixel each one gets; used: (n,) whether it is used.
 
     solution: None where no pose explains anything, or all fit hopelessly. changes: in words. cause: why the result is
     not to be trusted.
@@ -55,20 +55,20 @@ class LandmarkCheck:
 
     @property
     def state(self) -> tuple[str, ...]:
-        """Of each landmark: used, reassigned, excluded."""
+        """State of each landmark: used, reassigned or excluded."""
         moved_away = self.order != np.arange(len(self.order))
         return tuple(np.where(self.used, np.where(moved_away, "reassigned", "used"), "excluded").tolist())
 
 
 def passes(solution: Solution | None, probability: float) -> bool:
-    """Whether a pose explains the landmarks: one that could be no other always does."""
+    """Whether a pose explains the landmarks; without degrees of freedom it always does."""
     if solution is None:
         return False
     return solution.freedom <= 0 or _chance_above(solution.freedom, solution.cost) >= 1 - probability
 
 
 def _chance_above(freedom: int, value: float) -> float:
-    """How likely a chi-squared variable lies above a value."""
+    """Probability that a chi-squared variable exceeds a value."""
     from scipy.special import chdtrc  # 25 MB that only landmarks need
 
     return float(chdtrc(freedom, value))
@@ -101,7 +101,7 @@ def check_landmarks(
         tried = []
         for order, used in hypotheses(marks, camera, expected):
             if not expected.known[:6].any() and used.sum() < min(ENOUGH_ALONE, n - 1):
-                # Of six whose names are all wrong, some four fit a pose that is wrong as well.
+                # Of six with all names wrong, some four fit a wrong pose.
                 continue
             solution = find_pose(reorder_pixels(marks, order), camera, expected, used)
             if solution is not None and solution.freedom > 0 and passes(solution, probability):
@@ -129,11 +129,10 @@ def check_landmarks(
 
 
 def reorder_pixels(marks: LandmarkObservations, order: Int[np.ndarray, "n"]) -> LandmarkObservations:
-    """The landmarks with one another's pixels."""
+    """The landmarks with their pixels exchanged."""
     return replace(marks, image_px=marks.image_px[order], pixel_sigma=marks.pixel_sigma[order])
 
 
-# --------------------------------------------------------------------------------------------------------------------
 # What may be wrong.
 
 
@@ -169,7 +168,7 @@ def _without(n: int, rows: set[int]) -> Hypothesis:
 
 
 def _assigned(marks: LandmarkObservations, camera: Camera, expected: Expected) -> np.ndarray | None:
-    """Pixels to landmarks, the nearest in sum, once the shift that all have in common is taken away."""
+    """Assignment of pixels to landmarks after their common shift is removed."""
     seen = _predicted(marks, camera, expected)[0]
     if not expected.known.all() or not np.isfinite(seen).all():
         return None
@@ -202,9 +201,9 @@ def _predicted(marks: LandmarkObservations, camera: Camera, expected: Expected) 
 def _best_first(
     hypotheses: list[Hypothesis], marks: LandmarkObservations, camera: Camera, expected: Expected
 ) -> Iterator[Hypothesis]:
-    """The few hypotheses that explain most, by the sum of squares to first order about what is expected."""
+    """The hypotheses with the least sum of squares to first order, best first."""
     if len(hypotheses) <= FITTED or not expected.known.all():
-        # Nothing to predict by: where no heading is known, say, only the full fit tells.
+        # No prediction, as without a heading: all are fitted in full.
         yield from hypotheses
         return
     seen, slopes = _predicted(marks, camera, expected)
@@ -227,7 +226,6 @@ def _best_first(
         yield hypotheses[row]
 
 
-# --------------------------------------------------------------------------------------------------------------------
 # Words.
 
 

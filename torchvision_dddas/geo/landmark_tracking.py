@@ -1,4 +1,4 @@
-"""Landmarks in the picture: found by their colours, told from targets, followed.
+"""Landmarks in the picture: found by their colours, separated from targets, and tracked.
 
 Source: appendix A, IV-A. Beyond it: patches of a landmark's colour that are something else, blobs that hold a landmark
 and a person, and landmarks that the picture's border cuts.
@@ -15,11 +15,11 @@ from torchvision_dddas.geo.ranging import touches_border
 from torchvision_dddas.geometry import beside, centres_of, cheapest, covering, inside, transfer
 from torchvision_dddas.types import Detections
 
-# A blob that is this many times larger for its colour than usual holds something beside the landmark.
+# A blob this many times larger than usual for its colour holds something beside the landmark.
 _SHARED = 1.8
 # A vehicle's blob is no longer than it, but for its shadow; and its middle no further from the colour than this share.
 _LONGER, _WITHIN = 1.25, 0.6
-# Blobs of the last so many frames say what is usual; fewer than the second number say nothing.
+# Frames whose blobs define the usual size, and the fewest that do.
 _MEMORY, _ENOUGH = 25, 3
 
 
@@ -48,7 +48,7 @@ def separate(
                 match[row] = np.where(near & free, distance[row], np.inf).argmin()
                 free[match[row]] = False
         return match
-    # One pair more is worth more than any saving of distance.
+    # One more pair outweighs any saving of distance.
     missing = 1.0 + parameters.reach_px * (min(distance.shape) + 1)
     rows, columns = cheapest(np.where(within, distance, missing))
     good = within[rows, columns]
@@ -83,7 +83,7 @@ def _of_vehicles(at_px: np.ndarray, length_px: np.ndarray, boxes: np.ndarray) ->
 
 @dataclass
 class _Coupling:
-    """What is known of a landmark's blob: its place in the picture of the frame before, NaN where there was none."""
+    """State of a landmark's blob; blob_px: in the last frame, NaN if there was none."""
 
     blob_px: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
     coupled: bool = False
@@ -91,7 +91,7 @@ class _Coupling:
 
 
 class LandmarkTracker:
-    """Finds landmarks in picture after picture.
+    """Finds landmarks in successive pictures.
 
     Of each colour the patch counts that is large, is where the landmark was, and has something moving at it. Every
     interval_frames landmarks are told from targets anew; between, a landmark's blob is the one where it is predicted.
@@ -168,7 +168,7 @@ class LandmarkTracker:
             found = find_patches(mask, self._parameters.least_area_px)
             colour.advance(now_from_before)
             colour.see(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)))
-        # Vehicles of one team wear plates of like size: what others wear says what to look for.
+        # Plates of one team are alike in size: those of others tell the usual size.
         usual = np.inf
         for _ in range(2):
             for colour, where in zip(self._colours, expected, strict=True):
@@ -183,7 +183,7 @@ class LandmarkTracker:
     def _couple(
         self, colour: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
     ) -> np.ndarray:
-        """Which blob is each landmark's: told anew, or the one where it is predicted.
+        """Which blob is each landmark's: matched anew, or the one at its prediction.
 
         near: (K, N) bool, the blobs at or beside its colour: others are people who walk near a vehicle that is not
         seen to move. Where the colour is hidden any will do.
@@ -197,7 +197,7 @@ class LandmarkTracker:
         for k, (coupling, candidates) in enumerate(zip(self._blobs, self._colours, strict=True)):
             if not coupling.coupled:
                 continue
-            # A blob that was lost, as when the vehicle stood still, comes back at the colour.
+            # A lost blob, as of a vehicle that stood still, returns at the colour.
             predicted[k] = colour[k]
             if np.isfinite(coupling.blob_px).all():
                 moved = coupling.blob_px
@@ -230,19 +230,19 @@ class LandmarkTracker:
         return shared
 
 
-# What speaks for a patch, in logarithms of its area: something moves at it; it has travelled over the ground; it is the
-# landmark already. Against it, at most: it is far from where the landmark should be.
+# Score of a patch, in logarithms of its area: for motion at it; for its travel over the ground; for being the
+# landmark already. Greatest penalty for its distance from the expected place.
 _BLOB, _TRAVEL, _LOCK, _FAR = 2.0, 3.0, 1.0, 4.0
 # A patch of this many times the usual area is no better than one of half as many, and one that fills its box by less
 # than this is a shadow or a roof's edge rather than a vehicle's plate.
 _LARGE, _FILL = 2.0, 0.5
-# How much a new frame changes a velocity, an area, a share of frames.
+# Gain of a new frame in velocity, area and share of frames with motion.
 _GAIN = 0.3
-# So many patches of a colour are followed.
+# Most patches of a colour that are tracked.
 _MOST = 16
-# By so much more must speak for the best patch than for the next before it is taken for the landmark.
+# Margin by which the best patch must beat the next one to be taken for the landmark.
 _MARGIN = 1.0
-# Only patches of at least this logarithm less than its size can be taken for it.
+# Patches smaller than the best by more than this logarithm are no rivals.
 _ALIKE = 2.0
 
 
@@ -266,12 +266,12 @@ class TrackedPatch:
 
     @property
     def fill(self) -> float:
-        """Share of its box that it fills: half for a square on its corner."""
+        """Share of its box that it fills; half for a square on its corner."""
         return float(self.area_px / self.box_px[2:].prod())
 
     @property
     def travelled(self) -> float:
-        """How far it went over the ground, in its own sizes, up to 1."""
+        """Distance that it went over the ground, in its own sizes, up to 1."""
         return float(min(np.linalg.norm(self.centre_px - self.origin_px) / np.sqrt(self.area_px), 1.0))
 
 
@@ -286,7 +286,7 @@ class ColourTracker:
         self._blind = False
 
     def advance(self, now_from_before: np.ndarray | None) -> None:
-        """Go on to the next picture; without the background's motion patches are looked for further around."""
+        """Go on to the next picture. Without the background's motion, patches are searched further around."""
         self._blind = now_from_before is None
         if now_from_before is not None and self._all:
             places = np.array([(one.centre_px, one.origin_px) for one in self._all])
@@ -324,7 +324,7 @@ class ColourTracker:
             self.lock, self.sure = None, False
 
     def _foremost(self, found: Patches) -> np.ndarray:
-        """The rows of the patches worth following, however many shadows there are."""
+        """The rows of the most likely patches."""
         area, near = found.area_px, np.zeros(len(found), bool)
         if self.lock is not None:
             area = np.minimum(area, _LARGE * self.lock.area_px)
@@ -333,7 +333,7 @@ class ColourTracker:
         return np.lexsort((-area * np.minimum(fill / _FILL, 1.0) ** 4, ~near))[:_MOST]
 
     def _continue(self, found: Patches, rows: np.ndarray) -> dict[int, int]:
-        """Which patch goes on with which candidate, by the candidate's id."""
+        """The patch that continues each candidate, by the candidate's id."""
         if not self._all or not len(rows):
             return {}
         before = np.array([one.centre_px for one in self._all])
@@ -370,7 +370,7 @@ class ColourTracker:
         return float(np.log(min(one.area_px, _LARGE * usual_px)))
 
     def _signs(self, one: TrackedPatch, expected_px: np.ndarray, usual_px: float) -> float:
-        """What speaks for a candidate beside its size."""
+        """Score of a candidate without its size."""
         score = 4 * np.log(min(one.fill / _FILL, 1.0)) + _BLOB * one.moving + _TRAVEL * one.travelled
         if np.isfinite(usual_px):
             score -= max(np.log(one.area_px / (_LARGE * usual_px)), 0.0)

@@ -11,9 +11,9 @@ import numpy as np
 from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.types import Adjustment, LandmarkObservations, Landmarks
 
-# Reports that are further apart than this many times their usual distance have a dropout between them.
+# Reports further apart than this many times their usual distance have a dropout between them.
 _SLACK = 1.5
-# The reports of this last time tell how fast a landmark goes.
+# A landmark's velocity is fitted to the reports of this time.
 _PACE_S = 5.0
 
 
@@ -174,11 +174,11 @@ class LandmarkTrajectories:
         return float(np.hypot(sigma_m, self._parameters.drift_m_s * frames / self._rate_hz))
 
 
-# Landmarks count as well detected again once they are slower than this share of the speed at which they are not.
+# Hysteresis: landmarks count as well detected again below this share of poor_speed_m_s.
 _CALM = 0.8
-# Others are taken for the landmarks in use once they are spread better by this factor.
+# Other landmarks replace those in use once they are spread better by this factor.
 _BETTER = 1.25
-# Of more landmarks than this, only so many that lie far apart are tried.
+# Of more landmarks than this, only this many that lie far apart are tried.
 _TRIED = 12
 
 

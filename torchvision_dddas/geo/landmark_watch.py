@@ -1,4 +1,4 @@
-"""Landmarks in the pictures of a clip: found by their colours or by the table's own word, and kept from the targets."""
+"""Landmarks in the pictures of a clip: found by their colours or given by the table, and removed from the targets."""
 
 import time
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ _VEHICLE_REST = 4
 
 @dataclass(frozen=True)
 class WatchedScene:
-    """A scene without the landmarks, how it lies on the ground, and by what each of its landmarks was seen."""
+    """A scene without the landmarks, its fix, and by what each landmark was found: motion, colour or table."""
 
     scene: Scene
     fixed: FrameFix
@@ -33,12 +33,12 @@ class WatchedScene:
 
 
 def without_pixels(landmarks: Landmarks) -> Landmarks:
-    """Without what the table says of places in pictures: colours tell them."""
+    """The landmarks without their pixels in the table, for search by colour."""
     return replace(landmarks, image_px=np.full_like(landmarks.image_px, np.nan))
 
 
 def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -> None:
-    """Raises InputError where no picture could be laid on the ground by what is given.
+    """Raises InputError where the landmarks and colours cannot locate any picture.
 
     helped: whether telemetry says where the camera is.
     """
@@ -62,10 +62,10 @@ def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -
 
 
 class LandmarkWatch:
-    """Takes the scenes of a clip in order, and keeps their landmarks from their targets."""
+    """Locates the scenes of a clip in order, and removes landmarks from their targets."""
 
     def __init__(self, locator: AerialLocator, colours: Colours | None, finder: ColourFinder | None) -> None:
-        """colours, finder: None where the table of landmarks says where pictures show them."""
+        """colours, finder: None where the table of landmarks gives their pixels."""
         self.locator, self._colours, self._finder = locator, colours, finder
         names = locator.site.landmarks.names
         self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
@@ -73,11 +73,11 @@ class LandmarkWatch:
         self._fix: Fix | None = None
 
     def restarted(self) -> "LandmarkWatch":
-        """The same, as before its first scene."""
+        """The same watch as before its first scene."""
         return LandmarkWatch(self.locator.restarted(), self._colours, self._finder)
 
     def update(self, scene: Scene) -> WatchedScene:
-        """The next scene."""
+        """The next scene, without its landmarks, and its fix."""
         start = time.perf_counter()
         frame = scene.frame.number
         marks = self.locator.landmarks_at(frame)
@@ -97,7 +97,7 @@ class LandmarkWatch:
         )
 
     def _found(self, scene: Scene, marks: LandmarkObservations) -> tuple[LandmarkObservations, Scene, tuple[str, ...]]:
-        """The landmarks with their places in the picture, the scene without them, and by what each was seen."""
+        """The landmarks with their pixels, the scene without them, and by what each was found."""
         assert self._tracker is not None
         assert self._finder is not None
         assert self._colours is not None
@@ -126,7 +126,7 @@ class LandmarkWatch:
         return marks, self._cut(scene, seen, length), tuple(by)
 
     def _from_bodies(self, marks: LandmarkObservations, moving: np.ndarray) -> LandmarkObservations:
-        """Blobs (n,) are of whole vehicles and their shadows; colours are at height_m, and stay as they are."""
+        """Move pixels of blobs, which include shadows, to the vehicle's feet; colours stay at height_m."""
         height = self.locator.settings.landmarks.height_m
         if not height or not moving.any():
             return marks
@@ -138,7 +138,7 @@ class LandmarkWatch:
         return replace(marks, up_m=up_m, image_px=pixels)
 
     def _cut(self, scene: Scene, seen: TrackedLandmarks, length_px: np.ndarray) -> Scene:
-        """The scene without the landmarks: the blobs that are theirs, and their part of those that they share."""
+        """The scene without the landmarks' own blobs, and without their part of shared ones."""
         parameters = self.locator.settings.landmarks
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
             return without_detections(scene, seen.rows)

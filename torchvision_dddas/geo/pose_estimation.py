@@ -15,17 +15,17 @@ from torchvision_dddas.geo.projection import axes_of, normalize, project_with_sl
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
-# Which of the seven of a pose turns the heading.
+# The element of a pose that turns the heading.
 HEADING = 2
-# A landmark is never known better than this: the curvature would be too steep to invert.
+# Least standard deviation of a landmark's place: below, the curvature could not be inverted.
 EXACT_M = 1e-3
 
 STEPS = 30
-# A step this small, squared and in standard deviations, is the last.
+# Squared length of the last step, in standard deviations.
 ENOUGH = 1e-5
 
 
-# A step that lessens the sum of squares by a smaller share is the last, too.
+# A step that reduces the sum of squares by a smaller share is the last, too.
 NO_BETTER = 1e-5
 # Steps of the places alone after each of all, where the telemetry does not hold the pose: pixels are so much finer
 # than places that the sum of squares lies in a bent valley, and straight steps along it would be short.
@@ -44,7 +44,7 @@ class Prior:
 
     @property
     def known(self) -> Bool[np.ndarray, "7"]:
-        """Of which of the seven something is known."""
+        """Which of the seven have a prior."""
         return np.diag(self.information) > 0
 
 
@@ -64,7 +64,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Solution:
-    """The likeliest pose. places: (n, 2) of the landmarks. covariance: (7 + 2n, 7 + 2n) of pose and places.
+    """The most likely pose. places: (n, 2) of the landmarks. covariance: (7 + 2n, 7 + 2n) of pose and places.
 
     correction: (7 + 2n,) what was added to what telemetry and the landmarks report, with correction_covariance.
     cost: the least sum of squares, in standard deviations; chi-square of `freedom` degrees where all is as expected.
@@ -86,7 +86,7 @@ def pose_prior(
     ground_up_m: float = 0.0,
     focal_known: bool = True,
 ) -> Prior | None:
-    """What telemetry says of the pose; None where it says neither place nor height nor how the camera looks.
+    """The prior of the pose by telemetry; None without place, height and angles.
 
     flight: its place in local metres. ground_up_m: height of the ground below, that the altitude is measured from.
     focal_known: the camera's focal length is given, not guessed from a field of view.
@@ -98,7 +98,7 @@ def pose_prior(
     if not (np.isfinite(place).any() or np.isfinite(angles).any()):
         return None
     sigma = np.full(7, np.inf)
-    # A heading without a pitch is no more than a guess of how the camera is tilted, and so is no angle at all.
+    # Without a pitch the tilt is no more than a guess.
     tilt = parameters.tilt_sigma_deg if np.isfinite(angles[1]) else parameters.tilt_guess_sigma_deg
     sigma[:2] = np.radians(tilt)
     sigma[2] = np.radians(parameters.heading_sigma_deg) if np.isfinite(angles[0]) else np.inf
@@ -112,14 +112,14 @@ def pose_prior(
 
 
 def focal_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:
-    """What is known without telemetry: the focal length."""
+    """The prior without telemetry: the focal length alone."""
     focal, sigma = _focal_of(float("nan"), camera, parameters, focal_known)
     pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(parameters.pitch_deg), 0.0), focal)
     return Prior(pose, np.diag([0.0] * 6 + [1 / max(sigma, 1e-6) ** 2]))
 
 
 def independent_expectation(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
-    """A pose and landmarks that have nothing to do with each other, as in a single picture."""
+    """The expectation of a single picture: pose and landmarks are independent."""
     n = len(sigma_m)
     information = np.zeros((7 + 2 * n, 7 + 2 * n))
     information[:7, :7] = prior.information
@@ -162,7 +162,7 @@ def fit_pose(
         for _ in range(0 if expected.known.all() else SETTLING):
             tried = problem.settled(tried)
         if tried is not None and tried.cost <= state.cost + 1e-9:
-            # What fits badly at best need not be known as finely.
+            # A bad fit need not be as precise.
             gain = min(gain, (state.cost - tried.cost) / (NO_BETTER * (1 + tried.cost)) * ENOUGH)
             state, damping = tried, damping / 10
         else:
@@ -250,7 +250,7 @@ class _Problem:
         try:
             step = np.linalg.solve(state.curvature[7:, 7:], state.downhill[7:])
         except np.linalg.LinAlgError:
-            # A wild pose has landmarks so near its horizon that nothing else counts.
+            # An absurd pose has landmarks so near its horizon that nothing else counts.
             return state
         nearer = self.at(state.pose, state.places + step.reshape(-1, 2))
         return nearer if nearer is not None and nearer.cost < state.cost else state
@@ -302,14 +302,14 @@ def _focal_of(hfov_rad: float, camera: Camera, parameters: AerialParameters, kno
     return 1.0, camera.focal_sigma if known else parameters.focal_guess_sigma
 
 
-# So many are tried where nothing else tells one.
+# Headings that are tried where nothing tells one.
 HEADINGS = 8
 
 
 def find_pose(
     marks: LandmarkObservations, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
 ) -> Solution | None:
-    """The likeliest of the poses that the starts at hand lead to; None where none does.
+    """The most likely of the poses found from all available starts; None without any.
 
     used: the landmarks whose pixels count; all without it.
     """
@@ -361,7 +361,7 @@ def _turned_about_up(marks: LandmarkObservations, camera: Camera, expected: Expe
 
 
 def _all_headings(expected: Expected) -> list[CameraPose]:
-    """With all known but the heading: looking every way."""
+    """Starts in all directions, where only the heading is unknown."""
     pose = move_pose(expected.reference, expected.mean[:7])
     turns = np.linspace(0, 2 * np.pi, HEADINGS, endpoint=False)
     return [replace(pose, axes=turned(np.array([0.0, 0.0, turn])) @ pose.axes) for turn in turns]
@@ -397,7 +397,7 @@ def of_homography(flat_from_ground: np.ndarray, camera: Camera, east_north_m: np
     if sine > 1e-6:
         turn = turned(axis / sine * np.arctan2(sine, normal @ mirrored))
         poses.append(_seen_so(turn @ first, matrix[:, 2], middle, float(up_m.mean())))
-    # Seen from below the ground it is no picture from the air.
+    # A pose below the ground is wrong.
     return [pose for pose in poses if pose.place_m[2] > 0]
 
 

@@ -45,12 +45,12 @@ def normalize(pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera) ->
 
 
 def undistort_pixels(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
-    """Where a lens without distortion would show what is at these pixels."""
+    """Pixels of the same points for a lens without distortion."""
     return normalize(pixels, 1.0, camera) * camera.focal_px + camera.centre_px
 
 
 def distort_pixels(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 2"]:
-    """The other way: where the lens shows what one without distortion would show at these pixels; NaN where nowhere."""
+    """Pixels as the lens shows them, from those of a lens without distortion; NaN where it shows none."""
     flat = (np.asarray(pixels, float).reshape(-1, 2) - camera.centre_px) / camera.focal_px
     return distort(flat, camera)[0] * camera.focal_px + camera.centre_px
 
@@ -58,7 +58,7 @@ def distort_pixels(pixels: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np
 def normalize_with_slopes(
     pixels: Float[np.ndarray, "N 2"], focal: float, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`lifted`, and how it grows with the pixel (N, 2, 2) and with the log of the focal length (N, 2)."""
+    """`normalize`, and its derivatives by the pixel (N, 2, 2) and by the log of the focal length (N, 2)."""
     flat = normalize(pixels, focal, camera)
     scale = np.array(camera.focal_px) * focal
     bent, by_flat = distort(flat, camera)
@@ -94,12 +94,11 @@ def project_with_slopes(
     return flat * scale + camera.centre_px, by_pose, by_point
 
 
-# --------------------------------------------------------------------------------------------------------------------
 # The lens.
 
 
 def distort(flat: Float[np.ndarray, "N 2"], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What the lens makes of (right, down) per metre of depth (N, 2), and how that grows (N, 2, 2).
+    """Distort (right, down) per metre of depth (N, 2); also the derivatives (N, 2, 2).
 
     NaN beyond the radius where the lens folds the picture back.
     """
@@ -129,7 +128,7 @@ def undistort(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray,
     for _ in range(20):
         slope = 1 + 3 * camera.k1 * radius**2 + 5 * camera.k2 * radius**4
         missing = bent - radius * (1 + camera.k1 * radius**2 + camera.k2 * radius**4)
-        # Beyond the radius where the lens folds the picture back nothing is seen twice.
+        # Beyond the radius where the lens folds the picture back there is no solution.
         radius = np.where(slope > 0.05, radius + missing / np.maximum(slope, 0.05), np.nan)
     grown = 1 + camera.k1 * radius**2 + camera.k2 * radius**4
     reached = np.abs(radius * grown - bent) < 1e-6
@@ -137,7 +136,7 @@ def undistort(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray,
 
 
 def inverse_2x2(matrices: Float[np.ndarray, "N 2 2"]) -> Float[np.ndarray, "N 2 2"]:
-    """Inverses written out: so small, one by one would take longer."""
+    """Inverses in closed form, which is faster for small matrices."""
     (a, b), (c, d) = np.moveaxis(matrices, (1, 2), (0, 1))
     return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), (0, 1), (1, 2))
 
@@ -151,7 +150,7 @@ def ground_from_rays(
     up_m: float | Float[np.ndarray, "N"] = 0.0,
     surface: Surface | None = None,
 ) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 2"]]:
-    """East and north of what pixels show, and their covariance; NaN where a ray meets no ground.
+    """East and north of what pixels show by rays, and their covariance; NaN where a ray meets no ground.
 
     covariance: of the pose, in the order of Fix. sigma_px: standard deviation of u and of v each. up_m: height of what
     is seen above the ground: the plane up = 0 or the surface.

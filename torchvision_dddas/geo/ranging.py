@@ -23,13 +23,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import undistort
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
-# However large a box is, its edges are no better known than this, in pixels.
+# Least standard deviation of a box's edges, in pixels.
 PIXEL_SIGMA = 0.5
-# What a box cut at its side misses the body's middle by, in box heights.
+# Standard deviation of the middle of a box cut at its side, in box heights.
 SIDE_SIGMA = 0.15
 # A box whose edge is this near the picture's border touches it.
 BORDER_PX = 1.0
-# A distance whose standard deviation is a larger share of it is none: the first order no longer tells its errors.
+# Largest relative standard deviation of a distance: beyond it the first order does not hold.
 COARSEST = 0.5
 
 
@@ -59,7 +59,6 @@ def range_people(
     return _placed(rays, inverse, share, by, camera, poses, east_north_m)
 
 
-# --------------------------------------------------------------------------------------------------------------------
 # Errors: each is a column, scaled to one standard deviation.
 
 FEET, TALL, SIDE, DISPUTE, BODY, EAST, NORTH, HEADING, PITCH, HEIGHT, FOCAL = range(11)
@@ -124,7 +123,7 @@ def _rays(box_px: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, par
 
 
 def touches_border(box_px: Float[np.ndarray, "N 4"], size_px: tuple[int, int]) -> Bool[np.ndarray, "N"]:
-    """Whether the picture's border may cut each body: for tables that do not say it."""
+    """Whether the picture's border may cut each body, for tables that do not say so."""
     box = np.asarray(box_px, float).reshape(-1, 4)
     low, high = box[:, :2], box[:, :2] + box[:, 2:]
     return (low <= BORDER_PX).any(axis=1) | (high >= np.array(size_px) - BORDER_PX).any(axis=1)
@@ -166,7 +165,7 @@ def _inverse_distance(
     share = share + np.where((weight == 1)[:, None], 0, (1 - weight[:, None]) * d_feet)
     excess = np.abs(by_height - by_feet) - parameters.gate_sigmas * np.sqrt((gap**2).sum(axis=1))
     share[:, DISPUTE] = np.where(by == "both", np.maximum(excess, 0) / 2, 0)
-    # nan compares false: what is not surely fine enough is none.
+    # NaN compares as false: such a distance is unknown.
     fine = (weighed > 0) & (np.sqrt((share**2).sum(axis=1)) < COARSEST * weighed)
     return np.where(fine, weighed, np.nan), share, np.where(fine, by, "bearing")
 

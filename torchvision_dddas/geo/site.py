@@ -1,4 +1,4 @@
-"""Landmarks, telemetry and the camera as they are before the first frame: on one plane, in one kind of place."""
+"""Landmarks, telemetry and camera before the first frame, in one system of local metres."""
 
 import math
 from dataclasses import dataclass, replace
@@ -105,7 +105,7 @@ def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> boo
 
 
 def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
-    """What was reported in degrees, in metres east and north of (longitude, latitude)."""
+    """Reports in degrees as metres east and north of (longitude, latitude)."""
     return replace(reports, place=geometry.east_north(reports.place, origin_deg), geographic=False)
 
 
@@ -139,7 +139,7 @@ def _check_near(landmarks: Landmarks, telemetry: Telemetry) -> None:
 
 
 def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> None:
-    """Raises InputError, with both spans, for telemetry that tells nothing of the time that is looked at."""
+    """Raises InputError, with both spans, for telemetry that does not overlap the clip or table."""
     first, last = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
     if last < from_s - HOLDS_S or first > to_s + HOLDS_S:
         raise InputError(
@@ -149,7 +149,7 @@ def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> N
 
 
 def describe_unknown_heights(site: Site) -> list[str]:
-    """What the user should know where no height is known of the vehicle, or of the ground below it or at landmarks."""
+    """Notes on unknown heights of the vehicle, and of the ground below it or at landmarks."""
     telemetry, notes = site.telemetry, []
     if site.elevation is None:
         level = telemetry is not None and not np.isfinite(telemetry.altitude_m).any()
@@ -201,7 +201,7 @@ def resolve_camera(
         if settings.aerial.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         sigma = settings.aerial.focal_sigma
-        # What is set by hand counts for more than the file.
+        # A value set by hand overrides the file.
         return camera if sigma == Settings().aerial.focal_sigma else replace(camera, focal_sigma=sigma), True, notes
     if size is None and settings.aerial.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
