@@ -13,12 +13,15 @@ if TYPE_CHECKING:
 
 # Public name -> the module that holds it, and its name there.
 _HOME = {
+    "AerialLocator": ("geo", "AerialLocator"),
+    "GroundLocator": ("geo", "GroundLocator"),
     "__version__": ("runtime", "VERSION"),
     "Adjustment": ("types", "Adjustment"),
     "Detections": ("types", "Detections"),
     "Frame": ("types", "Frame"),
     "InputError": ("errors", "InputError"),
     "MotionDetector": ("detection", "MotionDetector"),
+    "Pipeline": ("pipeline", "Pipeline"),
     "Registration": ("types", "Registration"),
     "Scene": ("types", "Scene"),
     "Settings": ("config", "Settings"),
