@@ -9,8 +9,7 @@ import pytest
 from tests.io.ground import tracks
 from tests.io.streamed import ABOUT, followed, surveyed
 from torchvision_dddas.io.maps.cot import cot
-from torchvision_dddas.io.streams.cot_events import CotEvents
-from torchvision_dddas.io.streams.mot_rows import PEOPLE_FROM, mot_rows
+from torchvision_dddas.io.streams.tool_messages import PEOPLE_FROM, CotEvents, mot_rows
 
 
 def test_people_have_rows_of_their_own_with_identities_that_no_target_has():
@@ -63,7 +62,7 @@ def test_what_is_remembered_of_targets_does_not_grow_with_time():
         assert found.grounded is not None
         at = replace(found.grounded.positions, target=np.array([k]))
         events(replace(found, grounded=replace(found.grounded, positions=at)))
-    assert len(events._told_s) <= 10
+    assert len(events._sent_s) <= 10
 
 
 @pytest.mark.parametrize("lonlat", [(np.nan, 32.0), (np.inf, 32.0), (-110.0, 91.0), (1e300, 0.0)])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
-from torchvision_dddas.io.streams.about import About
+from torchvision_dddas.io.streams.stream import About
 from torchvision_dddas.io.tables import compass_deg
 from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult, TrackedFrame
 

@@ -7,9 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.streams.about import About
-from torchvision_dddas.io.streams.outlet import Outlet
-from torchvision_dddas.io.streams.stream import Encoder, Stream, Tell
+from torchvision_dddas.io.streams.stream import About, Encoder, Outlet, Stream, Tell
 
 WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
 
@@ -87,7 +85,7 @@ def _encoder(kind: str, about: About, asked: str) -> Encoder:
 
         return lambda surveyed, people, age_s, most_bytes: json_lines(surveyed, people, about, age_s, most_bytes)
     if kind == "mot":
-        from torchvision_dddas.io.streams.mot_rows import mot_rows
+        from torchvision_dddas.io.streams.tool_messages import mot_rows
 
         return lambda surveyed, people, age_s, most_bytes: mot_rows(surveyed, people, most_bytes)
     if not about.geographic:
@@ -97,7 +95,7 @@ def _encoder(kind: str, about: About, asked: str) -> Encoder:
         )
     if not about.clock:
         raise InputError(f"{asked}: such events need the time of day, and neither input nor telemetry tells it")
-    from torchvision_dddas.io.streams.cot_events import CotEvents
+    from torchvision_dddas.io.streams.tool_messages import CotEvents
 
     events = CotEvents(about)
     return lambda surveyed, people, age_s, most_bytes: events(surveyed)

@@ -1,4 +1,4 @@
-"""A stream: frames in, messages out, and what to do while nobody takes them."""
+"""A stream of messages: frames in, messages out, and retries while nobody takes them."""
 
 import math
 import os
@@ -6,9 +6,9 @@ import re
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from torchvision_dddas.io.streams.outlet import Outlet
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
 Tell = Callable[[str, str], object]
@@ -16,6 +16,48 @@ Tell = Callable[[str, str], object]
 
 _TELL_S, _SELDOM_S = 30.0, 3600.0  # between two words on the same loss, at first and at last
 _NUMBER = re.compile(r"\d+")
+
+
+@dataclass
+class About:
+    """What hardly changes from frame to frame.
+
+    start_utc_s: seconds since 1970 at time_s = 0, NaN while no clock is known. A live run sets it with its first
+    picture, and again when the machine's clock is set. clock: whether it will be known. geographic: whether targets get
+    longitudes and latitudes. landmarks: their names. source: what the run is called in Cursor-on-Target events.
+    """
+
+    start_utc_s: float = float("nan")
+    geographic: bool = False
+    landmarks: tuple[str, ...] = ()
+    source: str = "dddas"
+    clock: bool = True
+
+
+class Outlet(Protocol):
+    """A place that takes messages, one after another, without ever waiting long.
+
+    most_bytes: of a message; 0: any. lost: messages that nobody got so far; reason: why the last of them, in words.
+    """
+
+    most_bytes: int
+    lost: int
+    reason: str
+
+    def put(self, messages: Sequence[bytes]) -> None:
+        """Keep messages until they can be sent. What is kept is bounded: then the oldest are lost."""
+
+    def flush(self) -> None:
+        """Send what is kept as far as it is taken now, each message whole or not at all. Raises OSError on trouble."""
+
+    def mend(self) -> None:
+        """After trouble: make ready to send again. Raises OSError if it cannot."""
+
+    def handle(self) -> int | None:
+        """A new descriptor of the file that was written, for whoever puts it on the disk; None where there is none."""
+
+    def close(self) -> None:
+        """Send what can be sent soon and count the rest as lost. Never raises."""
 
 
 class Encoder(Protocol):
