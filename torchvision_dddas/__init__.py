@@ -27,6 +27,8 @@ _HOME = {
     "Settings": ("config", "Settings"),
     "Telemetry": ("types", "Telemetry"),
     "load_settings": ("config", "load_config"),
+    "PersonDetector": ("people", "PersonDetector"),
+    "Tracker": ("tracking", "Tracker"),
 }
 
 __all__ = ["open_source", "open_video", *_HOME]
