@@ -12,7 +12,7 @@ import numpy as np
 
 from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.detection.engine import View
-from torchvision_dddas.detection.registration import cell_side, judge_registration, match_exposure
+from torchvision_dddas.detection.registration import cell_side, judge_points, match_exposure
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
@@ -127,18 +127,14 @@ def _register_points(
     earlier: View, later: View, start: np.ndarray, parameters: RegistrationParameters, predicted: np.ndarray | None
 ) -> tuple[Registration, np.ndarray]:
     """The registration and its inliers' places in the later frame."""
-    size, end, tracked = earlier.size, start, np.zeros(len(start), bool)
+    end, tracked = start, np.zeros(len(start), bool)
     if len(start) >= 4:
         end, found, missed_px = track_both_ways(*match_exposure(earlier, later), start, parameters, predicted)
         tracked = found & (missed_px <= parameters.forward_backward_px)
     start, end = start[tracked], end[tracked]
-    if len(start) < 4:
-        return judge_registration(np.eye(3), len(start), 0, np.inf, size, parameters), end
-    later_from_earlier = fit_motion(start, end, parameters)
-    miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
-    inliers = miss < parameters.ransac_px
-    error = float(np.median(miss[inliers])) if inliers.any() else np.inf
-    return judge_registration(later_from_earlier, len(start), int(inliers.sum()), error, size, parameters), end[inliers]
+    later_from_earlier = fit_motion(start, end, parameters) if len(start) >= 4 else np.eye(3)
+    registration, inliers = judge_points(later_from_earlier, start, end, earlier.size, parameters)
+    return registration, end[inliers]
 
 
 def track_both_ways(

@@ -99,27 +99,34 @@ def _median_size(difference: np.ndarray) -> float:
     return float((size[(len(size) - 1) // 2] + size[len(size) // 2]) / 2)
 
 
-def judge_registration(
+def judge_points(
     later_from_earlier: np.ndarray,
-    tracked: int,
-    inliers: int,
-    error_px: float,
+    start: np.ndarray,
+    end: np.ndarray,
     size: tuple[int, int],
     parameters: RegistrationParameters,
-) -> Registration:
-    """The record of a registration, with a cause in words where nothing may be concluded from it.
+) -> tuple[Registration, np.ndarray]:
+    """The record of a registration, with a cause in words where nothing may be concluded from it; and its inliers.
 
-    size: (width, height).
+    start, end: (N, 2) tracked keypoints in the earlier and the later frame; fewer than four make it unreliable,
+    whatever the matrix. size: (width, height).
     """
-    cause = ""
+    tracked, error_px = len(start), float("inf")
+    if tracked < 4:
+        later_from_earlier, inliers = np.eye(3), np.zeros(tracked, bool)
+    else:
+        miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
+        inliers = miss < parameters.ransac_px
+        error_px = float(np.median(miss[inliers])) if inliers.any() else error_px
+    count, cause = int(inliers.sum()), ""
     if tracked < parameters.min_inliers:
         cause = f"only {tracked} keypoints could be followed, {parameters.min_inliers} wanted"
-    elif inliers < parameters.min_inliers or inliers < parameters.min_inlier_share * tracked:
-        cause = f"only {inliers} of {tracked} keypoints agree on one background motion"
+    elif count < parameters.min_inliers or count < parameters.min_inlier_share * tracked:
+        cause = f"only {count} of {tracked} keypoints agree on one background motion"
     elif not is_plausible(later_from_earlier, size):
         cause = "the background motion found is not one of a camera"
     flow = background_flow(later_from_earlier, size) if not cause else float("nan")
-    return Registration(later_from_earlier, tracked, inliers, error_px, flow, not cause, cause)
+    return Registration(later_from_earlier, tracked, count, error_px, flow, not cause, cause), inliers
 
 
 def is_plausible(later_from_earlier: np.ndarray, size: tuple[int, int]) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,15 +11,16 @@ from torch.nn import functional
 
 from torchvision_dddas.config import RegistrationParameters
 from torchvision_dddas.detection.engine import View
-from torchvision_dddas.detection.registration import cell_side, judge_registration, match_exposure
+from torchvision_dddas.detection.registration import cell_side, judge_points, match_exposure
 from torchvision_dddas.functional import affine, consensus, flow, homography, keypoints
-from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
 LEVEL = 255.0
 POINTS_AT_ONCE = {"cpu": 1000, "cuda": 100_000}
 # So many points search for the motion first; the others start where it takes them.
 SCOUTS = 32
+# Gates of the refits, in RANSAC's tolerance; they matter most for accuracy.
+REFITS = (1.5, 1.0, 0.5, 0.5)
 
 
 def register(
@@ -31,37 +32,40 @@ def register(
     """
     for earlier, _ in pairs:
         _detect(earlier, parameters, device)
-    followed = [_match_exposures(earlier, later) for earlier, later in pairs]
-    _build_pyramids([view for pair in followed for view in pair], parameters, device)
+    matched = [_match_exposures(earlier, later) for earlier, later in pairs]
+    _build_pyramids([view for pair in matched for view in pair], parameters, device)
     count = max(pairs[0][0].kept["points"].shape[1], 1)
     step = max(1, POINTS_AT_ONCE.get(device.type, 1000) // count)
     found: list[Registration] = []
     for first in range(0, len(pairs), step):
         part = np.s_[first : first + step]
-        found += _register_at_once([earlier for earlier, _ in pairs[part]], followed[part], parameters)
+        found += _register_at_once([earlier for earlier, _ in pairs[part]], matched[part], parameters)
     return found
 
 
 def _register_at_once(
-    detected: list[View], followed: list[tuple[View, View]], parameters: RegistrationParameters
+    detected: list[View], pairs: list[tuple[View, View]], parameters: RegistrationParameters
 ) -> list[Registration]:
-    """detected: the frames that hold the keypoints. followed: the same frames and the later ones, in one light."""
+    """detected: the frames that hold the keypoints. pairs: the same frames and the later ones, in equal exposure."""
     points, valid = (join_batch([view.kept[name] for view in detected]) for name in ("points", "valid"))
     earlier, later = (
-        [join_batch(level) for level in zip(*(pair[i].kept["pyramid"] for pair in followed), strict=True)]
-        for i in (0, 1)
+        [join_batch(level) for level in zip(*(pair[i].kept["pyramid"] for pair in pairs), strict=True)] for i in (0, 1)
     )
     if points.shape[1]:
-        end, found, matrices = track_points(points, valid, earlier, later, parameters)
+        end, found, matrices = _track_points(_Batch(points, valid, earlier, later), parameters)
         tracked = valid & found
     else:
         end, tracked, matrices = points, valid, torch.eye(3).expand(len(detected), 3, 3)
-    arrays = (array.cpu().numpy() for array in (points, end, valid, tracked, matrices))
-    return [_judge(one, detected[0].size, parameters) for one in zip(*arrays, strict=True)]
+    arrays = (array.cpu().numpy() for array in (points, end, tracked, matrices.double()))
+    size = detected[0].size
+    return [
+        judge_points(matrix, start[kept], end[kept], size, parameters)[0]
+        for start, end, kept, matrix in zip(*arrays, strict=True)
+    ]
 
 
 def _match_exposures(earlier: View, later: View) -> tuple[View, View]:
-    """The pair as it is followed: where exposures differ, one of the two is a view of its own."""
+    """The pair in equal exposure: where exposures differ, one of the two is a view of its own."""
     greys = match_exposure(earlier, later)
     first, second = (
         view if grey is view.grey else View(view.image, grey)
@@ -71,7 +75,7 @@ def _match_exposures(earlier: View, later: View) -> tuple[View, View]:
 
 
 def _build_pyramids(views: list[View], parameters: RegistrationParameters, device: torch.device) -> None:
-    """Those that are not there yet, in one batch."""
+    """Build the missing pyramids in one batch."""
     missing = list({id(view): view for view in views if "pyramid" not in view.kept}.values())
     if not missing:
         return
@@ -85,7 +89,7 @@ def _build_pyramids(views: list[View], parameters: RegistrationParameters, devic
 
 
 def _detect(view: View, parameters: RegistrationParameters, device: torch.device) -> None:
-    """Keypoints, at half the resolution where the onboard engine looks for them so, at a quarter of the cost."""
+    """Detect keypoints, at half the resolution where the onboard engine does so, at a quarter of the cost."""
     if "points" in view.kept:
         return
     levels, cell, step = levels_of(view, device), cell_side(*view.size, parameters), 1
@@ -96,19 +100,6 @@ def _detect(view: View, parameters: RegistrationParameters, device: torch.device
         levels, cell, parameters.quality, parameters.block_px, least=1e-7 * LEVEL**2
     )
     view.kept["points"], view.kept["valid"] = step * points, valid
-
-
-def _judge(found: tuple[np.ndarray, ...], size: tuple[int, int], parameters: RegistrationParameters) -> Registration:
-    start, end, valid, tracked, later_from_earlier = found
-    start, end = start[tracked], end[tracked]
-    if valid.sum() < 4 or len(start) < 4:
-        return judge_registration(np.eye(3), len(start) if valid.sum() >= 4 else 0, 0, np.inf, size, parameters)
-    miss = np.linalg.norm(transfer(later_from_earlier, start) - end, axis=1)
-    inliers = miss < parameters.ransac_px
-    error = float(np.median(miss[inliers])) if inliers.any() else np.inf
-    return judge_registration(
-        later_from_earlier.astype(np.float64), len(start), int(inliers.sum()), error, size, parameters
-    )
 
 
 def levels_of(view: View, device: torch.device) -> Tensor:
@@ -124,88 +115,78 @@ def join_batch(pictures: Sequence[Tensor]) -> Tensor:
     return pictures[0] if len(pictures) == 1 else torch.cat(list(pictures))
 
 
-def track_points(
-    points: Tensor, valid: Tensor, earlier: list[Tensor], later: list[Tensor], parameters: RegistrationParameters
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the points are in the later frames, which were found, and the motion (B, 3, 3) that they agree on.
+class _Batch(NamedTuple):
+    """points: (B, N, 2) keypoints, valid (B, N) which are there. earlier, later: pyramids."""
 
-    A few scouts search the whole pyramid; the others start where the scouts' motion takes them, which is quicker by
-    far. Where the scouts do not agree, all points search the whole pyramid.
+    points: Tensor
+    valid: Tensor
+    earlier: list[Tensor]
+    later: list[Tensor]
+
+    def select(self, chosen: Tensor) -> "_Batch":
+        earlier, later = ([level[chosen] for level in pyramid] for pyramid in (self.earlier, self.later))
+        return _Batch(self.points[chosen], self.valid[chosen], earlier, later)
+
+
+Tracked = tuple[Tensor, Tensor, Tensor]
+"""Where the points are in the later frames, which were found, and the motion (B, 3, 3) that they agree on."""
+
+
+def _track_points(batch: _Batch, parameters: RegistrationParameters) -> Tracked:
+    """Lucas-Kanade and RANSAC.
+
+    A few scouts search the whole pyramid; the others start where the scouts' motion takes them, which is much faster.
+    Where the scouts do not agree, all points search the whole pyramid.
     """
+    points, valid = batch.points, batch.valid
     if points.shape[1] < 2 * SCOUTS:
-        return _from_nothing(points, valid, earlier, later, parameters)
+        return _search_everywhere(batch, parameters)
     scouts = consensus.spread(valid, SCOUTS)
     start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
-    # Scouts only lead: whoever is not there after a few steps does not count.
-    ahead, found = flow.track(start, earlier, later, rounds=2, **_tracking(parameters, most_steps=8))
+    # A scout that has not arrived after a few steps does not count.
+    ahead, found = flow.track(start, batch.earlier, batch.later, rounds=2, **_settings(parameters, most_steps=8))
     found = found & valid.gather(1, scouts)
     motion = _ransac(start.double(), ahead.double(), found, parameters, parameters.hypotheses // 2, (1.5, 1.0)).float()
     near = found & (consensus.transfer_error(motion, start, ahead) < parameters.ransac_px)
     agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
     end, kept, motion = torch.zeros_like(points), torch.zeros_like(valid), motion.double()
-    for choice, search in ((agreed, _from_guess), (~agreed, _from_nothing)):
+    for choice, search in ((agreed, _search_near), (~agreed, _search_everywhere)):
         chosen = choice.nonzero()[:, 0]
         if len(chosen) == len(points):
-            return search(points, valid, earlier, later, parameters, motion)
+            return search(batch, parameters, motion)
         if len(chosen):
-            pyramids = [level[chosen] for level in earlier], [level[chosen] for level in later]
-            end[chosen], kept[chosen], motion[chosen] = search(
-                points[chosen], valid[chosen], *pyramids, parameters, motion[chosen]
-            )
+            end[chosen], kept[chosen], motion[chosen] = search(batch.select(chosen), parameters, motion[chosen])
     return end, kept, motion
 
 
-def _from_nothing(
-    points: Tensor,
-    valid: Tensor,
-    earlier: list[Tensor],
-    later: list[Tensor],
-    parameters: RegistrationParameters,
-    _: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _search_everywhere(batch: _Batch, parameters: RegistrationParameters, _: Tensor | None = None) -> Tracked:
     """Lucas-Kanade through the whole pyramid, then RANSAC."""
-    settings = _tracking(parameters) | {"rounds": 3}
-    end, found = _there_and_back(points, earlier, later, None, parameters, settings)
-    motion = _ransac(
-        points.double(), end.double(), valid & found, parameters, parameters.hypotheses, (1.5, 1.0, 0.5, 0.5)
-    )
-    return end, found, motion
+    end, found = _track(batch, None, parameters, _settings(parameters) | {"rounds": 3})
+    start, valid = batch.points.double(), batch.valid & found
+    return end, found, _ransac(start, end.double(), valid, parameters, parameters.hypotheses, REFITS)
 
 
-def _from_guess(
-    points: Tensor,
-    valid: Tensor,
-    earlier: list[Tensor],
-    later: list[Tensor],
-    parameters: RegistrationParameters,
-    motion: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _search_near(batch: _Batch, parameters: RegistrationParameters, motion: Tensor) -> Tracked:
     """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
-    guess = consensus.transfer(motion.float(), points)
-    settings = _tracking(parameters, most_steps=10) | {"reach_px": 3}
-    end, found = _there_and_back(points, earlier[:1], later[:1], guess, parameters, settings)
-    gates_px = tuple(share * parameters.ransac_px for share in (1.5, 1.0, 0.5, 0.5))
-    model = _model(parameters)
-    refits = consensus.refit(
-        points.double(), end.double(), valid & found, motion, gates_px, model.SAMPLE_SIZE, model.fit
-    )
-    return end, found, refits
+    finest = batch._replace(earlier=batch.earlier[:1], later=batch.later[:1])
+    guess = consensus.transfer(motion.float(), batch.points)
+    end, found = _track(finest, guess, parameters, _settings(parameters, most_steps=10) | {"reach_px": 3})
+    gates_px = tuple(share * parameters.ransac_px for share in REFITS)
+    model, start = _model(parameters), batch.points.double()
+    valid = batch.valid & found
+    return end, found, consensus.refit(start, end.double(), valid, motion, gates_px, model.SAMPLE_SIZE, model.fit)
 
 
-def _there_and_back(
-    points: Tensor,
-    earlier: list[Tensor],
-    later: list[Tensor],
-    guess: Tensor | None,
-    parameters: RegistrationParameters,
-    settings: dict[str, Any],
+def _track(
+    batch: _Batch, guess: Tensor | None, parameters: RegistrationParameters, settings: dict[str, Any]
 ) -> tuple[Tensor, Tensor]:
-    if parameters.forward_backward_px > 0:
-        return flow.forward_backward(points, earlier, later, guess, limit_px=parameters.forward_backward_px, **settings)
-    return flow.track(points, earlier, later, guess, **settings)
+    pictures, limit_px = (batch.points, batch.earlier, batch.later), parameters.forward_backward_px
+    if limit_px > 0:
+        return flow.forward_backward(*pictures, guess, limit_px=limit_px, **settings)
+    return flow.track(*pictures, guess, **settings)
 
 
-def _tracking(parameters: RegistrationParameters, most_steps: int = 1000) -> dict[str, Any]:
+def _settings(parameters: RegistrationParameters, most_steps: int = 1000) -> dict[str, Any]:
     return {
         "window_px": parameters.window_px,
         "iterations": min(parameters.iterations, most_steps),
@@ -226,10 +207,7 @@ def _ransac(
     hypotheses: int,
     shares: tuple[float, ...],
 ) -> Tensor:
-    """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own.
-
-    The refits matter most for accuracy.
-    """
+    """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own."""
     model = _model(parameters)
     batch, count = tracked.shape
     if count < model.SAMPLE_SIZE:
