@@ -85,7 +85,7 @@ def _pixels(box: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int
 
 
 Box = tuple[int, int, int, int]
-# Masks are looked over in blocks of this side, px.
+# Masks are searched in blocks of this side, px.
 _BLOCK_PX = 16
 
 
@@ -247,8 +247,8 @@ def about_up(rotation: np.ndarray) -> np.ndarray:
 def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """Rows, ascending, and the column of each: min(N, M) pairs of the least sum of finite costs."""
     cost = np.asarray(cost, float)
-    # Where nobody's best is anyone else's, no sum is less. SciPy's `optimize` takes 0.5 s and 45 MB to load, as much as
-    # the rest of a run onboard: it waits until two want the same.
+    # Where all rows have different best columns, no sum is less. SciPy's `optimize` takes 0.5 s and 45 MB to load, as
+    # much as the rest of a run onboard: it is loaded when two rows have the same best column.
     tall = cost.shape[0] > cost.shape[1]
     best = (cost.T if tall else cost).argmin(axis=1) if cost.size else np.zeros(0, np.int64)
     if len(np.unique(best)) == len(best):

@@ -1,4 +1,4 @@
-"""Motion history (appendix B, step S5): when each place last moved, and what that tells of blobs.
+"""Motion history (appendix B, step S5): when each place last moved, and what follows for blobs.
 
 A blob leaves a trail in the history, which gives its heading and speed. Where its trail falls into regions that point
 clearly different ways, the blob is several targets that touch.

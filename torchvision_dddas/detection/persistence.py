@@ -53,7 +53,7 @@ def find_persistent(
 
     A blob that is linked over enough frames and moves steadily in enough of them is a target. Where blobs are few, or
     a blob is large, one link is enough, because parallax makes many small blobs. Weak blobs need the full test.
-    size: (width, height) of the picture. Source: appendix B, S5, asks for independently moving targets; we test each
+    size: (width, height) of the picture. Source: appendix B, S5, wants independently moving targets; we test each
     blob and not each pixel, which keeps targets whole.
     """
     crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > parameters.trusted_blobs

@@ -51,7 +51,7 @@ class TorchEngine:
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
 
     def prepare(self, image: np.ndarray) -> View:
-        """The frame and its grey picture; tensors follow when they are asked for."""
+        """The frame and its grey picture; tensors are made when they are needed."""
         return View(image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image)
 
     @torch.inference_mode()
@@ -105,21 +105,21 @@ class TorchEngine:
                     sampled = apply_light(levels, sampled, *torch.from_numpy(light.T).to(levels))
             warped.append(sampled.to(torch.uint8))
             seen.append(run)
-        # Without either nobody asks for the texture.
+        # Needed for neither otherwise.
         wanted = parameters.kind == "normalized" or self.parameters.refine.on
         texture = difference.gradient(levels) if wanted else torch.zeros_like(levels)
         return WarpedWindows(grey, warped, seen, texture)
 
     def _foreground_at_once(self, windows: list[Window]) -> list[Foreground]:
         parameters, morph, one = self.parameters.difference, self.parameters.morphology, windows[0]
-        grey, warped, seen, texture = self.warp_neighbours(windows)
-        near, wide = combine_evidence(one, grey, warped, seen, texture, parameters)
+        views = self.warp_neighbours(windows)
+        near, wide = _combine_evidence(one, views, parameters)
         scale = EVIDENCE_SCALE if parameters.kind == "normalized" else 1.0
         core = (near > int(parameters.threshold * scale)).to(torch.uint8) * 255
-        core = close_masks(morphology.erode(core, morph.erode_px, "ellipse"), one.close_px or morph.close_px)
-        small = find_small(one, grey, warped, seen, self.parameters.small)
+        core = _close_masks(morphology.erode(core, morph.erode_px, "ellipse"), one.close_px or morph.close_px)
+        small = None if one.small is None else _find_small(one.small, views, self.parameters.small)
         a, b = one.near[-1]
-        maps = core, near, wide, texture.to(torch.uint8), warped[a], warped[b]
+        maps = core, near, wide, views.texture.to(torch.uint8), views.warped[a], views.warped[b]
         rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)
         smalls = [None] * len(windows) if small is None else list(small[:, 0].cpu().numpy())
         return [
@@ -142,53 +142,40 @@ def _apply_in_groups(
     return results
 
 
-def combine_evidence(
-    window: Window,
-    grey: Tensor,
-    warped: list[Tensor],
-    seen: list[tuple[Tensor, Tensor]],
-    texture: Tensor,
-    parameters: DifferenceParameters,
-) -> tuple[Tensor, Tensor]:
+def _combine_evidence(window: Window, views: WarpedWindows, parameters: DifferenceParameters) -> tuple[Tensor, Tensor]:
     """The largest evidence over the near pairs, and that of the wide pair, uint8."""
-    width = grey.shape[-1]
-    if parameters.kind == "normalized":
-        weight = difference.noise_weight(texture, parameters.noise_levels, parameters.gradient_share).mul_(
-            EVIDENCE_SCALE
-        )
-        textured = texture > TEXTURED
-    distance = compare_to_reference(window, grey, warped, parameters)
+    width, normalized = views.grey.shape[-1], parameters.kind == "normalized"
+    if normalized:
+        weight = difference.noise_weight(views.texture, parameters.noise_levels, parameters.gradient_share)
+        weight = weight.mul_(EVIDENCE_SCALE)
+        textured = views.texture > TEXTURED
+    distance = compare_to_reference(window, views.grey, views.warped, parameters)
 
-    def of(pair: tuple[int, int]) -> Tensor:
-        both = find_seen_by_both(seen[pair[0]], seen[pair[1]], width)
-        least = smaller_difference(pair, distance, warped)
-        if parameters.kind != "normalized":
+    def evidence(pair: tuple[int, int]) -> Tensor:
+        both = find_seen_by_both(views.seen[pair[0]], views.seen[pair[1]], width)
+        least = smaller_difference(pair, distance, views.warped)
+        if not normalized:
             return filters.gaussian_levels(least, parameters.blur_px) * both
         z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
-        z = filters.gaussian_levels(z, parameters.blur_px)
-        return _normalize(z, textured & both)
+        return _normalize(filters.gaussian_levels(z, parameters.blur_px), textured & both)
 
-    near = of(window.near[0])
+    near = evidence(window.near[0])
     for pair in window.near[1:]:
-        near = torch.maximum(near, of(pair))
-    return near, near if window.wide is None else of(window.wide)
+        near = torch.maximum(near, evidence(pair))
+    return near, near if window.wide is None else evidence(window.wide)
 
 
-def find_small(
-    window: Window, grey: Tensor, warped: list[Tensor], seen: list[tuple[Tensor, Tensor]], parameters: SmallParameters
-) -> Tensor | None:
-    """255 where something small may move, uint8; None where nobody looks for it."""
-    if window.small is None:
-        return None
-    a, b = window.small
-    least = torch.minimum(absolute_difference(grey, warped[a]), absolute_difference(grey, warped[b]))
-    least = filters.gaussian_levels(least, 5) * find_seen_by_both(seen[a], seen[b], grey.shape[-1])
+def _find_small(pair: tuple[int, int], views: WarpedWindows, parameters: SmallParameters) -> Tensor:
+    """255 where something small may move, uint8."""
+    (a, b), (one, other) = pair, (absolute_difference(views.grey, views.warped[k]) for k in pair)
+    least = filters.gaussian_levels(torch.minimum(one, other), 5)
+    least = least * find_seen_by_both(views.seen[a], views.seen[b], views.grey.shape[-1])
     mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
     level = (parameters.noise_ratio * mean).clamp(min=parameters.threshold).floor()
-    return close_masks((least > level).to(torch.uint8) * 255, parameters.close_px)
+    return _close_masks((least > level).to(torch.uint8) * 255, parameters.close_px)
 
 
-def close_masks(mask: Tensor, side: int) -> Tensor:
+def _close_masks(mask: Tensor, side: int) -> Tensor:
     """The mask closed with an ellipse; on a CPU only around where it is set at all in any of the pictures."""
     if mask.device.type != "cpu":
         return morphology.closing(mask, side, "ellipse")
@@ -204,17 +191,14 @@ def close_masks(mask: Tensor, side: int) -> Tensor:
     return out
 
 
-def _used(window: Window) -> set[int]:
-    return {k for pair in (*window.near, *([window.wide] if window.wide else [])) for k in pair}
-
-
 def compare_to_reference(
     window: Window, grey: Tensor, warped: list[Tensor], parameters: DifferenceParameters
 ) -> dict[int, Tensor]:
-    """How far each neighbour that counts is from the reference; none where neighbours are compared to each other."""
-    return (
-        {k: absolute_difference(grey, warped[k]) for k in _used(window)} if parameters.kind != "between_later" else {}
-    )
+    """The difference of each used neighbour to the reference; empty where neighbours are compared to each other."""
+    if parameters.kind == "between_later":
+        return {}
+    pairs = (*window.near, *([window.wide] if window.wide else []))
+    return {k: absolute_difference(grey, warped[k]) for k in {k for pair in pairs for k in pair}}
 
 
 def smaller_difference(pair: tuple[int, int], distance: dict[int, Tensor], warped: list[Tensor]) -> Tensor:
@@ -245,11 +229,11 @@ def match_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) 
 def apply_light(reference: Tensor, warped: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
     """The warped pictures through their gains and offsets, (B,) each, in whole levels.
 
-    What they have cut off at white agrees with anything brighter.
+    Where they are clipped at white they agree with anything brighter.
     """
     gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
     darkened = (gain * LEVEL + offset).round() < WHITE
-    # Cut off at white, a pixel only tells that the place was at least so bright.
+    # A clipped pixel only says that the place was at least so bright.
     cut = (warped >= WHITE) & darkened if bool(darkened.any()) else None
     through = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
     return through if cut is None else torch.where(cut, torch.maximum(through, reference), through)

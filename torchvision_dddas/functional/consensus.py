@@ -69,7 +69,7 @@ def ransac(
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
     """Best of all hypotheses at once, then least squares on its inliers, ever more strictly (appendix B, step S3).
 
-    Hypotheses are ranked by their truncated squared error, which tells apart two that have as many inliers.
+    Hypotheses are ranked by their truncated squared error, which ranks those with equally many inliers.
     A refit counts only if twice the minimal number of points support it. When nothing fits: identity, valid False.
     """
     size = samples.shape[-1]

@@ -18,9 +18,9 @@ def exposure(
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
     Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
-    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every `stride`-th pixel is looked at
-    (default: about 80 rows of them). Without inside pixels, or on a frame of one single
-    grey, the gain stays 1 (and the offset what the mean asks for).
+    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every `stride`-th pixel is used
+    (default: about 80 rows of them). Without inside pixels, or on a frame of one single grey, the gain stays 1 (and the
+    offset is the difference of the means).
     """
     if stride is None:
         stride = max(1, min(reference.shape[-2:]) // 80)

@@ -100,7 +100,7 @@ def _weighted(padded: Tensor, weights: list[int], dim: int) -> Tensor:
 def pad_reflect(image: Float[Tensor, "B C H W"], before: int, after: int) -> Tensor:
     """The picture with `before` pixels above and to the left and `after` below and to the right, mirrored at the edges.
 
-    Also where a side is smaller than what is asked for: then the mirror repeats.
+    Where a side is smaller than the border the mirror repeats.
     """
     height, width = image.shape[-2:]
     if max(before, after) < min(height, width):

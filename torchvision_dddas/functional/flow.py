@@ -81,8 +81,8 @@ def forward_backward(
 class _FromPatch:
     """What a level needs of the first frame around each point: gradients times the inverse structure tensor.
 
-    gradients: (B, N, 2, window^2), such that their product with a grey patch is the displacement that it asks for.
-    target: (B, N, 2), what the first frame's own patch asks for. textured: whether the tensor can be inverted.
+    gradients: (B, N, 2, window^2), such that their product with a grey patch is the displacement that it implies.
+    target: (B, N, 2), what the first frame's own patch implies. textured: whether the tensor can be inverted.
     """
 
     def __init__(self, image: Tensor, points: Tensor, window: int, min_eigen: float) -> None:
@@ -153,7 +153,7 @@ def _descend(
 
 
 def _table(patch: _FromPatch, image: Tensor, corner: Tensor, span: int) -> Float[Tensor, "B N 2 T"]:
-    """The displacement that the second frame's patch asks for at each of span x span whole displacements."""
+    """The displacement that the second frame's patch implies at each of span x span whole displacements."""
     window = patch.window
     grey = _gather(image, corner, window + span - 1)
     batch, count, side = grey.shape[:3]
