@@ -14,9 +14,11 @@ from torchvision_dddas.config import (
     all_parameters,
     changes,
     config_names,
+    format_toml,
     load_config,
     parameter,
     range_of,
+    read_toml,
     with_parameters,
 )
 from torchvision_dddas.errors import InputError
@@ -88,14 +90,17 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
         ("keypoints=3", ["did you mean registration.keypoints"]),
         ("nowhere.zzzz=3", ["unknown parameter 'nowhere.zzzz'", "dddas settings"]),
         ("registration=3", ["unknown parameter 'registration'"]),
-        ("registration.keypoints=9000", ["registration.keypoints = 9000", "50 to 5000 points"]),
+        (
+            "registration.keypoints=9000",
+            ["registration.keypoints must be a whole number between 50 and 5000 points, got 9000"],
+        ),
         ("registration.keypoints=1.5", ["1.5", "a whole number"]),
-        ("registration.keypoints=many", ["'many'", "50 to 5000 points"]),
+        ("registration.keypoints=many", ["got 'many'", "between 50 and 5000 points"]),
         ("registration.keypoints=true", ["True", "a whole number"]),
-        ("registration.block_px=4", ["block_px = 4", "3 to 15 px, odd"]),
-        ("registration.quality=nan", ["nan", "0.0001 to 0.5"]),
+        ("registration.block_px=4", ["block_px must be a whole number between 3 and 15 px, odd, got 4"]),
+        ("registration.quality=nan", ["nan", "between 0.0001 and 0.5"]),
         ("difference.near_frames=[]", ["near_frames", "a list of 1 to 30 frames"]),
-        ("difference.near_frames=[0]", ["near_frames = 0", "a list of 1 to 30 frames"]),
+        ("difference.near_frames=[0]", ["near_frames must be a list of 1 to 30 frames, got 0"]),
         ("registration.model=plane", ["'plane'", "homography or affine"]),
         ("interval.rule=1", ["true or false"]),
         ("interval.minimum_frames=50", ["minimum_frames = 50", "above maximum_frames"]),
@@ -123,7 +128,7 @@ def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: s
         ("[registration]\nkeypoints = [\n", ["end of document", "not valid TOML"]),
         ("keypoints = 300\n", ["outside a [group]", "registration.keypoints"]),
         ("[registration]\nkeypoint = 300\n", ["unknown parameter", "registration.keypoints"]),
-        ("[registration]\nkeypoints = 1\n", ["registration.keypoints = 1", "50 to 5000 points"]),
+        ("[registration]\nkeypoints = 1\n", ["registration.keypoints must be", "between 50 and 5000 points, got 1"]),
     ],
 )
 def test_a_mistake_in_a_file_names_the_file(tmp_path: Path, text: str, wanted: list[str]) -> None:
@@ -154,6 +159,23 @@ def test_an_unknown_configuration_lists_those_that_there_are(tmp_path: Path) -> 
 def test_settings_cannot_be_changed_in_place() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         Settings().registration.keypoints = 3
+
+
+def test_settings_have_a_json_schema_with_meanings_and_ranges() -> None:
+    schema = Settings.model_json_schema()["$defs"]["RegistrationParameters"]["properties"]["keypoints"]
+    assert (schema["minimum"], schema["maximum"], schema["unit"]) == (50, 5000, "points") and schema["description"]
+
+
+def test_toml_of_any_text_is_read_as_it_was_written(tmp_path: Path) -> None:
+    content = {
+        "name": 'a "\U0001f600", [1,\n]\x7f',
+        "rows": [[1, 2.5], []],
+        "t": {"on": True},
+        "all": [{"a": [1]}, {"b": []}],
+    }
+    text = format_toml(content, ["a comment"])
+    (tmp_path / "any.toml").write_text(text, encoding="utf-8")
+    assert read_toml(tmp_path / "any.toml") == content and "rows = [[1, 2.5], []]\n" in text
 
 
 def test_settings_survive_a_round_trip_through_plain_data() -> None:

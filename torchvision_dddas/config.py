@@ -33,7 +33,7 @@ def parameter(default: Any, unit: str, low: float | None = None, high: float | N
 
 
 class Group(BaseModel):
-    """Knobs that belong together: frozen, no unknown names, no silent conversion ("5" is no number)."""
+    """Parameters of one subject: frozen, without unknown names or silent conversion ("5" is no number)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True)
 
@@ -783,7 +783,7 @@ def all_parameters() -> list[Parameter]:
 
 
 def changes(settings: Settings) -> dict[str, object]:
-    """The parameters that differ from their defaults: `{"group.knob": value}`."""
+    """The parameters that differ from their defaults: `{"group.parameter": value}`."""
     now = {name: getattr(getattr(settings, name.split(".")[0]), name.split(".")[1]) for name, _ in _parameter_fields()}
     return {name: now[name] for name, field in _parameter_fields() if now[name] != field.default}
 
@@ -827,7 +827,7 @@ def load_config(
 ) -> Settings:
     """The defaults, changed by base, then by a TOML file and then by `group.parameter=value` overrides.
 
-    config: the name of a shipped configuration (`source`, `fast`) or a TOML file. base: `{"group.knob": value}`.
+    config: the name of a shipped configuration (`source`, `fast`) or a TOML file. base: `{"group.parameter": value}`.
     Raises InputError with one line: no such file, bad TOML, unknown parameter (with the nearest names), value out of
     range.
     """
@@ -839,7 +839,7 @@ def load_config(
 
 
 def with_parameters(settings: Settings, values: Mapping[str, object], origin: str = "") -> Settings:
-    """A copy of the settings with `{"group.knob": value}` changed and everything checked again.
+    """A copy of the settings with `{"group.parameter": value}` changed and everything checked again.
 
     origin: where the values come from, put before the message. Raises InputError for an unknown parameter or a bad
     value.
@@ -917,7 +917,7 @@ _ARRAY = re.compile(r"\[\n +((?:[^\n]*,\n *)+?)\]")
 
 
 def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:
-    """`{group: {parameter: value}}` → `{"group.knob": value}`."""
+    """`{group: {parameter: value}}` → `{"group.parameter": value}`."""
     flat: dict[str, object] = {}
     for group, parameters in content.items():
         if not isinstance(parameters, dict):
@@ -954,12 +954,13 @@ def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
     name = ".".join(str(part) for part in first["loc"][:2])
     if name not in fields:  # a rule across two parameters of one group
         return f"{name}: {str(first['msg']).removeprefix('Value error, ')}"
-    return will_not_do(name, first["input"], fields[name])
+    return describe_error(name, first["input"], fields[name])
 
 
-def will_not_do(name: str, value: object, field: FieldInfo) -> str:
-    """What came, and what was wanted: range and unit of a parameter."""
-    low_to_high, comma, odd = range_of(field).partition(",")
+def describe_error(name: str, value: object, field: FieldInfo) -> str:
+    """What a parameter must be, by its range and unit, and what it is instead."""
+    words, comma, odd = range_of(field).partition(",")
+    if field.annotation in (int, float):
+        words = f"{'a whole number ' if field.annotation is int else ''}between {words.replace(' to ', ' and ')}"
     unit = "" if _unit(field) in ("-", "") else f" {_unit(field)}"
-    whole = "a whole number, " if field.annotation is int else ""
-    return f"{name} = {value!r} will not do; wanted {whole}{low_to_high}{unit}{comma}{odd}"
+    return f"{name} must be {words}{unit}{comma}{odd}, got {value!r}"

@@ -87,10 +87,10 @@ def test_settings_of_a_scenario_are_the_systems_parameters():
 @pytest.mark.parametrize(
     ("override", "line"),
     [
-        ("uav.altitude_m=1", "uav.altitude_m = 1 will not do; wanted 2 to 2000 m"),
+        ("uav.altitude_m=1", "uav.altitude_m must be between 2 and 2000 m, got 1"),
         ("uav.altitud_m=9", "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
         ("crowd.1.peple=9", "unknown parameter 'crowd.1.peple'; did you mean crowd.1.people"),
-        ("crowd.1.people=0.5", "crowd.1.people = 0.5 will not do; wanted a whole number, 1 to 5000 people"),
+        ("crowd.1.people=0.5", "crowd.1.people must be a whole number between 1 and 5000 people, got 0.5"),
         ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ..., of which there are 2"),
         ("crowd.people=2", "'crowd.people' names no parameter; wanted such as crowd.1.people"),
         ("crowd=3", "crowd must be a list of tables, got 3"),
@@ -99,9 +99,9 @@ def test_settings_of_a_scenario_are_the_systems_parameters():
         ("seed=-1", "seed must be a whole number from 0 to 2147483647, got -1"),
         ("crowd.1.start_m=3", "crowd.1.start_m must be two numbers, [east, north], got 3"),
         ("crowd.1.way_m=[[1, 2], 3]", "crowd.1.way_m must be a list of places"),
-        ("happening.1.what=jump", "happening.1.what = 'jump' will not do; wanted join or split or scatter"),
+        ("happening.1.what=jump", "happening.1.what must be join or split or scatter"),
         ("settings.crowds.join=3", "settings: unknown parameter 'crowds.join'; did you mean crowds.join_m"),
-        ("settings.crowds.join_m=-3", "settings: crowds.join_m = -3 will not do; wanted 0 to 100 m"),
+        ("settings.crowds.join_m=-3", "settings: crowds.join_m must be between 0 and 100 m, got -3"),
         ("uav.altitude_m", "is no override; wanted group.parameter=value"),
     ],
 )
@@ -169,7 +169,7 @@ def test_a_missing_file_is_named(tmp_path):
     ("text", "line"),
     [
         ("[uav\n", "is not valid TOML"),
-        ("[uav]\naltitude_m = 'high'\n", "odd.toml: uav.altitude_m = 'high' will not do; wanted 2 to 2000 m"),
+        ("[uav]\naltitude_m = 'high'\n", "odd.toml: uav.altitude_m must be between 2 and 2000 m, got 'high'"),
         ("[[uav]]\naltitude_m = 5\n", "must be a table"),
         ("[crowd]\npeople = 5\n", "must be a list of tables"),
         ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown parameter"),

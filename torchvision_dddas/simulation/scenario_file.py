@@ -12,12 +12,12 @@ from torchvision_dddas.config import (
     Group,
     Settings,
     config_folder,
+    describe_error,
     format_toml,
     is_file,
     nearest,
     parse_override,
     read_toml,
-    will_not_do,
     with_parameters,
 )
 from torchvision_dddas.errors import InputError
@@ -256,7 +256,7 @@ def explain_error(loc: tuple[int | str, ...], kind: str, message: str, value: ob
         return f"{name} must be two numbers, [east, north], got {_shown(value)}"
     if annotation == tuple[Place, ...]:
         return f"{name} must be a list of places, [[east, north], ...], got {_shown(value)}"
-    return will_not_do(name, _shown(value) if isinstance(value, (tuple, dict)) else value, field)
+    return describe_error(name, _shown(value) if isinstance(value, (tuple, dict)) else value, field)
 
 
 def nearest_parameter(name: str) -> str:
