@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.browser import evaluate, needs_browser
-from tests.io.studied import HOSTILE, study
+from tests.evaluation.report.studied import HOSTILE, study
 from torchvision_dddas.evaluation.report import report
 from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite

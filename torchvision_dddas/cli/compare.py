@@ -45,7 +45,7 @@ def compare(
 
 def _write(path: Path, found: dict[str, Any]) -> None:
     """The page. Raises InputError where it cannot be written."""
-    from torchvision_dddas.evaluation.comparison_report import comparison_report
+    from torchvision_dddas.evaluation.report.comparison import comparison_report
     from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, write_whole
 
     refuse_folder(path)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.evaluation.comparison_report import MEANING, compared
-from torchvision_dddas.evaluation.report.words import GROUPS, measure
+from torchvision_dddas.evaluation.report.comparison import MEANING, compared
+from torchvision_dddas.evaluation.report.measures import GROUPS, measure
 from torchvision_dddas.io.report import (
     Axis,
     Cell,

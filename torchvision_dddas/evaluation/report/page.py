@@ -1,56 +1,79 @@
 """report.html of a study: how good, how sure, where it fails, what it cost; one page that opens offline."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
-from torchvision_dddas.evaluation.report.cards import card
-from torchvision_dddas.evaluation.report.costs import cost_charts, cost_table, costs_of, summed
-from torchvision_dddas.evaluation.report.curves import course_charts, ranked_charts
-from torchvision_dddas.evaluation.report.figures import Told, told
-from torchvision_dddas.evaluation.report.maps import error_clouds, maps
-from torchvision_dddas.evaluation.report.measures import groups_of, measure_plot, measure_table
-from torchvision_dddas.evaluation.report.pictures import KEY
-from torchvision_dddas.evaluation.report.words import GROUPS, TITLES
-from torchvision_dddas.evaluation.report.worst import Worst, drawn, worst_frames
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.report.measures import (
+    GROUPS,
+    HEADLINES,
+    TITLES,
+    TaskFigures,
+    groups_of,
+    measure,
+    measure_plot,
+    measure_table,
+    read_figures,
+    shown,
+)
+from torchvision_dddas.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
+from torchvision_dddas.evaluation.report.worst_frames import KEY, Worst, drawn, worst_frames
 from torchvision_dddas.evaluation.studies.results import Case, Results
-from torchvision_dddas.evaluation.studies.spec import TASKS
+from torchvision_dddas.evaluation.studies.spec import TASKS, Task
+from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
 from torchvision_dddas.io.output.run_record import finite, versions
-from torchvision_dddas.io.report import Column, data_url, render_page, table, text_cell
+from torchvision_dddas.io.report import (
+    Axis,
+    Cell,
+    Column,
+    Dots,
+    chart,
+    data_url,
+    format_number,
+    number_cell,
+    render_page,
+    table,
+    text_cell,
+)
+from torchvision_dddas.io.sources import open_source
 
 MOST_LEFT_OUT = 200
 """Lines; run.json has them all."""
 
 
-_ELSEWHERE = ("faults", "notes")  # facts that are not told among the others
+_ELSEWHERE = ("faults", "notes")  # facts that have a place of their own
 _NAVIGATION = '<nav><a href="#costs">costs</a><a href="#settings">what was run, settings, versions</a></nav>'
 
 
 def report(metrics: Mapping[str, Any], results: Results) -> str:
     """The HTML. metrics: as `studies.summary.summary` has it; pictures are drawn of the clips' files."""
     by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
-    told_of = {task: told(metrics, task) for task, cases in by_task.items() if cases}
+    figures_by_task = {task: read_figures(metrics, task) for task, cases in by_task.items() if cases}
     costs = costs_of(results.cases)
     title = f"{results.spec.name}: study"
     scored = [case for case in results.cases if case.scored is not None]
     clips = len({str(case.clip.place) + case.clip.name for case in scored})
     failed = [case for case in results.cases if case.cause]
-    state = f"{_many(clips, 'clip')}, {_many(len(told_of), 'task')}; in all {summed(costs) or 'no times kept'}"
+    state = f"{_many(clips, 'clip')}, {_many(len(figures_by_task), 'task')}; in all {summed(costs) or 'no times kept'}"
     heading = f"<h1>{escape(results.spec.name)} <span>study</span></h1>"
     parts = [heading, f'<p class="soft">{escape(state)}</p>', _NAVIGATION, '<div class="cards">']
-    for task, mine in told_of.items():
+    for task, mine in figures_by_task.items():
         parts.append(card(task, mine, costs, sum(case.cause != "" for case in by_task[task])))
     parts.append("</div>")
     parts += [_left_out(failed, results.left_out), _notes(results.facts.get("notes", ()))]
-    for task, mine in told_of.items():
+    for task, mine in figures_by_task.items():
         parts += _task(task, mine, by_task[task])
     parts += _costs(costs)
     parts += _facts(results)
     return render_page("page.html", title=title, parts=[part for part in parts if part])
 
 
-def _task(task: str, mine: Told, cases: Sequence[Case]) -> list[str]:
+def _task(task: str, mine: TaskFigures, cases: Sequence[Case]) -> list[str]:
     parts = [f'<h2 id="{task}">{TITLES[task]}</h2>', f'<p class="soft">{escape(TASKS[task])}</p>']  # type: ignore[index]
     frames = {case.clip.name: len(case.scored.frames) for case in cases if case.scored is not None}
     plots = []
@@ -162,10 +185,10 @@ def _facts(results: Results) -> list[str]:
     ]
 
 
-def _of_set(told: Mapping[str, Any]) -> str:
+def _of_set(source: Mapping[str, Any]) -> str:
     """A data set in words: kind, folder, clips, terms of use."""
-    where = f"{told.get('kind')} in {told.get('folder')}, {_many(int(told.get('clips', 0)), 'clip')}"
-    return where + (f" ({told['terms']})" if told.get("terms") else "")
+    where = f"{source.get('kind')} in {source.get('folder')}, {_many(int(source.get('clips', 0)), 'clip')}"
+    return where + (f" ({source['terms']})" if source.get("terms") else "")
 
 
 def _plot(svg: str, note: str = "") -> str:
@@ -191,3 +214,174 @@ def _in_words(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "; ".join(_in_words(v) for v in value)
     return "unknown" if value is None else str(value)
+
+
+MOST_STAGES = 8
+
+
+class Cost(NamedTuple):
+    """Of a case: seconds in all and by stage, pictures looked at, megabytes, megapixels of a picture (NaN: unknown)."""
+
+    case: Case
+    seconds: float
+    stages: dict[str, float]
+    images: int
+    peak_mb: float
+    megapixels: float
+
+
+def costs_of(cases: Sequence[Case]) -> list[Cost]:
+    """What each case that has times cost; the size of a clip's pictures is read off the first of them."""
+    sizes: dict[str, float] = {}
+    costs = []
+    for case in cases:
+        if case.found is None or not case.found.seconds:
+            continue
+        name = str(case.clip.place) + case.clip.name
+        if name not in sizes:
+            sizes[name] = _megapixels(case)
+        stages = dict(case.found.seconds)
+        costs.append(Cost(case, sum(stages.values()), stages, len(case.found.looked), case.found.peak_mb, sizes[name]))
+    return costs
+
+
+def summed(costs: Sequence[Cost], task: Task | None = None) -> str:
+    """In words: images a second, and the memory, of one task or all."""
+    mine = [cost for cost in costs if task is None or cost.case.task == task]
+    seconds, images = sum(cost.seconds for cost in mine), sum(cost.images for cost in mine)
+    if not seconds or not images:
+        return ""
+    peaks = [cost.peak_mb for cost in mine if np.isfinite(cost.peak_mb)]
+    memory = f", at most {format_number(round(max(peaks)))} MB" if peaks else ""
+    return f"{_rate(images / seconds)} frames/s ({format_number(seconds, 1)} s){memory}"
+
+
+def cost_table(costs: Sequence[Cost]) -> str:
+    """A row a case: time, rate, memory, and the time of its longest stages a frame."""
+    total: dict[str, float] = {}
+    for cost in costs:
+        for stage, spent in cost.stages.items():
+            total[stage] = total.get(stage, 0.0) + spent
+    stages = sorted(total, key=lambda stage: -total[stage])[:MOST_STAGES]
+    columns = [
+        Column("clip", text=True),
+        Column("task", text=True),
+        Column("frames", "pictures looked at"),
+        Column("Mpx", "millions of pixels of a picture"),
+        Column("s", "seconds in all"),
+        Column("frames/s", "pictures looked at in a second"),
+        Column("MB", "the most memory that the process held"),
+        *(Column(f"{stage}, ms", "milliseconds a frame") for stage in stages),
+    ]
+    rows = []
+    for cost in costs:
+        each = max(cost.images, 1)
+        rows.append(
+            [
+                text_cell(cost.case.clip.name),
+                text_cell(TITLES[cost.case.task]),
+                number_cell(cost.images),
+                number_cell(cost.megapixels, 2),
+                number_cell(cost.seconds, 2),
+                Cell(_rate(cost.images / cost.seconds), cost.images / cost.seconds) if cost.seconds else Cell("–"),
+                number_cell(cost.peak_mb, 0),
+                *(number_cell(1000 * cost.stages[s] / each if s in cost.stages else None, 2) for s in stages),
+            ]
+        )
+    return table("what each clip cost", columns, rows)
+
+
+def cost_charts(costs: Sequence[Cost]) -> list[str]:
+    """Milliseconds a frame against the size of the pictures, of each task that looks at pictures."""
+    dots = []
+    for k, task in enumerate(TITLES):
+        mine = [c for c in costs if c.case.task == task and np.isfinite(c.megapixels) and c.images]
+        if mine:
+            each_ms = [1000 * c.seconds / c.images for c in mine]
+            said = [
+                f"{c.case.clip.name}: {format_number(c.megapixels, 2)} Mpx, {format_number(ms, 1)} ms"
+                for c, ms in zip(mine, each_ms, strict=True)
+            ]
+            dots.append(Dots(TITLES[task], np.array([c.megapixels for c in mine]), np.array(each_ms), k % 6 + 1, said))
+    if not dots:
+        return []
+    return [chart("Time and resolution", Axis("megapixels of a picture", 0), Axis("ms a frame", log=True), dots=dots)]
+
+
+def _rate(each_second: float) -> str:
+    return format_number(each_second, 0 if each_second >= 100 else 1)
+
+
+def _megapixels(case: Case) -> float:
+    files = case.clip.pictures
+    if not files:
+        return float("nan")
+    try:
+        if files[0].suffix.lower() in IMAGE_SUFFIXES:
+            picture = read_image(files[0])
+            return float("nan") if picture is None else picture.shape[0] * picture.shape[1] / 1e6
+        width, height = open_source(files[0]).size
+    except InputError:
+        return float("nan")
+    return width * height / 1e6
+
+
+def card(task: Task, figures: TaskFigures, costs: Sequence[Cost], left_out: int) -> str:
+    """A task at a glance; it leads to the task's section."""
+    parts = [f'<h3><a href="#{task}">{TITLES[task]}</a></h3>']
+    chosen = headline(task, figures)
+    if chosen is None:
+        parts.append("<p>no measure</p>")
+    else:
+        group, name = chosen
+        known = measure(name)
+        whole = figures.pooled.get(group, {}).get(name)
+        if whole is not None:
+            meaning = f' title="{escape(known.meaning)}"' if known.meaning else ""
+            metres = name.endswith("_m")
+            what = (
+                f"m, {known.meaning.removesuffix(', metres')}"
+                if metres
+                else f"{known.name}, {GROUPS.get(group, group)}"
+            )
+            big = f"{format_number(whole.value, known.digits)} <span{meaning}>{escape(what)}</span>"
+            parts.append(f'<div class="big">{big}</div>')
+            if math.isfinite(whole.low) and math.isfinite(whole.high):
+                ends = f"{format_number(whole.low, known.digits)} to {format_number(whole.high, known.digits)}"
+                over = "clips" if figures.over.get(group) == "clips" else "blocks of frames"
+                parts.append(f"<p>95 % interval over {over}: {ends}</p>")
+            else:
+                parts.append("<p>no interval: too few clips or frames</p>")
+        parts.append(f"<p>{_over(figures, group, name)}</p>")
+    if cost := summed(costs, task):
+        parts.append(f'<p class="soft">{escape(cost)}</p>')
+    if left_out:
+        parts.append(f'<p class="bad">{left_out} left out, see <a href="#left-out">below</a></p>')
+    return f'<section class="card">{"".join(parts)}</section>'
+
+
+def headline(task: Task, figures: TaskFigures) -> tuple[str, str] | None:
+    """The group and measure that a task is judged by: the first of HEADLINES that most clips have."""
+    wanted = [
+        pair for pair in HEADLINES[task] if any(pair[1] in clip.get(pair[0], {}) for clip in figures.clips.values())
+    ]
+    if wanted:
+        return max(wanted, key=lambda pair: sum(pair[1] in clip.get(pair[0], {}) for clip in figures.clips.values()))
+    for group in groups_of(figures):
+        if names := shown(figures, group):
+            return group, names[0]
+    return None
+
+
+def _over(figures: TaskFigures, group: str, name: str) -> str:
+    """Over how many clips, and which is the worst."""
+    values: Mapping[str, float] = {
+        clip: groups[group][name].value
+        for clip, groups in figures.clips.items()
+        if name in groups.get(group, {}) and math.isfinite(groups[group][name].value)
+    }
+    if len(values) < 2:
+        return f"one clip: {escape(next(iter(values), 'none'))}"
+    known = measure(name)
+    worst = (max if known.better < 0 else min)(values, key=lambda clip: values[clip])
+    return f"pooled over {len(values)} clips; worst: {escape(worst)}, {format_number(values[worst], known.digits)}"

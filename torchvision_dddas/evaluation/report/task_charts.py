@@ -1,13 +1,53 @@
-"""Curves of a task: precision over recall, misses against false alarms, and how right it is as a clip goes on."""
+"""The charts of a task: ranked curves, course over the frames, maps, errors on the ground."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.evaluation.metrics.boxes import precision_recall, ranking
-from torchvision_dddas.evaluation.report.tallies import main_group, tally
 from torchvision_dddas.evaluation.studies.results import Case, Scored
 from torchvision_dddas.io.report import Axis, Dots, Line, chart
+
+_GROUPS = ("pixels", "tracks", "boxes", "target_track", "target", "still")
+_NAMES = {"right": ("tp", "hit", "found"), "false": ("fp", "false", "blobs"), "missed": ("fn", "missed")}
+
+
+class Tally(NamedTuple):
+    """Of each frame (F,): what is right, false, missed, changed identity, and the rest (of pixels) that is right too.
+
+    unit: what is counted. measure: what 2 right / (2 right + false + missed) is called.
+    """
+
+    right: np.ndarray
+    false: np.ndarray
+    missed: np.ndarray
+    switched: np.ndarray
+    rest: np.ndarray
+    unit: str
+    measure: str
+
+
+def main_group(scored: Scored) -> str | None:
+    """The group that tells most of where a clip goes wrong."""
+    return next((group for group in _GROUPS if group in scored.per_frame), None)
+
+
+def tally(scored: Scored, group: str) -> Tally:
+    """The counts of each frame; 0 where a group has no use for the frame."""
+    mine = scored.per_frame[group]
+
+    def of(*names: str) -> np.ndarray:
+        known = [np.nan_to_num(np.asarray(mine[name], float)) for name in names if name in mine]
+        return known[0] if known else np.zeros(len(scored.frames))
+
+    right, false, missed = (of(*names) for names in _NAMES.values())
+    if group in ("target", "target_track"):  # in a frame with the target it is found or missed
+        missed = np.maximum(of("frames") - right, 0)
+    rest, unit = (of("tn"), "pixels") if group == "pixels" else (np.zeros(len(right)), "boxes")
+    measure = "F" if group == "pixels" else "hit" if group in ("target", "target_track") else "F1"
+    return Tally(right, false, missed, of("switches"), rest, unit, measure)
+
 
 MOST_CLIPS = 6
 """Clips whose course is drawn."""
@@ -113,3 +153,58 @@ def _metres(name: str, scored: Scored) -> str | None:
         Line("median", np.array(at), np.array(middle), 1),
     ]
     return chart(name, Axis("frame"), Axis("error, m", 0), lines)
+
+
+_MOST_TARGETS = 60
+_MOST_ERRORS = 500
+
+
+def maps(cases: Sequence[Case]) -> list[str]:
+    """A map a clip with places, of the first MOST_CLIPS: true ways, and those that were found for the same targets."""
+    drawn: list[str] = []
+    for case in cases:
+        scored, truth = case.scored, case.clip.truth
+        if scored is None or truth is None or truth.positions is None or len(drawn) == MOST_CLIPS:
+            continue
+        if not len(scored.samples.get("east_m", ())):
+            continue
+        true, samples = truth.positions, scored.samples
+        seen = np.isin(true.frame, scored.frames)
+        keys = zip(true.frame.tolist(), true.identity.tolist(), strict=True)
+        row_of = {key: row for row, key in enumerate(keys)}
+        whose = zip(samples["frame"].tolist(), samples["identity"].tolist(), strict=True)
+        rows = np.array([row_of[int(frame), int(identity)] for frame, identity in whose])
+        # The error is added to the true place: each side may count its metres from an origin of its own.
+        found_m = true.east_north_m[rows] + np.stack([samples["east_m"], samples["north_m"]], axis=1)
+        lines = [
+            *_ways("true", true.identity[seen], true.frame[seen], true.east_north_m[seen], 5, True),
+            *_ways("found", samples["identity"], samples["frame"], found_m, 1, False),
+        ]
+        drawn.append(chart(case.clip.name, Axis("east, m"), Axis("north, m"), lines, equal=True))
+    return drawn
+
+
+def error_clouds(cases: Sequence[Case]) -> list[str]:
+    """The errors of all clips together, east and north; a cloud off the middle is a bias."""
+    having = [case.scored.samples for case in cases if case.scored and len(case.scored.samples.get("east_m", ()))]
+    if not having:
+        return []
+    off = np.concatenate([np.stack([samples["east_m"], samples["north_m"]], axis=1) for samples in having])
+    kept = off[np.unique(np.linspace(0, len(off) - 1, _MOST_ERRORS).astype(int))]
+    reach = float(np.percentile(np.abs(kept), 99)) * 1.1 or 1.0
+    across, up = Axis("error to the east, m", -reach, reach), Axis("error to the north, m", -reach, reach)
+    none = [Dots("no error", np.zeros(1), np.zeros(1), 2, sign="ring")]
+    return [chart("Errors", across, up, dots=[Dots("found", kept[:, 0], kept[:, 1], 1), *none], equal=True)]
+
+
+def _ways(
+    name: str, identity: np.ndarray, frame: np.ndarray, east_north_m: np.ndarray, colour: int, dashed: bool
+) -> list[Line]:
+    """A line an identity, the longest first; a single name for all of them."""
+    numbers, counts = np.unique(identity, return_counts=True)
+    lines: list[Line] = []
+    for number in numbers[np.argsort(-counts, kind="stable")][:_MOST_TARGETS].tolist():
+        mine = identity == number
+        way = east_north_m[mine][np.argsort(frame[mine], kind="stable")]
+        lines.append(Line("" if lines else name, way[:, 0], way[:, 1], colour, dashed=dashed))
+    return lines

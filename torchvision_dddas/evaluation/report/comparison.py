@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from torchvision_dddas.evaluation.report.words import GROUPS, TITLES, measure
+from torchvision_dddas.evaluation.report.measures import GROUPS, TITLES, measure
 from torchvision_dddas.io.report import (
     MOST_ROWS,
     Cell,

@@ -8,23 +8,36 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.io.studied import FRAMES, HOSTILE, SIZE, boxed_truth, found, masked_clip, scored, study, tracked_clip
+from tests.evaluation.report.studied import (
+    FRAMES,
+    HOSTILE,
+    SIZE,
+    boxed_truth,
+    found,
+    masked_clip,
+    scored,
+    study,
+    tracked_clip,
+)
 from tests.pages import Page
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.report import report
-from torchvision_dddas.evaluation.report.curves import MOST_FAINT, ranked_charts
-from torchvision_dddas.evaluation.report.pictures import (
+from torchvision_dddas.evaluation.report.task_charts import MOST_FAINT, ranked_charts
+from torchvision_dddas.evaluation.report.worst_frames import (
     FALSE,
     HIT,
+    MOST,
     TRUE,
     UNSCORED,
     Boxes,
     box_pair,
+    boxes_at,
+    drawn,
     mask_pair,
     matched,
+    worst_frames,
 )
-from torchvision_dddas.evaluation.report.worst import MOST, boxes_at, drawn, worst_frames
 from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite
 
