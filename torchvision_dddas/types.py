@@ -891,6 +891,11 @@ class Scene:
     step: Registration | None = None
     core: np.ndarray | None = None
 
+    @property
+    def camera_motion(self) -> np.ndarray | None:
+        """(3, 3) pixel homography from the frame before to this one; None where it is unknown."""
+        return self.step.later_from_earlier if self.step is not None and self.step.reliable else None
+
 
 @dataclass(frozen=True)
 class TrackedFrame:

@@ -104,7 +104,7 @@ class LandmarkWatch:
         image = scene.frame.image
         if image.ndim == 2:
             raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
-        step = scene.step.later_from_earlier if scene.step is not None and scene.step.reliable else None
+        step = scene.camera_motion
         place = {which: k for k, which in enumerate(self._which.tolist())}
         expected, length = np.full((len(self._colours), 2), np.nan), np.full(len(self._colours), np.nan)
         pixels, scale = self._expected(marks, step)
