@@ -1,12 +1,8 @@
 """`dddas tune`: parameters fitted by gradient on the clips of a study, and what that was worth on clips held out."""
 
-import json
 import sys
-import tempfile
 import time
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,14 +16,8 @@ from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.tuning.costing import TimeCost
-    from torchvision_dddas.tuning.descent import Descended, Plan, Step
-    from torchvision_dddas.tuning.family import Prepared
-    from torchvision_dddas.tuning.verdict import Side, Verdict
-
-CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
-OLD, OLD_COST = "checkpoint.old.pt", "cost.old.json"
-FILES = (CHECKPOINT, OLD, COST, OLD_COST, TUNED, REPORT, RUN)
+    from torchvision_dddas.tuning.descent import Step
+    from torchvision_dddas.tuning.tuner import Tuned
 
 
 @explained
@@ -56,8 +46,8 @@ def tune(
         bool,
         typer.Option(
             "--resume",
-            help=f"Go on from the checkpoint in --out; begin where there is none. Without it an unfinished one is kept "
-            f"as {OLD}.",
+            help="Go on from the checkpoint in --out; begin where there is none. Without it an unfinished one is kept "
+            "as checkpoint.old.pt.",
         ),
     ] = False,
     batch: Annotated[int, typer.Option(metavar="N", help="Examples of a step.")] = 8,
@@ -99,9 +89,11 @@ def tune(
     Writes tuned.toml, which every command takes as --config, report.html and run.json.
     """
     _need_torch()
-    from torchvision_dddas.cli.study import asked, patterns
+    from torchvision_dddas.cli.progress import progress
+    from torchvision_dddas.cli.study import asked, patterns, shown
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.tuning.descent import Plan
+    from torchvision_dddas.tuning.tuner import FILES, Display, Tuner
 
     check_jobs(jobs)
     if minutes is not None and not minutes > 0:
@@ -116,287 +108,63 @@ def tune(
     # The settings are read again for the figures before: tuned.toml may not have taken their place by then.
     read = [study, *([Path(spec.config)] if spec.config else [])]
     refuse_own_input(read, [out / name for name in FILES], "folder with --out")
-    _Tuning(out, plan, quiet, jobs, cache).run(
-        partial(
-            _prepared,
-            spec,
-            study.parent,
-            patterns(parameters, "--knobs", "knob"),
-            patterns(holdout, "--holdout"),
-            patterns(clips, "--clips"),
-            measure,
-            loss,
-            _device(device),
-            quiet,
-        ),
-        cost,
-        resume,
-        spec.backend,
+    names, held = patterns(parameters, "--knobs", "knob"), patterns(holdout, "--holdout")
+    display = Display(study=partial(shown, quiet), progress=partial(progress, quiet=quiet))
+    if not quiet:
+        display = replace(display, message=_print, step=_StepLines(steps))
+    tuner = Tuner(
+        out, plan, time_weight=cost, resume=resume, device=_device(device), jobs=jobs, cache=cache, display=display
     )
+    tuned = tuner.run(spec, study.parent, names, held, patterns(clips, "--clips"), measure, loss)
+    if not quiet:
+        _show(tuned, out)
+    if tuned.failed:
+        raise InputError(tuned.failed)
 
 
-class _Tuning:
-    """A run of the command, and its files."""
+class _StepLines:
+    """Prints a line for each look at the watched examples, and otherwise one every few seconds."""
 
-    def __init__(self, folder: Path, plan: "Plan", quiet: bool, jobs: int | None, cache: Path | None) -> None:
-        self._folder, self._plan, self._quiet, self._jobs, self._cache = folder, plan, quiet, jobs, cache
-        self._seconds: dict[str, float] = {}
-        self._said, self._least = 0.0, (float("inf"), 0)
-        self._state: dict[str, str] = {}
+    def __init__(self, steps: int) -> None:
+        self._steps, self._printed_s, self._least = steps, 0.0, (float("inf"), 0)
 
-    def run(self, prepared: Any, weight: float | None, resume: bool, backend: str) -> None:
-        """All of it. Raises InputError, at the end too where a loss was no number."""
-        self._write(None)
-        try:
-            found = self._run(prepared, weight, resume, backend)
-        except BaseException:
-            if self._state:  # else the record of an earlier run in this folder is still there
-                with suppress(InputError):
-                    self._write(RUN, _json({**self._state, "state": "interrupted"}))
-            raise
-        if found.failed:
-            raise InputError(f"{found.failed}; {self._folder / TUNED} holds the last good state, of step {found.best}")
-
-    def _run(self, prepared: Any, weight: float | None, resume: bool, backend: str) -> "Descended":
-        from torchvision_dddas.tuning.descent import descend
-
-        began = time.perf_counter()
-        ready: Prepared = prepared()
-        self._clock("examples", began)
-        self._begin(ready)
-        cost = None if weight is None else self._cost(ready, weight, backend, resume)
-        before = _values(ready)
-        began = time.perf_counter()
-        place = self._folder / CHECKPOINT
-        if resume and not place.is_file():
-            self._say(f"there is no checkpoint at {place}: it begins anew")
-        tell = partial(self._tell, {"state": "running", "study": ready.spec.name}, resume, cost)
-        found = descend(ready.family, ready.parameters, ready.examples, self._plan, cost, tell, place, resume)
-        self._clock("descent", began)
-        self._toml(ready, found, None)
-        verdict = self._judged(ready)
-        self._toml(ready, found, verdict)
-        record = self._record(ready, found, cost, before, verdict)
-        self._report(record)
-        self._write(RUN, _json(record))
-        if not self._quiet:
-            show(verdict, self._folder, before, _values(ready))
-        return found
-
-    def _begin(self, ready: "Prepared") -> None:
-        told = f"{ready.family.name}: {len(ready.examples)} examples of {_clips(len(ready.tuned))}"
-        held = f", {_clips(len(ready.held))} held out" if ready.held else ""
-        self._say(told + held)
-
-    def _say(self, line: str) -> None:
-        if not self._quiet:
-            print(line, file=sys.stderr, flush=True)
-
-    def _cost(self, ready: "Prepared", weight: float, backend: str, resume: bool) -> "TimeCost":
-        """What the knobs cost, measured on the shortest clip; of a descent that is taken up, as it was measured."""
-        from torchvision_dddas.cli.progress import progress
-        from torchvision_dddas.tuning import costing
-
-        place = self._folder / COST
-        if resume and place.is_file() and (self._folder / CHECKPOINT).is_file():
-            # Another weight is another descent, which the checkpoint refuses.
-            return replace(costing.read(place), weight=weight)
-        began = time.perf_counter()
-        clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
-        names, settings = ready.parameters.names, ready.parameters.base
-        count = costing.REPEATS * len(costing.points(settings, names))
-        with progress("what time costs", count, self._quiet) as tick:
-            cost = costing.measured(clip, ready.goal.task, settings, names, weight, backend, tick=tick)
-        self._clock("cost", began)
-        return cost
-
-    def _tell(self, state: dict[str, str], resume: bool, cost: "TimeCost | None", step: "Step") -> None:
-        """A line for each look, and every few seconds; with the first step the run has begun."""
-        from torchvision_dddas.tuning import costing
-
-        if not self._state:
-            if not resume:
-                self._set_aside()
-            if cost is not None:  # not before: that of an earlier descent is needed to go on with it
-                costing.write(self._folder / COST, cost)
-            self._write(RUN, _json(state))
-            self._state = state
-        if self._quiet:
-            return
+    def __call__(self, step: "Step") -> None:
         now = time.monotonic()
-        if step.watched is None and now - self._said < EVERY_S:
+        if step.watched is None and now - self._printed_s < EVERY_S:
             return
-        self._said = now
-        told = f"step {step.step} of {self._plan.steps}"
-        told += f": loss {step.loss:.4f}" if step.step else ""
+        self._printed_s = now
+        line = f"step {step.step} of {self._steps}"
+        line += f": loss {step.loss:.4f}" if step.step else ""
         if step.watched is not None:
             self._least = min(self._least, (step.watched, step.step))
-            told += f"{',' if step.step else ':'} watched {step.watched:.4f}"
-            told += f" (least {self._least[0]:.4f} at step {self._least[1]})"
-        self._say(told)
-
-    def _set_aside(self) -> None:
-        """A checkpoint that could be gone on with is not written over, nor what was measured for it."""
-        from torchvision_dddas.tuning.checkpoint import set_aside
-
-        place, aside = self._folder / CHECKPOINT, self._folder / OLD
-        if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
-            self._say(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
-
-    def _judged(self, ready: "Prepared") -> "Verdict":
-        from torchvision_dddas.cli.study import shown
-        from torchvision_dddas.tuning.verdict import judge
-
-        began, hidden = time.perf_counter(), partial(shown, self._quiet)
-        jobs, cache = self._jobs, self._cache
-        after = _values(ready)
-        found = judge(ready.spec, ready.base, ready.goal, after, ready.tuned, ready.held, jobs, cache, hidden)
-        self._clock("before and after", began)
-        return found
-
-    def _toml(self, ready: "Prepared", found: "Descended", verdict: "Verdict | None") -> None:
-        from torchvision_dddas.evaluation.studies.sweep import settings_toml
-
-        about = [f"dddas tune: {', '.join(ready.parameters.names)} on {', '.join(ready.tuned)}, step {found.best}."]
-        if verdict is not None:
-            about += [f"{line}." for line in _told(verdict)]
-        self._write(TUNED, settings_toml(found.settings, about))
-
-    def _record(
-        self,
-        ready: "Prepared",
-        found: "Descended",
-        cost: "TimeCost | None",
-        before: Mapping[str, Any],
-        verdict: "Verdict",
-    ) -> dict[str, Any]:
-        """What run.json holds, and the page shows."""
-        from torchvision_dddas.config import all_parameters
-        from torchvision_dddas.io.output.run_record import versions
-        from torchvision_dddas.tuning.family import loss_of
-        from torchvision_dddas.tuning.parameters import TUNABLE
-
-        spec, after = ready.spec, _values(ready)
-        meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
-        charged = None
-        if cost is not None:
-            expected = float(cost.expected({name: value.detach() for name, value in ready.parameters.values().items()}))
-            charged = {**cost.as_json(), "expected": expected}
-        return {
-            "state": "failed" if found.failed else "complete",
-            "versions": versions(),
-            "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
-            "family": ready.family.name,
-            "loss": loss_of(ready.family) or None,
-            "plan": asdict(self._plan),
-            "examples": len(ready.examples),
-            "knobs": {
-                name: {
-                    "before": before[name],
-                    "after": after[name],
-                    "unit": TUNABLE[name].unit,
-                    "range": TUNABLE[name].range,
-                    "meaning": meaning[name],
-                    "idle": name in found.idle,
-                }
-                for name in ready.parameters.names
-            },
-            "best": found.best,
-            "taken": found.taken,
-            "ended": found.ended,
-            "failed": found.failed,
-            "history": [
-                {"knobs" if name == "parameters" else name: value for name, value in asdict(step).items()}
-                for step in found.history
-            ],
-            "cost": charged,
-            "verdict": verdict.told(),
-            "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},
-        }
-
-    def _report(self, record: dict[str, Any]) -> None:
-        from torchvision_dddas.io.output.run_record import finite
-        from torchvision_dddas.tuning.report import tuning_report
-
-        self._write(REPORT, tuning_report(finite(record)))
-
-    def _clock(self, what: str, began: float) -> None:
-        self._seconds[what] = time.perf_counter() - began
-
-    def _write(self, name: str | None, text: str = "") -> None:
-        """Write a file; without a name, only see that some can be written. Raises InputError."""
-        from torchvision_dddas.io.atomic_files import cannot_write, write_whole
-
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            if name is None:
-                tempfile.TemporaryFile(dir=self._folder).close()
-            else:
-                write_whole(self._folder / name, text.encode())
-        except OSError as error:
-            raise cannot_write(self._folder / (name or RUN), error) from error
+            line += f"{',' if step.step else ':'} watched {step.watched:.4f}"
+            line += f" (least {self._least[0]:.4f} at step {self._least[1]})"
+        _print(line)
 
 
-def show(verdict: "Verdict", folder: Path, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Print the parameters, what they were worth, and where the rest is."""
+def _print(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _show(tuned: "Tuned", folder: Path) -> None:
+    """Print the parameters, what tuning was worth, and where the rest is."""
     from rich.console import Console
     from rich.table import Table
 
+    from torchvision_dddas.tuning.tuner import REPORT, RUN, TUNED
+
+    verdict = tuned.verdict
     console = Console() if sys.stdout.isatty() else Console(width=120)
     table = Table(title=f"Tuned: {verdict.goal.name}, {'less' if verdict.goal.minimize else 'more'} is better")
-    for column in ("knob", "before", "after"):
-        table.add_column(column, justify="left" if column == "knob" else "right")
-    for name in after:
-        table.add_row(name, f"{before[name]:g}", f"{after[name]:g}")
+    for column in ("parameter", "before", "after"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    for name, value in tuned.after.items():
+        table.add_row(name, f"{tuned.before[name]:g}", f"{value:g}")
     console.print(table)
-    for line in _told(verdict):
+    notes = [f"note: {note}" for side in (verdict.tuned, verdict.held) if side is not None for note in side.notes]
+    for line in (*verdict.lines(), *notes):
         console.print(line, markup=False, highlight=False)
-    for side in (verdict.tuned, verdict.held):
-        for note in () if side is None else side.notes:
-            console.print(f"note: {note}", markup=False, highlight=False)
     typer.echo(f"{folder}: {TUNED} (for --config), {REPORT}, {RUN}")
-
-
-def _told(verdict: "Verdict") -> list[str]:
-    """What tuning was worth, a line for each set of clips."""
-    lines = [_line("Tuned on", verdict.tuned, verdict)]
-    return lines if verdict.held is None else [*lines, _line("Held out", verdict.held, verdict)]
-
-
-def _line(what: str, side: "Side", verdict: "Verdict") -> str:
-    from torchvision_dddas.evaluation.studies.sweep import format_value
-
-    goal = verdict.goal
-    pooled, mean = (" -> ".join(map(format_value, pair)) for pair in (side.pooled, side.mean))
-    told = f"{what} ({_clips(len(side.clips))}): {goal.measure} {pooled}"
-    mean = f", mean of clips {mean}" if len(side.clips) > 1 else ""
-    return told + mean + (f": {side.says}" if side.says else "")
-
-
-def _prepared(
-    spec: Any,
-    base: Path,
-    names: list[str],
-    holdout: list[str],
-    clips: list[str],
-    measure: str | None,
-    loss: str | None,
-    device: Any,
-    quiet: bool,
-) -> "Prepared":
-    from torchvision_dddas.cli.progress import progress
-    from torchvision_dddas.tuning.family import prepare
-
-    with progress("examples", None, quiet) as tick:
-        ready = prepare(spec, base, names, holdout, clips, measure, loss, tick)
-    ready.parameters.to(device)
-    return ready
-
-
-def _values(ready: "Prepared") -> dict[str, Any]:
-    """The parameters as settings have them."""
-    dumped = ready.parameters.settings().model_dump()
-    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.parameters.names}
 
 
 def _device(name: str) -> Any:
@@ -413,13 +181,3 @@ def _device(name: str) -> Any:
 def _need_torch() -> None:
     if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
         raise InputError(f"dddas tune needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]'")
-
-
-def _clips(count: int) -> str:
-    return f"{count} clip{'s' * (count != 1)}"
-
-
-def _json(content: Any) -> str:
-    from torchvision_dddas.io.output.run_record import finite
-
-    return json.dumps(finite(content), indent=2) + "\n"

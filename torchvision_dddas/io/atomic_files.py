@@ -27,6 +27,15 @@ def write_whole(path: Path, content: bytes) -> None:
         raise
 
 
+def save_file(path: Path, content: bytes) -> None:
+    """Write a file at once, and the folders above it. Raises InputError where the disk refuses."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, content)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
 def remove(path: Path) -> None:
     """Remove a file if it is there and can be removed: used while another error is on its way to the user."""
     with suppress(OSError):

@@ -12,7 +12,7 @@ import torch
 
 from torchvision_dddas.config import changes
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, save_file
 from torchvision_dddas.tuning.family import Family, loss_of
 from torchvision_dddas.tuning.parameters import Parameters
 
@@ -40,11 +40,7 @@ def write(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> No
     """Write a state. Raises InputError where the disk refuses."""
     content = io.BytesIO()
     torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(place, content.getvalue())
-    except OSError as error:
-        raise cannot_write(place, error) from error
+    save_file(place, content.getvalue())
 
 
 def read(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:

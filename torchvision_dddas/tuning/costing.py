@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.results import Found
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import find, upstream_task
-from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.tuning.parameters import TUNABLE
 
 FACTORS = (0.5, 2.0)
@@ -124,11 +124,7 @@ def points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
 
 def write(place: Path, cost: TimeCost) -> None:
     """Keep what was measured: another time it would be a little other. Raises InputError where the disk refuses."""
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(place, (json.dumps(cost.as_json(), indent=2) + "\n").encode())
-    except OSError as error:
-        raise cannot_write(place, error) from error
+    save_file(place, (json.dumps(cost.as_json(), indent=2) + "\n").encode())
 
 
 def read(place: Path) -> TimeCost:

@@ -14,7 +14,7 @@ from torchvision_dddas.evaluation.studies.jobs import Event
 from torchvision_dddas.evaluation.studies.results import Case, ScoredCase, ScoredStudy
 from torchvision_dddas.evaluation.studies.runner import Plan, run_study
 from torchvision_dddas.evaluation.studies.spec import Spec
-from torchvision_dddas.evaluation.studies.sweep import toml_value
+from torchvision_dddas.evaluation.studies.sweep import format_value, toml_value
 from torchvision_dddas.evaluation.studies.workers import Workers
 
 BEFORE, AFTER = "before", "after"
@@ -48,6 +48,17 @@ class Verdict:
     goal: Goal
     tuned: Side
     held: Side | None
+
+    def lines(self) -> list[str]:
+        """What tuning was worth, a line for each set of clips."""
+        sides = {"Tuned on": self.tuned, "Held out": self.held}
+        return [self._line(name, side) for name, side in sides.items() if side is not None]
+
+    def _line(self, name: str, side: Side) -> str:
+        pooled, mean = (" -> ".join(map(format_value, pair)) for pair in (side.pooled, side.mean))
+        mean = f", mean of clips {mean}" if len(side.clips) > 1 else ""
+        says = f": {side.says}" if side.says else ""
+        return f"{name} ({count_clips(side.clips)}): {self.goal.measure} {pooled}{mean}{says}"
 
     def told(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -152,3 +163,8 @@ def _told(side: Side) -> dict[str, Any]:
         "changes": side.changes,
         "notes": side.notes,
     }
+
+
+def count_clips(clips: Sequence[str]) -> str:
+    """`1 clip`, `2 clips`."""
+    return f"{len(clips)} clip{'s' * (len(clips) != 1)}"

@@ -1,0 +1,255 @@
+"""A whole tuning run on a study: examples, descent, figures before and after, and the files that record it."""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchvision_dddas.config import all_parameters
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.studies.spec import Spec
+from torchvision_dddas.evaluation.studies.sweep import settings_toml
+from torchvision_dddas.io.atomic_files import cannot_write, save_file
+from torchvision_dddas.io.output.run_record import finite, versions
+from torchvision_dddas.tuning import costing
+from torchvision_dddas.tuning.checkpoint import set_aside
+from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
+from torchvision_dddas.tuning.family import Prepared, loss_of, prepare
+from torchvision_dddas.tuning.parameters import TUNABLE
+from torchvision_dddas.tuning.report import tuning_report
+from torchvision_dddas.tuning.verdict import Shown, Verdict, count_clips, judge
+
+CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
+OLD, OLD_COST = "checkpoint.old.pt", "cost.old.json"
+FILES = (CHECKPOINT, OLD, COST, OLD_COST, TUNED, REPORT, RUN)
+
+
+@dataclass(frozen=True)
+class Display:
+    """What to call while a run is under way; by default nothing is shown.
+
+    message: with a line of text. step: with every step. progress: with a name and a count, or None where the count is
+    unknown; gives a function to call after each item. study: as `judge` takes it.
+    """
+
+    message: Callable[[str], object] = lambda line: None
+    step: Callable[[Step], object] = lambda step: None
+    progress: Callable[[str, int | None], AbstractContextManager[Callable[[], object]]] = lambda name, count: (
+        nullcontext(lambda: None)
+    )
+    study: Shown = lambda: nullcontext((lambda plan: None, lambda event: None))
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The result of a run. before, after: values of the tuned parameters.
+
+    failed: why the run stopped early, in one line; empty where it did not.
+    """
+
+    descended: Descended
+    verdict: Verdict
+    before: Mapping[str, Any]
+    after: Mapping[str, Any]
+    failed: str = ""
+
+
+class Tuner:
+    """Tunes parameters on the clips of a study and writes FILES into a folder.
+
+    tuned.toml holds the settings for --config, report.html and run.json what happened, checkpoint.pt the descent.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        plan: Plan | None = None,
+        *,
+        time_weight: float | None = None,
+        resume: bool = False,
+        device: torch.device | str = "cpu",
+        jobs: int | None = None,
+        cache: Path | None = None,
+        display: Display | None = None,
+    ) -> None:
+        """time_weight: the loss that a frame of twice the time costs; None leaves time out. device: of the descent.
+
+        resume: go on from the folder's checkpoint where there is one. jobs, cache: as `judge` takes them.
+        """
+        self._folder, self._plan, self._resume, self._device = folder, plan or Plan(), resume, device
+        self._time_weight, self._jobs, self._cache = time_weight, jobs, cache
+        self._display = display or Display()
+        self._seconds: dict[str, float] = {}
+        self._state: dict[str, str] = {}
+
+    def run(
+        self,
+        study: Spec,
+        base: Path,
+        names: Sequence[str],
+        holdout: Sequence[str] = (),
+        clips: Sequence[str] = (),
+        measure: str | None = None,
+        loss: str | None = None,
+    ) -> Tuned:
+        """Prepare, descend, measure before and after, and record it. The arguments are those of `prepare`.
+
+        Raises InputError as `prepare`, `descend` and `judge` do, and where the folder cannot be written. A loss that is
+        not finite is no error here: `Tuned.failed` says so, and the last good state is measured and written.
+        """
+        self._check_folder()
+        try:
+            return self._run(lambda tick: prepare(study, base, names, holdout, clips, measure, loss, tick))
+        except BaseException:
+            if self._state:  # otherwise the record of an earlier run in this folder is still there
+                with suppress(InputError):
+                    self._write(RUN, _json({**self._state, "state": "interrupted"}))
+            raise
+
+    def _run(self, prepare_examples: Callable[[Callable[[], object]], Prepared]) -> Tuned:
+        with self._timed("examples"), self._display.progress("examples", None) as tick:
+            ready = prepare_examples(tick)
+        ready.parameters.to(self._device)
+        held = f", {count_clips(ready.held)} held out" if ready.held else ""
+        count = f"{len(ready.examples)} examples of {count_clips(ready.tuned)}"
+        self._display.message(f"{ready.family.name}: {count}{held}")
+        cost = None if self._time_weight is None else self._measure_cost(ready, self._time_weight)
+        before = _values(ready)
+        place = self._folder / CHECKPOINT
+        if self._resume and not place.is_file():
+            self._display.message(f"there is no checkpoint at {place}: it begins anew")
+
+        def tell(step: Step) -> None:
+            if not self._state:
+                self._begin_record(ready, cost)
+            self._display.step(step)
+
+        with self._timed("descent"):
+            found = descend(ready.family, ready.parameters, ready.examples, self._plan, cost, tell, place, self._resume)
+        after = _values(ready)
+        self._write_settings(ready, found, ())
+        with self._timed("before and after"):
+            verdict = judge(
+                ready.spec,
+                ready.base,
+                ready.goal,
+                after,
+                ready.tuned,
+                ready.held,
+                self._jobs,
+                self._cache,
+                self._display.study,
+            )
+        self._write_settings(ready, found, verdict.lines())
+        record = self._record(ready, found, cost, before, verdict)
+        self._write(REPORT, tuning_report(finite(record)))
+        self._write(RUN, _json(record))
+        last_good = f"{self._folder / TUNED} holds the last good state, of step {found.best}"
+        return Tuned(found, verdict, before, after, f"{found.failed}; {last_good}" if found.failed else "")
+
+    def _check_folder(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=self._folder).close()
+        except OSError as error:
+            raise cannot_write(self._folder / RUN, error) from error
+
+    def _measure_cost(self, ready: Prepared, weight: float) -> costing.TimeCost:
+        """The time that the parameters cost on the shortest clip; a resumed descent keeps what was measured for it."""
+        place = self._folder / COST
+        if self._resume and place.is_file() and (self._folder / CHECKPOINT).is_file():
+            # Another weight is another descent, which the checkpoint refuses.
+            return replace(costing.read(place), weight=weight)
+        clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
+        names, settings = ready.parameters.names, ready.parameters.base
+        count = costing.REPEATS * len(costing.points(settings, names))
+        with self._timed("cost"), self._display.progress("what time costs", count) as tick:
+            return costing.measured(clip, ready.goal.task, settings, names, weight, ready.spec.backend, tick=tick)
+
+    def _begin_record(self, ready: Prepared, cost: costing.TimeCost | None) -> None:
+        """Called with the first step, so that a refused run leaves the files of an earlier one alone."""
+        if not self._resume:
+            place, aside = self._folder / CHECKPOINT, self._folder / OLD
+            if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
+                self._display.message(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
+        if cost is not None:
+            costing.write(self._folder / COST, cost)
+        state = {"state": "running", "study": ready.spec.name}
+        self._write(RUN, _json(state))
+        self._state = state
+
+    def _write_settings(self, ready: Prepared, found: Descended, lines: Sequence[str]) -> None:
+        about = f"dddas tune: {', '.join(ready.parameters.names)} on {', '.join(ready.tuned)}, step {found.best}."
+        self._write(TUNED, settings_toml(found.settings, [about, *(f"{line}." for line in lines)]))
+
+    def _record(
+        self,
+        ready: Prepared,
+        found: Descended,
+        cost: costing.TimeCost | None,
+        before: Mapping[str, Any],
+        verdict: Verdict,
+    ) -> dict[str, Any]:
+        """The content of run.json and of the report."""
+        spec, after = ready.spec, _values(ready)
+        meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
+        charged = None
+        if cost is not None:
+            values = {name: value.detach() for name, value in ready.parameters.values().items()}
+            charged = {**cost.as_json(), "expected": float(cost.expected(values))}
+        return {
+            "state": "failed" if found.failed else "complete",
+            "versions": versions(),
+            "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
+            "family": ready.family.name,
+            "loss": loss_of(ready.family) or None,
+            "plan": asdict(self._plan),
+            "examples": len(ready.examples),
+            "knobs": {
+                name: {
+                    "before": before[name],
+                    "after": after[name],
+                    "unit": TUNABLE[name].unit,
+                    "range": TUNABLE[name].range,
+                    "meaning": meaning[name],
+                    "idle": name in found.idle,
+                }
+                for name in ready.parameters.names
+            },
+            "best": found.best,
+            "taken": found.taken,
+            "ended": found.ended,
+            "failed": found.failed,
+            "history": [
+                {"knobs" if name == "parameters" else name: value for name, value in asdict(step).items()}
+                for step in found.history
+            ],
+            "cost": charged,
+            "verdict": verdict.told(),
+            "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},
+        }
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._seconds[what] = time.perf_counter() - began
+
+    def _write(self, name: str, text: str) -> None:
+        save_file(self._folder / name, text.encode())
+
+
+def _values(ready: Prepared) -> dict[str, Any]:
+    """The parameters as settings have them."""
+    dumped = ready.parameters.settings().model_dump()
+    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.parameters.names}
+
+
+def _json(content: Any) -> str:
+    return json.dumps(finite(content), indent=2) + "\n"
