@@ -70,9 +70,7 @@ def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Pa
 
 def test_a_list_of_numbers_can_be_a_parameter() -> None:
     class Gaps(Group):
-        gaps: tuple[Annotated[int, Field(ge=1, le=30)], ...] = parameter(
-            (1, 2), "frames", meaning="how far to look back"
-        )
+        gaps: tuple[Annotated[int, Field(ge=1, le=30)], ...] = parameter((1, 2), "how far to look back", "frames")
 
     assert range_of(Gaps.model_fields["gaps"]) == "a list of 1 to 30"
     with pytest.raises(ValidationError):

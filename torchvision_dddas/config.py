@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from torchvision_dddas.errors import InputError
 
 # --------------------------------------------------------------------------------------------------------------------
-# The parameters. A new one is a line in a group: type, default, unit, lowest, highest, meaning.
+# The parameters. A new one is a line in a group: type, default, meaning, unit, lowest, highest.
 
 
 def _odd(value: int) -> int:
@@ -27,8 +27,8 @@ def _odd(value: int) -> int:
 Odd = Annotated[int, AfterValidator(_odd)]
 
 
-def parameter(default: Any, unit: str, low: float | None = None, high: float | None = None, *, meaning: str) -> Any:
-    """A field of a group: default, unit (`-` for a bare number), inclusive range, and what it does."""
+def parameter(default: Any, meaning: str, unit: str = "-", low: float | None = None, high: float | None = None) -> Any:
+    """A field of a group: default, meaning, unit (`-` for a bare number) and inclusive range."""
     return Field(default, ge=low, le=high, description=meaning, json_schema_extra={"unit": unit})
 
 
@@ -50,64 +50,60 @@ class RegistrationParameters(Group):
     """How the background's motion between two frames is found (appendix B, steps S1 to S3)."""
 
     model: Literal["homography", "affine"] = parameter(
-        "homography", "-", meaning="the background's motion: homography, or the earlier affine baseline"
+        "homography", "model of the background's motion; affine is the earlier baseline"
     )
-    keypoints: int = parameter(500, "points", 50, 5000, meaning="budget of good features to track in a frame")
+    keypoints: int = parameter(
+        500, "largest number of keypoints in a frame (good features to track)", "points", 50, 5000
+    )
     cell_px: int = parameter(
-        16, "px", 4, 256, meaning="side of the grid cell that yields its best point; grows until the budget holds"
+        16, "side of the grid cells, which keep their best point each; grows until `keypoints` suffice", "px", 4, 256
     )
     quality: float = parameter(
-        0.01, "-", 1e-4, 0.5, meaning="smaller eigenvalue of a point, as a share of the frame's largest"
+        0.01, "smallest eigenvalue of a point, as a share of the frame's largest", "-", 1e-4, 0.5
     )
-    block_px: Odd = parameter(5, "px", 3, 15, meaning="window over which the structure tensor is summed, odd")
-    window_px: Odd = parameter(21, "px", 5, 51, meaning="Lucas-Kanade's window, odd")
-    levels: int = parameter(4, "levels", 0, 6, meaning="pyramid levels above the full resolution")
-    iterations: int = parameter(30, "steps", 1, 100, meaning="Lucas-Kanade steps a level at most")
-    epsilon_px: float = parameter(0.01, "px", 1e-4, 1, meaning="a Lucas-Kanade step shorter than this ends the search")
+    block_px: Odd = parameter(5, "window over which the structure tensor is summed, odd", "px", 3, 15)
+    window_px: Odd = parameter(21, "Lucas-Kanade's window, odd", "px", 5, 51)
+    levels: int = parameter(4, "pyramid levels above full resolution", "levels", 0, 6)
+    iterations: int = parameter(30, "largest number of Lucas-Kanade steps per level", "steps", 1, 100)
+    epsilon_px: float = parameter(0.01, "Lucas-Kanade stops when a step is shorter than this", "px", 1e-4, 1)
     forward_backward_px: float = parameter(
-        1.0, "px", 0, 20, meaning="a point tracked there and back may miss its start by this; 0 leaves the check out"
+        1.0, "largest error of a point tracked forth and back; 0 switches the check off", "px", 0, 20
     )
     ransac_px: float = parameter(
-        2.0, "px", 0.1, 20, meaning="a point this close to the model's prediction is an inlier"
+        2.0, "a point within this distance of the model's prediction is an inlier", "px", 0.1, 20
     )
-    hypotheses: int = parameter(128, "models", 8, 4096, meaning="models drawn by RANSAC")
+    hypotheses: int = parameter(128, "number of models that RANSAC draws", "models", 8, 4096)
     redetect_frames: int = parameter(
-        1, "frames", 1, 60, meaning="new keypoints every so many frames; between, inliers are carried on (onboard)"
+        1, "detect keypoints every so many frames, and track the inliers in between (onboard)", "frames", 1, 60
     )
-    halved: bool = parameter(False, "-", meaning="search pictures of half the size: quicker, half as exact (onboard)")
-    min_inliers: int = parameter(20, "points", 4, 5000, meaning="fewer inliers make the registration unreliable")
+    halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
+    min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
     min_inlier_share: float = parameter(
-        0.4, "-", 0, 1, meaning="a smaller share of inliers makes the registration unreliable"
+        0.4, "with a smaller share of inliers the registration is unreliable", "-", 0, 1
     )
 
 
 class IntervalParameters(Group):
     """The detection interval and the rule that steers it (appendix B, eq. 2)."""
 
-    rule: bool = parameter(True, "-", meaning="steer the interval by altitude, speed and rate; false keeps `frames`")
-    frames: int = parameter(3, "frames", 1, 60, meaning="the interval at the start, and for good where the rule is off")
-    minimum_frames: int = parameter(3, "frames", 1, 60, meaning="shortest interval that the rule may choose")
-    maximum_frames: int = parameter(8, "frames", 1, 60, meaning="longest interval that the rule may choose")
+    rule: bool = parameter(True, "adapt the interval to altitude, speed and frame rate; false keeps `frames`")
+    frames: int = parameter(3, "interval at the start; the only one if `rule` is false", "frames", 1, 60)
+    minimum_frames: int = parameter(3, "shortest interval that the rule may choose", "frames", 1, 60)
+    maximum_frames: int = parameter(8, "longest interval that the rule may choose", "frames", 1, 60)
     reference_altitude_m: float = parameter(
-        20.0, "m", 1, 1000, meaning="altitude above ground at which the interval is one frame"
+        20.0, "altitude above ground at which the interval is one frame", "m", 1, 1000
     )
-    reference_speed_m_s: float = parameter(
-        5.0, "m/s", 0.1, 100, meaning="ground speed at which the interval is one frame"
-    )
-    reference_rate_hz: float = parameter(10.0, "1/s", 1, 240, meaning="frame rate at which the interval is one frame")
+    reference_speed_m_s: float = parameter(5.0, "ground speed at which the interval is one frame", "m/s", 0.1, 100)
+    reference_rate_hz: float = parameter(10.0, "frame rate at which the interval is one frame", "1/s", 1, 240)
     reference_flow: float = parameter(
-        0.02,
-        "widths",
-        1e-4,
-        1,
-        meaning="without telemetry: background flow a frame, as a share of the width, at which the interval is one",
+        0.02, "without telemetry: background flow per frame at which the interval is one frame", "widths", 1e-4, 1
     )
     lowest_speed_m_s: float = parameter(
-        0.5, "m/s", 0.01, 10, meaning="floor of the speed, so that hovering gives the longest interval"
+        0.5, "slower speeds count as this speed, so that hovering gives the longest interval", "m/s", 0.01, 10
     )
-    cost: float = parameter(1.0, "-", 0.1, 10, meaning="cost of one step relative to its reference (O in eq. 2)")
+    cost: float = parameter(1.0, "cost of one step relative to its reference (O in eq. 2)", "-", 0.1, 10)
     memory_frames: int = parameter(
-        9, "frames", 1, 100, meaning="steps over which the background flow's median is taken"
+        9, "number of steps over which the median of the background flow is taken", "frames", 1, 100
     )
 
 
@@ -116,139 +112,140 @@ class DifferenceParameters(Group):
 
     kind: Literal["normalized", "to_reference", "between_later"] = parameter(
         "normalized",
-        "-",
-        meaning="normalized: the difference to both neighbours in units of local noise, exposure corrected; "
-        "to_reference: min(|I(t) - W1|, |I(t) - W2|) in grey levels, a clear change of exposure undone; "
-        "between_later: |W2 - W1|, the source's eq. 9",
+        "normalized: difference to both neighbours in units of local noise, exposure corrected; to_reference: "
+        "min(|I(t) - W1|, |I(t) - W2|) in grey levels, clear changes of exposure corrected; between_later: |W2 - "
+        "W1|, the source's eq. 9",
     )
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = parameter(
-        (1, 2), "frames", meaning="distances of the neighbours on either side of the reference frame"
+        (1, 2), "distances from the reference frame to its neighbours, on both sides", "frames"
     )
-    wide_frames: int = parameter(6, "frames", 0, 60, meaning="distance of the pair that fills large targets; 0 is none")
-    noise_levels: float = parameter(4.0, "grey levels", 0.1, 50, meaning="noise of a flat region (normalized)")
+    wide_frames: int = parameter(
+        6, "distance of the pair of frames that fills large targets; 0 switches it off", "frames", 0, 60
+    )
+    noise_levels: float = parameter(4.0, "noise of a flat region (normalized)", "grey levels", 0.1, 50)
     gradient_share: float = parameter(
-        0.12, "-", 0, 2, meaning="share of the local gradient that counts as noise, for errors of registration"
+        0.12, "share of the local gradient that counts as noise, for registration errors", "-", 0, 2
     )
     threshold: float = parameter(
-        3.5, "-", 0.1, 255, meaning="a larger difference is foreground: noise units if normalized, else grey levels"
+        3.5, "larger differences are foreground; noise units if normalized, else grey levels", "-", 0.1, 255
     )
-    peak: float = parameter(7.0, "-", 0, 255, meaning="a target's largest difference reaches at least this, same unit")
-    blur_px: Odd = parameter(5, "px", 1, 31, meaning="Gaussian kernel on the difference, odd; 1 is none")
-    border_px: int = parameter(4, "px", 0, 50, meaning="strip inside a warped frame's border that counts as outside")
-    halved: bool = parameter(
-        False, "-", meaning="compare pictures of half the size: quicker, coarser outlines (onboard)"
-    )
+    peak: float = parameter(7.0, "smallest peak difference of a target, same unit as the threshold", "-", 0, 255)
+    blur_px: Odd = parameter(5, "Gaussian kernel applied to the difference, odd; 1 switches it off", "px", 1, 31)
+    border_px: int = parameter(4, "width of the strip along a warped frame's border that is ignored", "px", 0, 50)
+    halved: bool = parameter(False, "compare frames at half resolution: faster, coarser outlines (onboard)")
 
 
 class MorphologyParameters(Group):
     """How the silhouette is cleaned (appendix B, step S5)."""
 
     erode_px: int = parameter(
-        3, "px", 1, 31, meaning="ellipse that erodes the silhouette: precision up, recall down; 1 is none"
+        3, "ellipse that erodes the silhouette: raises precision, lowers recall; 1 switches it off", "px", 1, 31
     )
     close_px: int = parameter(
-        25, "px", 1, 101, meaning="ellipse that closes gaps between fragments of one target; 1 is none"
+        25, "ellipse that closes gaps between fragments of one target; 1 switches it off", "px", 1, 101
     )
     close_m: float = parameter(
-        0.0, "m", 0, 100, meaning="with telemetry: gaps up to this on the ground, close_px at the most; 0: close_px"
+        0.0, "with telemetry: largest gap to close, at most close_px; 0 always uses close_px", "m", 0, 100
     )
-    hull: bool = parameter(True, "-", meaning="take the convex hull of every blob")
+    hull: bool = parameter(True, "replace every blob by its convex hull")
 
 
 class RefineParameters(Group):
     """Redrawing a target's outline by its motion and its colours."""
 
-    on: bool = parameter(True, "-", meaning="refine outlines; false leaves the blobs of the morphology")
-    spatial_px: float = parameter(90.0, "px", 1, 500, meaning="how far evidence spreads where colours do not change")
-    colour_levels: float = parameter(80.0, "grey levels", 1, 1000, meaning="change of colour that stops the spread")
-    share: float = parameter(
-        0.55, "-", 0.05, 0.95, meaning="share of foreground evidence that makes a pixel foreground"
+    on: bool = parameter(True, "refine outlines; false keeps the blobs of the morphology")
+    spatial_px: float = parameter(
+        90.0, "distance over which foreground evidence spreads where colours are constant", "px", 1, 500
     )
+    colour_levels: float = parameter(80.0, "change of colour that stops the spread", "grey levels", 1, 1000)
+    share: float = parameter(0.55, "share of foreground evidence above which a pixel is foreground", "-", 0.05, 0.95)
     shadow_share: float = parameter(
-        0.01, "-", 0, 1, meaning="cast shadows are cut off blobs of at most this share of the picture"
+        0.01, "cast shadows are removed from blobs of at most this share of the picture", "-", 0, 1
     )
 
 
 class PersistenceParameters(Group):
     """What a blob must show over time to be a target: moving as one, steadily, unlike its surroundings."""
 
-    on: bool = parameter(True, "-", meaning="test blobs by flow and persistence; false passes every blob")
-    flow_share: float = parameter(0.3, "-", 0, 1, meaning="share of a blob's core that must move steadily for the test")
-    sure_share: float = parameter(0.7, "-", 0, 1, meaning="share at which a large blob needs no further frames")
-    links: int = parameter(3, "frames", 1, 5, meaning="of two frames before, itself and two after: seen in so many")
-    passes: int = parameter(2, "frames", 0, 5, meaning="of those, so many pass the flow test")
-    large_share: float = parameter(
-        0.02, "-", 0, 1, meaning="a blob of this share of the picture needs one link and no flow test"
+    on: bool = parameter(True, "test blobs by flow and persistence; false accepts every blob")
+    flow_share: float = parameter(
+        0.3, "share of a blob's core that must move steadily to pass the flow test", "-", 0, 1
     )
-    weak_links: int = parameter(4, "frames", 1, 5, meaning="a blob that only the wide pair shows: seen in so many ...")
-    weak_passes: int = parameter(3, "frames", 0, 5, meaning="... and passing the flow test in so many")
+    sure_share: float = parameter(0.7, "a large blob with at least this share needs no further frames", "-", 0, 1)
+    links: int = parameter(
+        3, "frames out of five (two before, itself, two after) in which a blob must be seen", "frames", 1, 5
+    )
+    passes: int = parameter(2, "number of these frames in which it must pass the flow test", "frames", 0, 5)
+    large_share: float = parameter(
+        0.02, "a blob of at least this share of the picture needs one link and no flow test", "-", 0, 1
+    )
+    weak_links: int = parameter(4, "`links` for a blob that only the wide pair of frames shows", "frames", 1, 5)
+    weak_passes: int = parameter(3, "`passes` for a blob that only the wide pair of frames shows", "frames", 0, 5)
     trusted_blobs: int = parameter(
-        4, "blobs", 0, 1000, meaning="where no more blobs are seen a frame, one link does: parallax comes in crowds"
+        4, "with at most this many blobs per frame one link is enough: parallax causes many", "blobs", 0, 1000
     )
 
 
 class SmallParameters(Group):
     """Small slow targets: weak evidence over a longer gap, confirmed by steady travel."""
 
-    on: bool = parameter(True, "-", meaning="look for small slow targets while the interval is long enough")
-    from_interval: int = parameter(3, "frames", 1, 60, meaning="shortest interval at which they are looked for")
-    gap_frames: int = parameter(
-        6, "frames", 1, 30, meaning="distance of the neighbours on either side, no longer than the interval"
+    on: bool = parameter(True, "detect small slow targets while the interval is long enough")
+    from_interval: int = parameter(3, "shortest interval at which they are detected", "frames", 1, 60)
+    gap_frames: int = parameter(6, "distance to the neighbours on both sides, at most the interval", "frames", 1, 30)
+    threshold: float = parameter(6.0, "smallest difference of a candidate", "grey levels", 1, 255)
+    noise_ratio: float = parameter(
+        6.0, "smallest difference of a candidate as a multiple of the picture's mean difference", "-", 0, 100
     )
-    threshold: float = parameter(6.0, "grey levels", 1, 255, meaning="a larger difference makes a candidate, ...")
-    noise_ratio: float = parameter(6.0, "-", 0, 100, meaning="... one that is also this many times the picture's mean")
-    close_px: int = parameter(13, "px", 1, 31, meaning="ellipse that joins the parts of a candidate; 1 is none")
-    min_area_px: int = parameter(12, "px", 1, 10_000, meaning="smallest area of a candidate")
-    max_box_px: int = parameter(1500, "px", 10, 1_000_000, meaning="largest box of a candidate, pixels of area")
-    max_candidates: int = parameter(80, "blobs", 1, 10_000, meaning="with more of them in a frame, none is followed")
-    max_blobs: int = parameter(
-        4, "blobs", 0, 1000, meaning="with more large blobs than this about, parallax may be at work, ..."
-    )
+    close_px: int = parameter(13, "ellipse that joins the parts of a candidate; 1 switches it off", "px", 1, 31)
+    min_area_px: int = parameter(12, "smallest area of a candidate", "px", 1, 10_000)
+    max_box_px: int = parameter(1500, "largest box area of a candidate", "px", 10, 1_000_000)
+    max_candidates: int = parameter(80, "with more candidates in a frame none is tracked", "blobs", 1, 10_000)
+    max_blobs: int = parameter(4, "with more large blobs than this, parallax is tested for", "blobs", 0, 1000)
     parallax_px: float = parameter(
-        0.15, "px", 0, 10, meaning="... and is where inliers miss the registration by more: no small target is reported"
+        0.15, "residual of inliers that indicates parallax; then no small target is reported", "px", 0, 10
     )
     gate_px: float = parameter(
-        4.0, "px", 0.5, 50, meaning="a candidate this close to a track's prediction continues it"
+        4.0, "largest distance between a track's prediction and the candidate that continues it", "px", 0.5, 50
     )
-    hits: int = parameter(10, "frames", 2, 60, meaning="frames with a candidate that confirm a track at the earliest")
-    min_travel_px: float = parameter(3.0, "px", 0, 100, meaning="a confirmed track has travelled at least this")
-    sureness: float = parameter(8.0, "-", 1, 100, meaning="... at a speed of so many of its standard deviations")
-    misses: int = parameter(3, "frames", 0, 30, meaning="frames without a candidate after which a track ends")
+    hits: int = parameter(10, "frames with a candidate that a track needs to be confirmed", "frames", 2, 60)
+    min_travel_px: float = parameter(3.0, "smallest distance that a confirmed track has travelled", "px", 0, 100)
+    sureness: float = parameter(8.0, "smallest speed of a confirmed track, in its standard deviations", "-", 1, 100)
+    misses: int = parameter(3, "a track ends after this many frames without a candidate", "frames", 0, 30)
 
 
 class HistoryParameters(Group):
     """The motion history, its gradient and the segmentation by motion (appendix B, step S5)."""
 
     on: bool = parameter(
-        True, "-", meaning="heading and speed from the history where the chain computes no flow; part touching targets"
+        True, "motion history for heading and speed where no flow is computed, and to split touching targets"
     )
-    duration_frames: float = parameter(6.0, "frames", 1, 120, meaning="how long a silhouette stays in the history")
+    duration_frames: float = parameter(6.0, "how long a silhouette stays in the history", "frames", 1, 120)
     delta_min_frames: float = parameter(
-        0.5, "frames", 0, 60, meaning="smallest difference of time stamps that makes a gradient"
+        0.5, "smallest difference of time stamps that gives a gradient", "frames", 0, 60
     )
     delta_max_frames: float = parameter(
-        4.0, "frames", 0, 120, meaning="largest difference of time stamps that makes a gradient"
+        4.0, "largest difference of time stamps that gives a gradient", "frames", 0, 120
     )
     segmentation_threshold_frames: float = parameter(
-        1.0, "frames", 0, 60, meaning="neighbours whose stamps differ by more belong to different motions"
+        1.0, "neighbours whose time stamps differ by more belong to different motions", "frames", 0, 60
     )
 
 
 class GateParameters(Group):
     """Which blobs can be targets; the bounds in metres hold when telemetry is given (appendix A)."""
 
-    min_area_px: int = parameter(300, "px", 1, 1_000_000, meaning="smallest foreground area of a target")
-    min_size_m: float = parameter(0.2, "m", 0, 100, meaning="shortest longer side of a target on the ground")
-    max_size_m: float = parameter(25.0, "m", 0.1, 1000, meaning="longest longer side of a target on the ground")
-    max_speed_m_s: float = parameter(60.0, "m/s", 0.1, 500, meaning="fastest target over ground")
+    min_area_px: int = parameter(300, "smallest foreground area of a target", "px", 1, 1_000_000)
+    min_size_m: float = parameter(0.2, "smallest length of a target on the ground", "m", 0, 100)
+    max_size_m: float = parameter(25.0, "largest length of a target on the ground", "m", 0.1, 1000)
+    max_speed_m_s: float = parameter(60.0, "largest speed of a target over ground", "m/s", 0.1, 500)
     focal_px: float = parameter(
-        1000.0, "px", 10, 100_000, meaning="focal length: px bounds are metric bounds x focal / altitude"
+        1000.0, "focal length: bounds in px are bounds in m x focal length / altitude", "px", 10, 100_000
     )
     expected_size_m: float = parameter(
-        1.7, "m", 0.05, 100, meaning="size of a typical small target: sets the smallest area when telemetry is given"
+        1.7, "size of a typical small target: sets the smallest area if telemetry is given", "m", 0.05, 100
     )
     expected_share: float = parameter(
-        0.1, "-", 0.01, 1, meaning="share of the expected target's square that its foreground fills at least"
+        0.1, "smallest share of the expected target's square that is foreground", "-", 0.01, 1
     )
 
 
@@ -256,182 +253,147 @@ class TrackParameters(Group):
     """Which detections become tracks, how they are linked, and how long a track lives. Lengths are in box heights."""
 
     mode: Literal["default", "paper"] = parameter(
-        "default", "-", meaning="default: links scored by motion, size and appearance; paper: the source's affinity"
+        "default", "default: links scored by motion, size and appearance; paper: the source's affinity"
     )
-    look_ahead: bool = parameter(True, "-", meaning="decide with the next frame in view (K = 3); false decides at once")
+    look_ahead: bool = parameter(True, "decide with the next frame in view (K = 3); false decides at once")
     appearance: Literal["always", "ambiguous", "never"] = parameter(
-        "ambiguous", "-", meaning="compare pictures of targets: always, where locations leave a doubt, or never"
+        "ambiguous", "compare appearance: always, only where locations are ambiguous, or never"
     )
-    min_score: float = parameter(0.7, "-", 0, 1, meaning="detections of a lower score are no part of any track")
-    birth_score: float = parameter(0.95, "-", 0, 1, meaning="a detection of at least this score may begin a track")
-    hits: int = parameter(3, "frames", 1, 60, meaning="detections that confirm a track; one of score 1 does so alone")
-    smooth: bool = parameter(True, "-", meaning="move boxes of a score below 1 to where their track was")
-    memory_frames: int = parameter(125, "frames", 1, 10_000, meaning="how long a track that is not seen is remembered")
-    memory_outside_frames: int = parameter(10, "frames", 1, 10_000, meaning="the same once it has left the picture")
-    speed: float = parameter(0.07, "heights/frame", 1e-4, 10, meaning="typical speed at the start; adapts to the scene")
-    agility: float = parameter(0.009, "heights/frame", 1e-5, 1, meaning="change of velocity in one frame at that speed")
-    scatter: float = parameter(0.06, "heights", 1e-3, 1, meaning="scatter of a detection's centre")
-    size_scatter: float = parameter(0.1, "-", 1e-3, 10, meaning="scatter of the logarithm of a detection's height")
-    prior: float = parameter(4.0, "-", -20, 20, meaning="what any link is worth before it is compared: opens the gate")
+    min_score: float = parameter(0.7, "detections of a lower score are not tracked", "-", 0, 1)
+    birth_score: float = parameter(0.95, "smallest score of a detection that may start a track", "-", 0, 1)
+    hits: int = parameter(3, "detections that confirm a track; a single one of score 1 is enough", "frames", 1, 60)
+    smooth: bool = parameter(True, "move boxes with a score below 1 to the smoothed track")
+    memory_frames: int = parameter(125, "how long an unseen track is kept", "frames", 1, 10_000)
+    memory_outside_frames: int = parameter(10, "how long a track that left the picture is kept", "frames", 1, 10_000)
+    speed: float = parameter(0.07, "typical speed at the start; adapts to the scene", "heights/frame", 1e-4, 10)
+    agility: float = parameter(0.009, "change of velocity per frame at that speed", "heights/frame", 1e-5, 1)
+    scatter: float = parameter(0.06, "standard deviation of a detection's centre", "heights", 1e-3, 1)
+    size_scatter: float = parameter(0.1, "standard deviation of the logarithm of a detection's height", "-", 1e-3, 10)
+    prior: float = parameter(4.0, "score of any link before comparison; a larger value widens the gate", "-", -20, 20)
     tail: float = parameter(
-        4.0, "-", 0.1, 100, meaning="freedom of the distance's law: a small one forgives sharp turns and stops"
+        4.0, "degrees of freedom of the distance's distribution: few tolerate sharp turns and stops", "-", 0.1, 100
     )
-    upright: float = parameter(
-        0.6, "-", 0.1, 2, meaning="distances of standing targets up and down count as larger by one over this"
+    upright: float = parameter(0.6, "vertical distances of standing targets are divided by this", "-", 0.1, 2)
+    rest_drift: float = parameter(0.03, "drift per frame of an unseen target that may stand still", "heights", 1e-4, 1)
+    rest_price: float = parameter(1.0, "cost of assuming that a lost target stood still", "-", 0, 20)
+    missed: float = parameter(0.5, "cost of a gap in a track", "-", 0, 20)
+    border: float = parameter(4.0, "cost of a return after a gap at the picture's border", "-", 0, 20)
+    left: float = parameter(2.0, "cost of a return after a gap of a target last seen at the border", "-", 0, 20)
+    births: float = parameter(2.0, "cost of a return after a gap where new targets keep appearing", "-", 0, 10)
+    own_scatter: float = parameter(0.2, "`scatter` for moving targets that dddas detected", "heights", 1e-3, 1)
+    own_size_scatter: float = parameter(
+        1.0, "`size_scatter` for moving targets that dddas detected, which split and merge", "-", 1e-3, 10
     )
-    rest_drift: float = parameter(
-        0.03, "heights", 1e-4, 1, meaning="drift in one frame of a target that may stand still unseen"
+    own_births: float = parameter(
+        0.0, "`births` for moving targets that dddas detected: most are parts of known targets", "-", 0, 10
     )
-    rest_price: float = parameter(1.0, "-", 0, 20, meaning="price of taking a lost target to have stood still")
-    missed: float = parameter(0.5, "-", 0, 20, meaning="price of a gap in a track")
-    border: float = parameter(4.0, "-", 0, 20, meaning="price of a return after a gap at the picture's border")
-    left: float = parameter(2.0, "-", 0, 20, meaning="price of a return after a gap of who was last seen at the border")
-    births: float = parameter(2.0, "-", 0, 10, meaning="price of a return after a gap where targets keep appearing")
-    own_scatter: float = parameter(0.2, "heights", 1e-3, 1, meaning="scatter for the moving targets found in a clip")
-    own_size_scatter: float = parameter(1.0, "-", 1e-3, 10, meaning="size_scatter for those, which part and join")
-    own_births: float = parameter(0.0, "-", 0, 10, meaning="births for those: most are parts of known targets")
-    appearance_weight: float = parameter(10.0, "-", 0, 100, meaning="weight of the appearance's likeness")
+    appearance_weight: float = parameter(10.0, "weight of the similarity of appearance", "-", 0, 100)
     appearance_offset: float = parameter(
-        0.86, "-", 0, 1, meaning="likeness that speaks neither for a link nor against it"
+        0.86, "similarity of appearance that counts neither for nor against a link", "-", 0, 1
     )
 
 
 class PaperParameters(Group):
     """The source's association as printed (appendix C, III); each reading that it leaves open is a named option."""
 
-    window: int = parameter(3, "frames", 2, 3, meaning="frames associated at once: K of the source")
+    window: int = parameter(3, "number of frames associated at once: K of the source", "frames", 2, 3)
     rule: Literal["dispersion", "fixed"] = parameter(
-        "dispersion", "-", meaning="the weight of location: chosen by the dispersions (III-D), or `weight` for good"
+        "dispersion", "weight of location: dispersion computes it (III-D), fixed takes `weight`"
     )
-    weight: float = parameter(0.7, "-", 0, 1, meaning="share of location in the affinity where the rule is fixed")
+    weight: float = parameter(0.7, "share of location in the affinity if the rule is fixed", "-", 0, 1)
     lowest_dispersion: float = parameter(
-        0.65, "-", 0, 1, meaning="a feature above this tells targets apart: LL of III-D"
+        0.65, "a feature with a larger dispersion separates targets: LL of III-D", "-", 0, 1
     )
     location_cut: float = parameter(
-        0.25, "-", 0, 1, meaning="clusters of locations end at this dissimilarity: the normalised G; empirical"
+        0.25, "dissimilarity at which clusters of locations end: the normalised G; empirical", "-", 0, 1
     )
-    appearance_cut: float = parameter(
-        0.25, "-", 0, 1, meaning="clusters of histograms end at this dissimilarity; empirical"
-    )
+    appearance_cut: float = parameter(0.25, "dissimilarity at which clusters of histograms end; empirical", "-", 0, 1)
     dispersion_of: Literal["smallest", "smallest_if_counts_differ", "newest"] = parameter(
-        "smallest",
-        "-",
-        meaning="which frame of the window speaks for it; the source: smallest if counts differ",
+        "smallest", "which frame of the window gives the dispersion; the source: smallest_if_counts_differ"
     )
     gate: Literal["one_dummy", "every_dummy", "off"] = parameter(
-        "one_dummy",
-        "-",
-        meaning="entries raised to 1 - threshold: with exactly one dummy; with any number, as printed; none",
+        "one_dummy", "entries to raise to 1 - threshold: with one dummy, with any number (as printed), or none"
     )
     gated: Literal["features", "affinity"] = parameter(
-        "features", "-", meaning="gate location and appearance each before they are weighed, or their weighted sum"
+        "features", "gate location and appearance separately, or their weighted sum"
     )
     threshold: float = parameter(
-        0.4, "-", 0, 1, meaning="an entry with a dummy is raised where all real alternatives are below 1 - threshold"
+        0.4, "an entry with a dummy is raised if all real alternatives are below 1 - threshold", "-", 0, 1
     )
     dummy: Literal["zero", "formula"] = parameter(
-        "zero", "-", meaning="affinity with a dummy before the gate: none, or eq. 4 and 5 with a vector of zeros"
+        "zero", "affinity with a dummy before the gate: zero, or eq. 4 and 5 with a zero vector"
     )
     histogram: Literal["channel", "count"] = parameter(
-        "channel", "-", meaning="histograms add up to 1 in each channel, or hold counts, so that size matters too"
+        "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"
     )
     exact_targets: int = parameter(
-        12, "targets", 0, 1000, meaning="three frames with no more targets in any are solved exactly, others ..."
+        12, "up to this many targets per frame the exact solution, else relaxation", "targets", 0, 1000
     )
-    gap: float = parameter(
-        0.005, "-", 0, 1, meaning="... by relaxation, to within this share of the bound where that can be had in time"
-    )
+    gap: float = parameter(0.005, "relaxation aims at a solution within this share of the bound", "-", 0, 1)
 
 
 class PeopleParameters(Group):
     """Recognizing people by HOG and a linear SVM (appendix A, III-B): which windows are scored, and what they yield."""
 
-    classifier: str = parameter(
-        "opencv", "-", meaning="opencv: the coefficients of its default people detector; or a file of a linear SVM's"
-    )
-    graphs: str = parameter(
-        "shipped", "-", meaning="onboard: the ONNX graphs; a folder that `dddas export` made, or shipped"
-    )
-    window_width_px: int = parameter(64, "px", 8, 1024, meaning="width of the window that the classifier sees")
-    window_height_px: int = parameter(128, "px", 8, 1024, meaning="height of the window that the classifier sees")
-    cell_px: int = parameter(8, "px", 2, 64, meaning="side of a cell, which has one histogram")
-    block_px: int = parameter(16, "px", 2, 256, meaning="side of a block of cells, which is normalised as one")
-    block_stride_px: int = parameter(8, "px", 1, 256, meaning="distance from block to block in a window")
-    window_stride_px: int = parameter(
-        8, "px", 1, 256, meaning="distance from window to window in each level of the pyramid"
-    )
-    bins: int = parameter(
-        9, "bins", 2, 36, meaning="directions of a histogram, over half a turn, or a whole one if signed"
-    )
-    signed: bool = parameter(False, "-", meaning="tell a gradient from its opposite; false folds them together")
-    clip: float = parameter(
-        0.2, "-", 0.01, 1, meaning="largest share of a block's norm that one number may have (L2-Hys)"
-    )
-    gamma: bool = parameter(True, "-", meaning="take square roots of the levels first")
-    scale_step: float = parameter(
-        1.05, "-", 1.01, 2, meaning="how much smaller each level of the pyramid is than the last"
-    )
+    classifier: str = parameter("opencv", "opencv: OpenCV's default people detector; or a file with a linear SVM")
+    graphs: str = parameter("shipped", "onboard: shipped, or a folder of ONNX graphs made by `dddas export`")
+    window_width_px: int = parameter(64, "width of the classifier's window", "px", 8, 1024)
+    window_height_px: int = parameter(128, "height of the classifier's window", "px", 8, 1024)
+    cell_px: int = parameter(8, "side of a cell; each cell has one histogram", "px", 2, 64)
+    block_px: int = parameter(16, "side of a block of cells; each block is normalised", "px", 2, 256)
+    block_stride_px: int = parameter(8, "distance between blocks in a window", "px", 1, 256)
+    window_stride_px: int = parameter(8, "distance between windows in each pyramid level", "px", 1, 256)
+    bins: int = parameter(9, "orientation bins of a histogram, over 180 degrees, or 360 if signed", "bins", 2, 36)
+    signed: bool = parameter(False, "distinguish a gradient from its opposite")
+    clip: float = parameter(0.2, "largest share of a block's norm that one element may have (L2-Hys)", "-", 0.01, 1)
+    gamma: bool = parameter(True, "take the square root of the grey levels first")
+    scale_step: float = parameter(1.05, "ratio of the sizes of successive pyramid levels", "-", 1.01, 2)
     enlarge: float = parameter(
         1.5,
+        "scale of the first pyramid level; at 1.5 bodies are found from 64 px; the cost grows with its square",
         "-",
         1,
         4,
-        meaning="the pyramid begins with the picture so many times larger, in whole scale steps: bodies are found from "
-        "height_share x window_height_px / enlarge, 64 px; the cost grows with its square",
     )
-    max_levels: int = parameter(64, "levels", 1, 200, meaning="levels of the pyramid at most")
+    max_levels: int = parameter(64, "largest number of pyramid levels", "levels", 1, 200)
     padding_px: int = parameter(
-        24, "px", 0, 256, meaning="border that each level is given by reflection, for people at it"
+        24, "border added to each level by reflection, to detect people at the border", "px", 0, 256
     )
-    threshold: float = parameter(0.0, "-", -10, 10, meaning="a window whose score is above it may be a person")
+    threshold: float = parameter(0.0, "smallest score of a window that may be a person", "-", -10, 10)
     suppression: Literal["nms", "opencv", "none"] = parameter(
-        "nms",
-        "-",
-        meaning="one box a person: nms keeps the best of windows that overlap; opencv averages groups; none keeps all",
+        "nms", "nms keeps the best of overlapping windows; opencv averages groups; none keeps all"
     )
-    overlap: float = parameter(0.4, "-", 0, 1, meaning="nms: bodies that share more of their union are the same person")
+    overlap: float = parameter(0.4, "nms: bodies with a larger intersection over union are the same person", "-", 0, 1)
     contained: float = parameter(
-        0.7,
-        "-",
-        0,
-        1,
-        meaning="nms: so are those that share more of the smaller one, as legs do with the body; 1: none",
+        0.7, "nms: so are bodies that share more of the smaller one; 1 switches it off", "-", 0, 1
     )
     settle: float = parameter(
-        0.75,
-        "-",
-        0,
-        1,
-        meaning="nms: the box is the mean, by score, of windows that share this much of their union with the best; "
-        "1: the best alone",
+        0.75, "nms: boxes are means of windows with this overlap with the best; 1: the best alone", "-", 0, 1
     )
-    group: int = parameter(2, "windows", 0, 100, meaning="opencv: a group of no more windows than this is dropped")
-    group_distance: float = parameter(0.2, "-", 0, 1, meaning="opencv: edges this close, in box sizes, make a group")
-    height_share: float = parameter(0.738, "-", 0.1, 1, meaning="body height over window height")
-    width_share: float = parameter(0.5, "-", 0.1, 1, meaning="width of the body's box over window width")
-    feet_share: float = parameter(0.845, "-", 0.1, 1.2, meaning="from the window's top to the feet, over window height")
-    probability_slope: float = parameter(
-        2.6, "-", 0.01, 100, meaning="probability = 1 / (1 + exp(-slope (score - even)))"
+    group: int = parameter(2, "opencv: groups of at most this many windows are dropped", "windows", 0, 100)
+    group_distance: float = parameter(0.2, "opencv: edges within this distance, in box sizes, form a group", "-", 0, 1)
+    height_share: float = parameter(0.738, "body height divided by window height", "-", 0.1, 1)
+    width_share: float = parameter(0.5, "body width divided by window width", "-", 0.1, 1)
+    feet_share: float = parameter(
+        0.845, "distance from the window's top to the feet, divided by window height", "-", 0.1, 1.2
     )
-    probability_even: float = parameter(0.8, "-", -10, 10, meaning="score at which a person is as likely as not")
+    probability_slope: float = parameter(2.6, "probability = 1 / (1 + exp(-slope (score - even)))", "-", 0.01, 100)
+    probability_even: float = parameter(0.8, "score at which the probability of a person is 0.5", "-", -10, 10)
     search: Literal["everywhere", "regions"] = parameter(
-        "everywhere",
-        "-",
-        meaning="look at the whole picture in every frame, or around what is expected there and at the rest in turns",
+        "everywhere", "search the whole picture, or regions where people are expected and the rest in turns"
     )
     rescan_frames: int = parameter(
-        10, "frames", 1, 10_000, meaning="regions: in so many frames the whole picture, some of its levels in each"
+        10, "regions: frames in which the whole picture is searched once, some levels in each", "frames", 1, 10_000
     )
     look_share: float = parameter(
         1.0,
+        "regions: largest cost of a frame, as a share of the whole search; 1: no limit (--live: at most 0.1)",
         "-",
         0.001,
         1,
-        meaning="regions: what a look may cost at most, as a share of one at the whole picture, so none takes long: "
-        "picture and regions are then searched in turns from the first look on; 1: no bound. --live takes 0.1 at most",
     )
-    region_margin: float = parameter(0.2, "heights", 0, 5, meaning="regions: so far around a body that is expected")
-    region_scales: float = parameter(1.15, "-", 1, 4, meaning="regions: a body may be this much larger or smaller")
+    region_margin: float = parameter(0.2, "regions: margin around an expected body", "heights", 0, 5)
+    region_scales: float = parameter(1.15, "regions: a body may be larger or smaller by this factor", "-", 1, 4)
 
     @model_validator(mode="after")
     def _cells_fill_blocks_and_blocks_the_window(self) -> "PeopleParameters":
@@ -479,20 +441,18 @@ class GroundParameters(Group):
     """Where people stand, seen from the ground (appendix A, IV-C), and which of several sightings are one person."""
 
     mode: Literal["default", "paper"] = parameter(
-        "default", "-", meaning="default: height and foot row with covariances, on the ellipsoid; paper: eq. 13 to 15"
+        "default", "default: height and foot row with covariances, on the ellipsoid; paper: eq. 13 to 15"
     )
     use: Literal["both", "height", "feet"] = parameter(
-        "both",
-        "-",
-        meaning="what tells the distance: the body's height, the row of its feet, or both by their variances",
+        "both", "measure distance by the body's height, the row of the feet, or both by variance"
     )
-    body_height_m: float = parameter(1.75, "m", 0.3, 3, meaning="height of a typical person")
-    body_height_sigma_m: float = parameter(0.1, "m", 0, 1, meaning="standard deviation of people's heights")
-    height_sigma: float = parameter(0.05, "-", 0, 1, meaning="standard deviation of a box's height, in heights")
-    feet_sigma: float = parameter(0.03, "-", 0, 1, meaning="standard deviation of the foot row, in box heights")
-    gate_sigmas: float = parameter(3.0, "-", 0.5, 10, meaning="sightings further apart than this are not of one person")
+    body_height_m: float = parameter(1.75, "height of a typical person", "m", 0.3, 3)
+    body_height_sigma_m: float = parameter(0.1, "standard deviation of people's heights", "m", 0, 1)
+    height_sigma: float = parameter(0.05, "standard deviation of a box's height, in box heights", "-", 0, 1)
+    feet_sigma: float = parameter(0.03, "standard deviation of the foot row, in box heights", "-", 0, 1)
+    gate_sigmas: float = parameter(3.0, "sightings at a larger distance are different people", "-", 0.5, 10)
     within_frames: int = parameter(
-        0, "frames", 0, 1000, meaning="frames of several cameras no further apart are one look"
+        0, "frames of several cameras this close together count as simultaneous", "frames", 0, 1000
     )
 
 
@@ -500,37 +460,37 @@ class ConfirmParameters(Group):
     """When people seen from the ground decide what a blob seen from the air is: two fidelities (appendix A, III-B)."""
 
     gate_probability: float = parameter(
-        0.99, "-", 0.5, 0.9999, meaning="share of people who lie within the gate of their own blob, by both covariances"
+        0.99, "share of people inside the gate of their own blob, by both covariances", "-", 0.5, 0.9999
     )
     spread_m: float = parameter(
-        0.5, "m", 0, 20, meaning="standard deviation of people about their blob's position, which may be a crowd's"
+        0.5, "standard deviation of people around their blob's position, which may be a crowd's", "m", 0, 20
     )
-    unknown_sigma_m: float = parameter(
-        2.0, "m", 0.01, 100, meaning="standard deviation of a position whose table gives no covariance"
-    )
+    unknown_sigma_m: float = parameter(2.0, "standard deviation of positions without covariance", "m", 0.01, 100)
     inside_sigmas: float = parameter(
-        2.0, "-", 0, 10, meaning="a blob so many of its standard deviations within a view is well within it"
+        2.0, "a blob is well inside a view if this many of its standard deviations are", "-", 0, 10
     )
-    body_width_m: float = parameter(0.6, "m", 0, 10, meaning="what stands nearer, this close to a line of sight, hides")
+    body_width_m: float = parameter(0.6, "nearer objects within this distance of the line of sight occlude", "m", 0, 10)
     least_score: float = parameter(
-        0.5, "-", 0.5, 1, meaning="a person less probable than this tells neither for nor against their blob"
+        0.5, "people of a lower probability count neither for nor against their blob", "-", 0.5, 1
     )
-    detection_rate: float = parameter(0.7, "-", 0.01, 0.999, meaning="share of looks at a person that recognize one")
+    detection_rate: float = parameter(
+        0.7, "share of observations of a person in which one is recognized", "-", 0.01, 0.999
+    )
     false_rate: float = parameter(
-        0.05, "-", 0.001, 0.99, meaning="share of looks at another blob that recognize one there"
+        0.05, "share of observations of other blobs in which a person is recognized", "-", 0.001, 0.99
     )
     crowd_share: float = parameter(
-        0.5, "-", 0, 1, meaning="in pictures: detection rate in a blob as wide as several people, over that of one"
+        0.5, "in pictures: detection rate in a blob of several people, relative to that of one", "-", 0, 1
     )
-    prior: float = parameter(0.5, "-", 0.01, 0.99, meaning="share of the blobs that are people")
+    prior: float = parameter(0.5, "share of blobs that are people", "-", 0.01, 0.99)
     fresh: float = parameter(
-        0.3, "-", 0, 1, meaning="weight of a look that follows another of the same vehicle: they err alike"
+        0.3, "weight of a repeated observation by the same vehicle: its errors are correlated", "-", 0, 1
     )
     limit: float = parameter(
-        7.0, "-", 0.5, 50, meaning="log-odds never pass this, so that later looks can still turn them"
+        7.0, "largest absolute log-odds, so that later observations can still change the result", "-", 0.5, 50
     )
     share: float = parameter(
-        0.5, "-", 0.01, 1, meaning="in pictures: share of the smaller of a person's and a blob's box that both hold"
+        0.5, "in pictures: smallest intersection of a person's and a blob's box, over the smaller box", "-", 0.01, 1
     )
 
 
@@ -538,48 +498,37 @@ class LandmarkParameters(Group):
     """How ground vehicles serve as landmarks: found by colour, told from targets, followed (appendix A, IV-A)."""
 
     differentiation: Literal["exact", "greedy"] = parameter(
-        "exact", "-", meaning="which blob is which landmark: as many as possible at the least distance; or row by row"
+        "exact", "assignment of blobs to landmarks: most pairs at the least distance, or greedy"
     )
     centre: Literal["motion", "colour"] = parameter(
-        "motion",
-        "-",
-        meaning="where a landmark that has a blob is: the blob's centre, or its colour's, the better one where the "
-        "colour is in the middle of the vehicle",
+        "motion", "position of a landmark with a blob: the blob's centre, or the colour's (if in the vehicle's middle)"
     )
-    reach_px: float = parameter(
-        40.0, "px", 0, 10000, meaning="a blob further from a landmark's colour is not the landmark's"
-    )
+    reach_px: float = parameter(40.0, "largest distance between a landmark's colour and its blob", "px", 0, 10000)
     interval_frames: int = parameter(
-        10, "frames", 1, 10000, meaning="every so many frames landmarks are told from targets anew (tracking interval)"
+        10, "frames between two separations of landmarks from targets (tracking interval)", "frames", 1, 10000
     )
-    least_area_px: int = parameter(12, "px", 1, 1_000_000, meaning="a patch of colour smaller than this is none")
-    pixel_sigma: float = parameter(
-        1.0, "px", 0.01, 100, meaning="standard deviation of a landmark's place in the picture"
-    )
+    least_area_px: int = parameter(12, "smaller patches of colour are ignored", "px", 1, 1_000_000)
+    pixel_sigma: float = parameter(1.0, "standard deviation of a landmark's position in the picture", "px", 0.01, 100)
     sigma_m: float = parameter(
-        1.43, "m", 0, 1000, meaning="of a landmark's report where it does not say: a GPS of 3.5 m in 95 %"
+        1.43, "standard deviation of a landmark's report where none is given: GPS with 3.5 m at 95 %", "m", 0, 1000
     )
     common_sigma_m: float = parameter(
-        0.0, "m", 0, 1000, meaning="standard deviation of the error that all the team's receivers share"
+        0.0, "standard deviation of the error common to all receivers of the team", "m", 0, 1000
     )
     gap_s: float = parameter(
-        5.0, "s", 0, 3600, meaning="a dropout of reports longer than this without planned waypoints ends a landmark"
+        5.0, "a landmark ends after a dropout of this length without planned waypoints", "s", 0, 3600
     )
-    drift_m_s: float = parameter(0.5, "m/s", 0, 100, meaning="how fast a place gets uncertain during a dropout")
-    height_m: float = parameter(
-        0.0, "m", 0, 20, meaning="height of the colour above ground, or of the point that the table has pixels of"
-    )
+    drift_m_s: float = parameter(0.5, "growth of the position's uncertainty during a dropout", "m/s", 0, 100)
+    height_m: float = parameter(0.0, "height of the colour (or of the point given in pixels) above ground", "m", 0, 20)
     length_m: float = parameter(
-        4.0, "m", 0.1, 50, meaning="length of a vehicle: what moves at its colour and is no longer is it, and no target"
+        4.0, "vehicle length: a moving blob at its colour up to this length is the landmark, not a target", "m", 0.1, 50
     )
-    least: int = parameter(
-        4, "landmarks", 4, 64, meaning="landmarks used where they are detected well (4-or-more rule)"
-    )
+    least: int = parameter(4, "number of landmarks used where detection is good (4-or-more rule)", "landmarks", 4, 64)
     rule: Literal["all", "source"] = parameter(
-        "all", "-", meaning="all: every landmark at hand; source: more than `least` only where detection is poor"
+        "all", "all: use every landmark; source: use more than `least` only where detection is poor"
     )
     poor_speed_m_s: float = parameter(
-        2.0, "m/s", 0, 100, meaning="source rule: landmarks that move faster on average count as poorly detected"
+        2.0, "source rule: detection is poor if landmarks move faster than this on average", "m/s", 0, 100
     )
 
 
@@ -587,69 +536,56 @@ class AerialParameters(Group):
     """How the picture from the air is laid on the ground by landmarks and telemetry (appendix A, IV-B)."""
 
     mode: Literal["pose", "homography", "paper"] = parameter(
-        "pose",
-        "-",
-        meaning="pose: the camera's, by landmarks and telemetry; homography: by landmarks alone; paper: raw degrees",
+        "pose", "pose: from landmarks and telemetry; homography: landmarks only; paper: as printed, in degrees"
     )
     hfov_deg: float = parameter(
-        70.0, "deg", 1, 170, meaning="width of the field of view where neither camera nor telemetry says it"
+        70.0, "horizontal field of view if neither camera nor telemetry gives it", "deg", 1, 170
     )
     pitch_deg: float = parameter(
-        90.0, "deg", -90, 90, meaning="how far the camera looks below the horizon where neither says it; 90: down"
+        90.0, "angle of the optical axis below the horizon if neither gives it; 90 is straight down", "deg", -90, 90
     )
     focal_sigma: float = parameter(
-        0.01,
-        "-",
-        0,
-        1,
-        meaning="standard deviation, as a share, of a focal length that is given, unless the camera's file says it",
+        0.01, "relative standard deviation of a given focal length, unless the camera's file gives it", "-", 0, 1
     )
-    focal_guess_sigma: float = parameter(0.2, "-", 0, 1, meaning="the same where it is not given but hfov_deg guessed")
-    tilt_sigma_deg: float = parameter(1.0, "deg", 0, 90, meaning="standard deviation of the reported tilt, each way")
-    tilt_guess_sigma_deg: float = parameter(
-        15.0, "deg", 0, 180, meaning="the same where the telemetry does not say it but pitch_deg is taken"
+    focal_guess_sigma: float = parameter(
+        0.2, "relative standard deviation of a focal length that follows from hfov_deg", "-", 0, 1
     )
-    heading_sigma_deg: float = parameter(5.0, "deg", 0, 180, meaning="standard deviation of the reported heading")
-    altitude_sigma: float = parameter(0.02, "-", 0, 10, meaning="standard deviation of the altitude, as a share of it")
-    altitude_sigma_m: float = parameter(0.0, "m", 0, 1000, meaning="and in metres")
+    tilt_sigma_deg: float = parameter(1.0, "standard deviation of the reported tilt, per axis", "deg", 0, 90)
+    tilt_guess_sigma_deg: float = parameter(15.0, "standard deviation of the tilt if pitch_deg is used", "deg", 0, 180)
+    heading_sigma_deg: float = parameter(5.0, "standard deviation of the reported heading", "deg", 0, 180)
+    altitude_sigma: float = parameter(0.02, "relative standard deviation of the altitude", "-", 0, 10)
+    altitude_sigma_m: float = parameter(0.0, "standard deviation added to it, in metres", "m", 0, 1000)
     position_sigma_m: float = parameter(
-        1.43, "m", 0, 1000, meaning="standard deviation of the vehicle's place, east and north each: 3.5 m in 95 %"
+        1.43, "standard deviation of the vehicle's position, east and north: 3.5 m at 95 %", "m", 0, 1000
     )
-    target_sigma_px: float = parameter(
-        1.0, "px", 0, 100, meaning="standard deviation of a target's place in the picture"
-    )
+    target_sigma_px: float = parameter(1.0, "standard deviation of a target's position in the picture", "px", 0, 100)
     own_sigma: float = parameter(
-        0.13, "sides", 0, 2, meaning="the same of boxes that dddas found moving, beside it, in sides of the box"
+        0.13, "additional standard deviation for targets that dddas detected, in box sides", "sides", 0, 2
     )
     point: Literal["auto", "centre", "foot"] = parameter(
         "auto",
-        "-",
-        meaning="which point of a box is on the ground: its centre; the foot of a body whose middle is the centre; "
-        "auto: the feet that the table names, the foot for tables of dddas, else the centre",
+        "point of a box on the ground: centre, foot, or auto: the table's feet, the foot for tables of dddas, "
+        "else the centre",
     )
     shadows: bool = parameter(
-        False, "-", meaning="what moves is a body and its shadow: the foot is sought by where the sun stands"
+        False, "blobs are bodies with their shadows: the foot is found from the direction of the sun"
     )
-    sun_azimuth_deg: float = parameter(0.0, "deg", 0, 360, meaning="where the sun stands, clockwise from north")
+    sun_azimuth_deg: float = parameter(0.0, "direction of the sun, clockwise from north", "deg", 0, 360)
     sun_height_deg: float = parameter(
-        0.0, "deg", 0, 90, meaning="how high above the horizon; 0: by the telemetry's clock, no shadows without one"
+        0.0, "elevation of the sun; 0: from the telemetry's clock, no shadows without a clock", "deg", 0, 90
     )
-    target_height_m: float = parameter(1.7, "m", 0, 100, meaning="height of the body whose foot is sought")
+    target_height_m: float = parameter(1.7, "height of the body whose foot is wanted", "m", 0, 100)
     gate_probability: float = parameter(
-        0.999, "-", 0.5, 0.999999, meaning="share of right landmarks that pass the test against what is expected"
+        0.999, "share of correct landmarks that pass the consistency test", "-", 0.5, 0.999999
     )
     correlation_s: float = parameter(
-        20.0,
-        "s",
-        0,
-        10000,
-        meaning="time over which errors of telemetry and receivers stay alike; 0: frames stand alone",
+        20.0, "correlation time of telemetry and receiver errors; 0: independent in each frame", "s", 0, 10000
     )
     least_spread: float = parameter(
-        0.02, "-", 0, 1, meaning="landmarks whose width is a smaller share of their length count as on one line"
+        0.02, "landmarks whose width is a smaller share of their length count as collinear", "-", 0, 1
     )
     clock_offset_s: float = parameter(
-        0.0, "s", -1e6, 1e6, meaning="added to the times of telemetry and landmarks to get those of the clip"
+        0.0, "added to the times of telemetry and landmarks to get the clip's time", "s", -1e6, 1e6
     )
 
 
@@ -657,41 +593,37 @@ class CrowdParameters(Group):
     """Moving targets that go together as one crowd."""
 
     join_m: float = parameter(
-        0.0, "m", 0, 100, meaning="targets located from the air with gaps up to this are one crowd; 0: each on its own"
+        0.0, "targets located from the air with gaps up to this form one crowd; 0: no crowds", "m", 0, 100
     )
-    speed_m_s: float = parameter(
-        1.5, "m/s", 0.01, 100, meaning="targets whose velocities over ground differ by more do not go together"
-    )
+    speed_m_s: float = parameter(1.5, "largest velocity difference over ground within a crowd", "m/s", 0.01, 100)
 
 
 class SteeringParameters(Group):
     """How what is found steers where the instruments go and look, in a run whose source can be steered."""
 
-    on: bool = parameter(True, "-", meaning="steer the instruments; false flies as planned, whatever is found")
+    on: bool = parameter(True, "steer the vehicles; false flies as planned")
     sampling: bool = parameter(
-        False, "-", meaning="look at every k-th frame only, k by the rule of the interval; the clip must be in order"
+        False, "process only every k-th frame, k from the interval rule; the clip must be in order"
     )
-    sampling_share: float = parameter(
-        0.5, "-", 0.01, 10, meaning="k as a share of the interval that the rule gives before its bounds"
-    )
+    sampling_share: float = parameter(0.5, "k as a share of the rule's interval before its bounds", "-", 0.01, 10)
     least_move_px: float = parameter(
-        1.5, "px", 0, 100, meaning="k is large enough for a walker to move by this from look to look: less hardly shows"
+        1.5, "k is so large that a walker moves by at least this between processed frames", "px", 0, 100
     )
-    maximum_every: int = parameter(5, "frames", 1, 60, meaning="largest k, however slow the scene")
-    follow: bool = parameter(
-        True, "-", meaning="the aerial vehicle keeps the crowds in view; false: it flies as planned"
+    maximum_every: int = parameter(5, "largest k, however slow the scene", "frames", 1, 60)
+    follow: bool = parameter(True, "the UAV keeps the crowds in view; false flies as planned")
+    look: bool = parameter(True, "UGVs drive to targets that need a closer look; false drives as planned")
+    fast_m_s: float = parameter(3.0, "speed of a UGV far from its goal", "m/s", 0, 30)
+    slow_m_s: float = parameter(
+        1.0, "speed of a UGV near its goal, where its motion degrades its position", "m/s", 0, 30
     )
-    look: bool = parameter(True, "-", meaning="ground vehicles go where targets need a closer look; false: as planned")
-    fast_m_s: float = parameter(3.0, "m/s", 0, 30, meaning="speed of a ground vehicle far from its goal")
-    slow_m_s: float = parameter(1.0, "m/s", 0, 30, meaning="and near it, where its own motion must not spoil its place")
-    near_m: float = parameter(6.0, "m", 0, 1000, meaning="what counts as near")
-    station_m: float = parameter(12.0, "m", 2, 1000, meaning="how far from a crowd ground vehicles stand about it")
+    near_m: float = parameter(6.0, "distance to the goal that counts as near", "m", 0, 1000)
+    station_m: float = parameter(12.0, "distance of UGVs from the crowd they observe", "m", 2, 1000)
     look_m: float = parameter(
-        14.0, "m", 1, 1000, meaning="up to this distance a ground vehicle's camera recognizes people: 64 px of body"
+        14.0, "largest distance at which a UGV's camera recognizes people: bodies of 64 px", "m", 1, 1000
     )
-    picture_s: float = parameter(1.0, "s", 0.01, 3600, meaning="time between two pictures of one ground vehicle")
+    picture_s: float = parameter(1.0, "time between two pictures of one UGV", "s", 0.01, 3600)
     maximum_altitude_m: float = parameter(
-        0.0, "m", 0, 10_000, meaning="the aerial vehicle climbs no higher to see more; 0: twice its altitude at first"
+        0.0, "largest altitude of the UAV; 0: twice its initial altitude", "m", 0, 10_000
     )
 
 
@@ -699,34 +631,26 @@ class LiveParameters(Group):
     """A run that must keep up with a camera."""
 
     pace: float = parameter(
-        1.0, "-", 0, 1000, meaning="a file plays so many times as fast as it was filmed; 0: as fast as it is taken"
+        1.0, "playback speed of a file relative to real time; 0: as fast as frames are processed", "-", 0, 1000
     )
-    queue_frames: int = parameter(2, "frames", 1, 64, meaning="pictures that may wait; of more the oldest is dropped")
+    queue_frames: int = parameter(2, "frames that may wait; beyond that the oldest is dropped", "frames", 1, 64)
     deadline_ms: float = parameter(
-        80.0,
-        "ms",
-        1,
-        60_000,
-        meaning="what a picture may take from camera to results, those it waits for apart",
+        80.0, "largest latency from camera to results, without the frames of look-ahead", "ms", 1, 60_000
     )
-    shed: bool = parameter(
-        True, "-", meaning="look at less when it takes too long; false: pictures are dropped instead"
+    shed: bool = parameter(True, "reduce the load when processing is too slow; false drops frames instead")
+    load: float = parameter(0.85, "largest share of the time between frames that processing may take", "-", 0.1, 1)
+    calm_s: float = parameter(5.0, "time with spare capacity after which the load is raised again", "s", 0.1, 600)
+    least_keypoints: int = parameter(80, "smallest number of keypoints under load", "-", 16, 10_000)
+    maximum_every: int = parameter(8, "process at least one of this many frames under load", "frames", 1, 60)
+    stall_s: float = parameter(5.0, "a stream without frames for this long counts as lost", "s", 0.1, 600)
+    retry_s: float = parameter(
+        0.5, "first delay before a lost stream is opened again; doubles with each attempt", "s", 0.01, 600
     )
-    load: float = parameter(
-        0.85, "-", 0.1, 1, meaning="share of the time between two pictures that looking at one may take"
+    retry_most_s: float = parameter(30.0, "longest delay before a lost stream is opened again", "s", 0.01, 3600)
+    watchdog_s: float = parameter(
+        30.0, "a step that takes longer counts as hung; 0 switches the watchdog off", "s", 0, 3600
     )
-    calm_s: float = parameter(5.0, "s", 0.1, 600, meaning="more is looked at again after so long with time to spare")
-    least_keypoints: int = parameter(80, "-", 16, 10_000, meaning="no fewer keypoints than this, however busy")
-    maximum_every: int = parameter(
-        8, "frames", 1, 60, meaning="at least one of so many pictures is looked at, however busy"
-    )
-    stall_s: float = parameter(5.0, "s", 0.1, 600, meaning="a stream that sends nothing for so long counts as lost")
-    retry_s: float = parameter(0.5, "s", 0.01, 600, meaning="a lost stream is opened again after this, then twice that")
-    retry_most_s: float = parameter(30.0, "s", 0.01, 3600, meaning="... and so on up to this")
-    watchdog_s: float = parameter(30.0, "s", 0, 3600, meaning="a step that takes so long counts as hung; 0: none does")
-    status_s: float = parameter(
-        2.0, "s", 0.1, 600, meaning="how often the state of the run is written, and results are put to disk"
-    )
+    status_s: float = parameter(2.0, "time between two writes of the status and the results", "s", 0.1, 600)
 
     @model_validator(mode="after")
     def _pauses_grow(self) -> "LiveParameters":
