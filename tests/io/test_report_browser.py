@@ -5,7 +5,7 @@ import pytest
 
 from tests.browser import evaluate, needs_browser
 from tests.evaluation.report.studied import HOSTILE, study
-from torchvision_dddas.evaluation.report import report
+from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.io.report import Axis, Column, Line, chart, number_cell, render_page, table, text_cell
@@ -46,7 +46,7 @@ _PRESS = "function press(k){page.querySelectorAll('thead button')[k].click();}"
 @pytest.fixture(scope="module")
 def study_page(tmp_path_factory):
     results = study(tmp_path_factory.mktemp("study"))
-    return report(finite(summarize(results)), results)
+    return study_report(finite(summarize(results)), results)
 
 
 def many_rows(count):

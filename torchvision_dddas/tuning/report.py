@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.evaluation.report.comparison import MEANING, compared
+from torchvision_dddas.evaluation.report.comparison import MEANING, comparison_section
 from torchvision_dddas.evaluation.report.measures import GROUPS, measure
 from torchvision_dddas.io.report import (
     Axis,
@@ -208,7 +208,7 @@ def _side(side: str, heading: str, verdict: Mapping[str, Any]) -> list[str]:
     parts: list[str] = []
     tasks = (found["changes"] or {}).get("tasks", {})
     for mine in tasks.values():
-        parts += compared(side, said, mine, "before", "after")
+        parts.append(comparison_section(side, said, mine, "before", "after"))
     if not tasks:
         parts.append(f'<h2 id="{side}">{escape(said)}</h2><p>Nothing to compare.</p>')
     notes = [*found["notes"], *((found["changes"] or {}).get("notes", []))]

@@ -22,7 +22,7 @@ from tests.evaluation.report.studied import (
 from tests.pages import Page
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.report import report
+from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.report.task_charts import MOST_FAINT, ranked_charts
 from torchvision_dddas.evaluation.report.worst_frames import (
     FALSE,
@@ -54,7 +54,7 @@ def metrics(results):
 
 @pytest.fixture(scope="module")
 def text(results, metrics):
-    return report(metrics, results)
+    return study_report(metrics, results)
 
 
 def decode(jpeg):
@@ -108,12 +108,12 @@ def test_settings_versions_and_terms_are_told(text, results):
 
 
 def test_the_same_study_gives_the_same_page(text, results, metrics):
-    assert report(metrics, results) == text
+    assert study_report(metrics, results) == text
 
 
 def test_a_study_without_any_result_still_has_a_page(results):
     empty = replace(results, cases=tuple(case for case in results.cases if case.cause))
-    said = " ".join(Page(report(finite(summarize(empty)), empty)).words)
+    said = " ".join(Page(study_report(finite(summarize(empty)), empty)).words)
     assert "0 clips" in said and "4x4" in said
 
 
@@ -121,7 +121,7 @@ def test_pictures_that_are_gone_cost_no_more_than_themselves(tmp_path, metrics):
     results = study(tmp_path)
     for file in (tmp_path / "bad" / "frames").iterdir():
         file.unlink()
-    page = Page(report(metrics, results))
+    page = Page(study_report(metrics, results))
     assert any("no picture: " in word for word in page.words)
     assert sum(tag == "img" for tag in page.found) >= 4  # those of other tasks
 
@@ -130,7 +130,7 @@ def test_the_worst_frames_come_first_and_the_others_are_counted(tmp_path):
     cases = [masked_clip(tmp_path, "good", 0), masked_clip(tmp_path, "bad", 4), masked_clip(tmp_path, "fair", 2)]
     chosen, others = worst_frames(cases)
     assert [(one.case.clip.name, one.frame) for one in chosen[:2]] == [("bad", 5), ("fair", 6)]
-    assert chosen[0].words == "F 0.00; pixels: 0 right, 400 false, 400 missed"
+    assert chosen[0].text == "F 0.00; pixels: 0 right, 400 false, 400 missed"
     assert len(chosen) + others == 2 * FRAMES and "good" not in {one.case.clip.name for one in chosen}
 
 
@@ -197,7 +197,7 @@ def test_a_change_of_identity_is_named_and_the_lost_target_is_missed(tmp_path):
     at_4, at_5 = boxes_at(case, 4), boxes_at(case, 5)
     assert at_4.found_names == ["1>9", "2"] and at_4.marked.tolist() == [True, False]
     assert at_5.found_names == ["9"] and len(at_5.true_px) == 2 and at_5.of_found.tolist() == [0]
-    said = {one.frame: one.words for one in worst_frames([case])[0]}
+    said = {one.frame: one.text for one in worst_frames([case])[0]}
     assert said[4].endswith("1 changed identity") and said[5] == "F1 0.67; boxes: 1 right, 0 false, 1 missed"
 
 
@@ -215,7 +215,7 @@ def test_in_a_still_clip_every_box_is_false_and_drawn(tmp_path):
     case = scored(still, "motion", found([2, 2, 5], [[10, 10, 9, 9], [40, 40, 9, 9], [20, 20, 9, 9]]))
     chosen, others = worst_frames([case])
     assert (chosen[0].frame, others) == (2, 0)
-    assert chosen[0].words == "F1 0.00; boxes: 0 right, 2 false, 0 missed"
+    assert chosen[0].text == "F1 0.00; boxes: 0 right, 2 false, 0 missed"
     pair = drawn(chosen)[0].pair
     assert pair is not None
     pixels = decode(pair.result).reshape(-1, 3)

@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
+
+from markupsafe import Markup
 
 from torchvision_dddas.evaluation.report.measures import GROUPS, TITLES, measure
 from torchvision_dddas.io.report import (
@@ -20,97 +21,96 @@ from torchvision_dddas.io.report import (
 )
 
 MEANING = (
-    "Better and worse are beyond noise: p below 0.05 after Holm's correction for all that is asked here. "
-    "“On these clips” is by blocks of their frames and says nothing of other clips; "
-    "“too little to tell”: so few frames or clips could not show any change."
+    "Better and worse are beyond noise: p below 0.05 after Holm's correction for all tests of this table. "
+    "“On these clips”: significant over blocks of their frames, which holds for these clips alone. "
+    "“Too little to tell”: so few frames or clips could not show any change."
 )
 
 Entry = Mapping[str, Any]
 
 
-def comparison_report(found: Mapping[str, Any]) -> str:
-    """The HTML. found: as `compare_studies` returns it, NaN as None."""
-    first, second = str(found["first"]), str(found["second"])
-    title = f"{first} and {second}: comparison"
-    parts = [f"<h1>{escape(first)} → {escape(second)} <span>comparison</span></h1>", f'<p class="soft">{MEANING}</p>']
-    parts += ['<div class="cards">', *(_card(task, mine) for task, mine in found["tasks"].items()), "</div>"]
-    if found["notes"]:
-        items = "".join(f"<li>{escape(note)}</li>" for note in found["notes"])
-        parts.append(f"<details open><summary>Not compared ({len(found['notes'])})</summary><ul>{items}</ul></details>")
-    for task, mine in found["tasks"].items():
-        parts += compared(task, TITLES.get(task, task), mine, first, second)
-    return render_page("page.html", title=title, parts=parts)
+def comparison_report(comparison: Mapping[str, Any]) -> str:
+    """The HTML. comparison: as `compare_studies` returns it, NaN as None."""
+    first, second = str(comparison["first"]), str(comparison["second"])
+    return render_page(
+        "comparison.html",
+        title=f"{first} and {second}: comparison",
+        first=first,
+        second=second,
+        meaning=MEANING,
+        tasks=[_task(task, changes, first, second) for task, changes in comparison["tasks"].items()],
+        notes=comparison["notes"],
+    )
 
 
-def _card(task: str, mine: Mapping[str, Any]) -> str:
-    """A task at a glance: its first measure, and how many clips went which way."""
-    parts = [f'<h3><a href="#{escape(task)}">{escape(TITLES.get(task, task))}</a></h3>']
-    pooled = _rows(mine["pooled"])
-    if pooled:
+def _task(task: str, changes: Mapping[str, Any], first: str, second: str) -> dict[str, Any]:
+    """What the page shows of a task: a card with its first measure and counts of clips, and its section."""
+    title = TITLES.get(task, task)
+    verdicts = [str(entry["says"]) for groups in changes["clips"].values() for _, _, entry in _rows(groups)[:1]]
+    n_better, n_worse = (sum(verdict.startswith(word) for verdict in verdicts) for word in ("better", "worse"))
+    found = {
+        "id": task,
+        "title": title,
+        "change": "",
+        "n_better": n_better,
+        "n_worse": n_worse,
+        "n_others": len(verdicts) - n_better - n_worse,
+        "n_same": len(changes["same"]),
+        "section": comparison_section(task, title, changes, first, second),
+    }
+    if pooled := _rows(changes["pooled"]):
         group, name, entry = pooled[0]
-        parts.append(f'<div class="big">{_signed(entry, name)} <span>{escape(_title(group, name))}</span></div>')
-        ends = [_value(entry[end], name) for end in ("first", "second")]
-        parts.append(f"<p>{ends[0]} → {ends[1]}: <b>{escape(entry['says'])}</b></p>")
-    clips = [entry for groups in mine["clips"].values() for _, _, entry in _rows(groups)[:1]]
-    ways = {word: sum(str(entry["says"]).startswith(word) for entry in clips) for word in ("better", "worse")}
-    said = ", ".join(f"{count} {word} beyond noise" for word, count in ways.items())
-    parts.append(f"<p>clips: {said}, {len(clips) - sum(ways.values())} not, {len(mine['same'])} the same</p>")
-    return f'<section class="card">{"".join(parts)}</section>'
+        before, after = (number_cell(entry[end], measure(name).digits).text for end in ("first", "second"))
+        found |= {"change": _signed(entry, name), "metric": _title(group, name), "before": before, "after": after}
+        found["verdict"] = entry["says"]
+    return found
 
 
-def compared(anchor: str, title: str, mine: Mapping[str, Any], first: str, second: str) -> list[str]:
-    """The section of a task: plots clip by clip, all clips together, single clips. mine: found["tasks"][task].
+def comparison_section(id: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
+    """The section of a task: plots clip by clip, all clips together, single clips.
 
-    anchor: what a link to the section names; first, second: what the columns are called.
+    id: what a link to the section names. changes: of this task, as in `compare_studies`. first, second: columns' names.
     """
-    parts = [f'<h2 id="{escape(anchor)}">{escape(title)}</h2>']
-    if plots := _plots(mine["clips"], mine["same"]):
-        parts += ['<div class="plots">', *plots, "</div>"]
-    rows = [
+    pooled = [
         _row(_title(group, name), name, entry, ("over_clips", "over_frames"))
-        for group, name, entry in _rows(mine["pooled"])
+        for group, name, entry in _rows(changes["pooled"])
     ]
-    columns = [*_columns("measure", first, second), Column("p, clips"), Column("p, frames"), Column("says", text=True)]
-    parts += ["<h3>All clips together</h3>", table("all clips together", columns, rows)]
-    of_clips = [
+    by_clip = [
         [text_cell(clip), *_row(_title(group, name), name, entry, ("over_frames",))]
-        for clip, groups in mine["clips"].items()
+        for clip, groups in changes["clips"].items()
         for group, name, entry in _rows(groups)
     ]
-    if of_clips:
-        columns = [
-            Column("clip", text=True),
-            *_columns("measure", first, second),
-            Column("p"),
-            Column("says", text=True),
-        ]
-        parts += ["<h3>Clip by clip</h3>", table("clip by clip", columns, of_clips)]
-    if mine["same"]:
-        parts.append(f'<p class="note">The same in both to the last digit: {escape(", ".join(mine["same"]))}.</p>')
-    return parts
+    columns = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
+    says = Column("says", text=True)
+    section = render_page(
+        "comparison_section.html",
+        id=id,
+        title=title,
+        charts=_charts(changes["clips"]),
+        pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), says], pooled),
+        by_clip=by_clip
+        and table("clip by clip", [Column("clip", text=True), *columns, Column("p"), says], by_clip),
+        same=changes["same"],
+    )
+    return Markup(section)
 
 
-def _plots(clips: Mapping[str, Mapping[str, Any]], same: Sequence[str]) -> list[str]:
-    """The change of each group's first measure clip by clip, the largest loss first."""
-    plots = []
+def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
+    """The change of each group's first measure clip by clip, the largest loss first, and a note."""
+    charts = []
     for group in dict.fromkeys(group for groups in clips.values() for group in groups):
-        having = [(clip, *_rows({group: groups[group]})[0]) for clip, groups in clips.items() if groups.get(group)]
-        rows = [Interval(clip, *_change(entry)) for clip, _, _, entry in having if entry["change"] is not None]
+        changed = [(clip, *_rows({group: groups[group]})[0]) for clip, groups in clips.items() if groups.get(group)]
+        rows = [Interval(clip, *_change(entry)) for clip, _, _, entry in changed if entry["change"] is not None]
         if not rows:
             continue
-        name = having[0][2]
+        name = changed[0][2]
         rows.sort(key=lambda row: row.value * (-1 if measure(name).better < 0 else 1))
-        left = len(rows) - MOST_ROWS
         ends = [abs(v) for row in rows for v in (row.value, row.low, row.high) if math.isfinite(v)]
         reach = max(ends) or 1.0
         svg = interval_chart(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
-        note = f"<figcaption>{left} more in the table</figcaption>" if left > 0 else ""
-        plots.append(f"<figure>{svg}{note}</figure>")
-    return plots
-
-
-def _columns(what: str, first: str, second: str) -> list[Column]:
-    return [Column(what, text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
+        n_left_out = len(rows) - MOST_ROWS
+        charts.append((svg, f"{n_left_out} more in the table" if n_left_out > 0 else ""))
+    return charts
 
 
 def _row(title: str, name: str, entry: Entry, ways: Sequence[str]) -> list[Cell]:
@@ -119,9 +119,7 @@ def _row(title: str, name: str, entry: Entry, ways: Sequence[str]) -> list[Cell]
     cells = [text_cell(title), number_cell(entry["first"], digits), number_cell(entry["second"], digits)]
     small = number_cell(entry["change"], digits, (low, high)).small
     cells.append(Cell(_signed(entry, name), entry["change"], small))
-    for way in ways:
-        told = entry.get(way)
-        cells.append(number_cell(None if told is None else told["p_holm"]))
+    cells += [number_cell(None if (effect := entry.get(way)) is None else effect["p_holm"]) for way in ways]
     return [*cells, text_cell(str(entry["says"]))]
 
 
@@ -131,8 +129,8 @@ def _rows(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Ent
 
 def _change(entry: Entry) -> tuple[float, float, float]:
     """The change and the ends of its interval: over clips where there is one, else over frames."""
-    ways = [told for way in ("over_clips", "over_frames") if (told := entry.get(way)) is not None]
-    spans = [told["interval"] for told in ways if told["interval"] is not None]
+    effects = [effect for way in ("over_clips", "over_frames") if (effect := entry.get(way)) is not None]
+    spans = [effect["interval"] for effect in effects if effect["interval"] is not None]
     change = math.nan if entry["change"] is None else float(entry["change"])
     low, high = spans[0] if spans else (math.nan, math.nan)
     return change, low, high
@@ -143,9 +141,6 @@ def _signed(entry: Entry, name: str) -> str:
     text = format_number(math.nan if change is None else change, measure(name).digits)
     return f"+{text}" if change and change > 0 else text
 
-
-def _value(value: float | None, name: str) -> str:
-    return format_number(math.nan if value is None else value, measure(name).digits)
 
 
 def _title(group: str, name: str) -> str:

@@ -30,17 +30,6 @@ MOST_WIDE, MOST_HIGH = 560, 420
 _QUALITY = 80
 _SMALL, _RING = 4, 6  # px of a picture on the page
 
-KEY = (
-    ("found and true", '<rect x="1" y="2" width="24" height="12" fill="#56b4e9" stroke="#2a6f96"/>'),
-    ("found, but false", '<rect x="2" y="3" width="22" height="10" fill="#d55e00" stroke="#d55e00" stroke-width="3"/>'),
-    (
-        "true, but missed",
-        '<rect x="2" y="3" width="22" height="10" fill="#f0e442" stroke="#6b6400" stroke-dasharray="4 3"/>',
-    ),
-    ("not judged", '<rect x="2" y="3" width="22" height="10" fill="#969696" stroke="#5f5f5f"/>'),
-)
-"""What the colours mean, each with its sign as SVG of 26 by 16."""
-
 
 class Pair(NamedTuple):
     """Two pictures as JPEG."""
@@ -200,12 +189,12 @@ _OF_A_CLIP = 3
 
 @dataclass(frozen=True)
 class Worst:
-    """A frame. wrong: how much of it. words: what went wrong. pair: None where it cannot be shown, and why: trouble."""
+    """A frame. wrong: how much of it. text: what went wrong. pair: None where it cannot be shown, and why: trouble."""
 
     case: Case
     frame: int
     wrong: float
-    words: str
+    text: str
     pair: Pair | None = None
     trouble: str = ""
 
@@ -236,7 +225,7 @@ def drawn(chosen: Sequence[Worst]) -> list[Worst]:
                 pairs[id(one)] = _with_pair(one, pictures.get(one.frame))
         except (InputError, OSError) as error:
             for one in mine:
-                pairs[id(one)] = Worst(one.case, one.frame, one.wrong, one.words, None, str(error))
+                pairs[id(one)] = Worst(one.case, one.frame, one.wrong, one.text, None, str(error))
     return [pairs[id(one)] for one in chosen]
 
 
@@ -305,10 +294,10 @@ def _with_pair(one: Worst, picture: np.ndarray | None) -> Worst:
             raise InputError("the result's mask cannot be read")
         mask = mask if mask.ndim == 2 else mask.max(axis=2)
         shown = np.full((*labels.shape, 3), 70, np.uint8) if picture is None else picture
-        return Worst(case, one.frame, one.wrong, one.words, mask_pair(shown, labels, mask))
+        return Worst(case, one.frame, one.wrong, one.text, mask_pair(shown, labels, mask))
     boxes = boxes_at(case, one.frame)
     size = (picture.shape[1], picture.shape[0]) if picture is not None else _extent(case)
-    return Worst(case, one.frame, one.wrong, one.words, box_pair(picture, size, boxes))
+    return Worst(case, one.frame, one.wrong, one.text, box_pair(picture, size, boxes))
 
 
 def boxes_at(case: Case, frame: int) -> Boxes:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchvision_dddas.evaluation.report import report
+from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.studies.jobs import Tell
 from torchvision_dddas.evaluation.studies.results import Results, ScoredCase
 from torchvision_dddas.evaluation.studies.runner import Plan, cache_folder, run_study
@@ -84,7 +84,7 @@ def write_study(
             write_parquet(folder, measures, results)
             scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
             write_scores(folder, spec.name, scored)
-            write_whole(folder / "report.html", report(finite(measures), results).encode())
+            write_whole(folder / "report.html", study_report(finite(measures), results).encode())
             _write_json(folder / "run.json", _record(results, time.perf_counter() - began, place))
         except BaseException:
             if has_begun:

@@ -162,15 +162,16 @@ def summarize_costs(results: Results) -> dict[str, Any]:
     for task in TASKS:
         cases = sorted((c for c in results.cases if c.task == task and c.found is not None), key=lambda c: c.clip.name)
         if cases:
-            found[task] = {"clips": {case.clip.name: _cost([case]) for case in cases}, "all": _cost(cases)}
+            found[task] = {"clips": {case.clip.name: sum_costs([case]) for case in cases}, "all": sum_costs(cases)}
     return found
 
 
-def _cost(cases: Sequence[Case]) -> dict[str, Any]:
+def sum_costs(cases: Sequence[Case]) -> dict[str, Any]:
+    """The cost of cases together; see `summarize_costs`."""
     seconds: Counter[str] = Counter()
     frames, peaks = 0, [float("nan")]
     for case in cases:
-        assert case.found is not None
+        assert case.found is not None, "only cases with results have a cost"
         seconds.update(case.found.seconds)
         frames += len(case.found.looked)
         peaks.append(case.found.peak_mb)

@@ -98,6 +98,11 @@ def format_number(value: float, digits: int = 3) -> str:
     return text.replace("-", "−")
 
 
+def format_count(count: int, noun: str) -> str:
+    """A count with its noun: 1 frame, 2 frames."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def data_url(picture: bytes) -> str:
     """A JPEG or PNG picture as a URL that holds it."""
     kind = "jpeg" if picture[:2] == b"\xff\xd8" else "png"
@@ -117,4 +122,5 @@ def _environment() -> "Environment":
     )
     environment.filters["number"] = format_number
     environment.filters["data_url"] = data_url
+    environment.filters["format_count"] = format_count
     return environment
