@@ -81,15 +81,14 @@ def comparison_section(id: str, title: str, changes: Mapping[str, Any], first: s
         for group, name, entry in _rows(groups)
     ]
     columns = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
-    says = Column("says", text=True)
+    verdict = Column("verdict", text=True)
     section = render_page(
         "comparison_section.html",
         id=id,
         title=title,
         charts=_charts(changes["clips"]),
-        pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), says], pooled),
-        by_clip=by_clip
-        and table("clip by clip", [Column("clip", text=True), *columns, Column("p"), says], by_clip),
+        pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), verdict], pooled),
+        by_clip=by_clip and table("clip by clip", [Column("clip", text=True), *columns, Column("p"), verdict], by_clip),
         same=changes["same"],
     )
     return Markup(section)
@@ -140,7 +139,6 @@ def _signed(entry: Entry, name: str) -> str:
     change = entry["change"]
     text = format_number(math.nan if change is None else change, measure(name).digits)
     return f"+{text}" if change and change > 0 else text
-
 
 
 def _title(group: str, name: str) -> str:
