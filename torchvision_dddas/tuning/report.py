@@ -205,10 +205,8 @@ def _side(side: str, heading: str, verdict: Mapping[str, Any]) -> list[str]:
     said = (
         f"{heading}: {', '.join(found['clips'])}" if len(found["clips"]) <= 6 else f"{heading} ({len(found['clips'])})"
     )
-    parts: list[str] = []
     tasks = (found["changes"] or {}).get("tasks", {})
-    for mine in tasks.values():
-        parts.append(comparison_section(side, said, mine, "before", "after"))
+    parts: list[str] = [comparison_section(side, said, mine, "before", "after") for mine in tasks.values()]
     if not tasks:
         parts.append(f'<h2 id="{side}">{escape(said)}</h2><p>Nothing to compare.</p>')
     notes = [*found["notes"], *((found["changes"] or {}).get("notes", []))]

@@ -66,10 +66,10 @@ def _task(task: str, changes: Mapping[str, Any], first: str, second: str) -> dic
     return found
 
 
-def comparison_section(id: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
+def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
     """The section of a task: plots clip by clip, all clips together, single clips.
 
-    id: what a link to the section names. changes: of this task, as in `compare_studies`. first, second: columns' names.
+    anchor: what a link to the section names. changes: of this task, as in `compare_studies`. first, second: columns' names.
     """
     pooled = [
         _row(_title(group, name), name, entry, ("over_clips", "over_frames"))
@@ -84,7 +84,7 @@ def comparison_section(id: str, title: str, changes: Mapping[str, Any], first: s
     verdict = Column("verdict", text=True)
     section = render_page(
         "comparison_section.html",
-        id=id,
+        id=anchor,
         title=title,
         charts=_charts(changes["clips"]),
         pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), verdict], pooled),
