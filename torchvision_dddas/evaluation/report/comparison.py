@@ -69,7 +69,7 @@ def _task(task: str, changes: Mapping[str, Any], first: str, second: str) -> dic
 def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
     """The section of a task: plots clip by clip, all clips together, single clips.
 
-    anchor: what a link to the section names. changes: of this task, as in `compare_studies`. first, second: columns' names.
+    anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
     pooled = [
         _row(_title(group, name), name, entry, ("over_clips", "over_frames"))
