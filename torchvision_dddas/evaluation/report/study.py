@@ -249,7 +249,7 @@ def _format_rate(per_s: float) -> str:
 def _fact_table(results: Results) -> Markup:
     """What was run on what, and the versions of the libraries."""
     spec = results.spec
-    facts = {
+    facts: dict[str, Any] = {
         "datasets": [f"{source.kind}: {', '.join(source.clips)}" for source in spec.sources],
         "tasks": spec.tasks or ["all that each clip allows"],
         "configuration": spec.config or "defaults",
