@@ -109,7 +109,7 @@ def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frame
         raise ValueError("no picture will do")
 
     monkeypatch.setattr(OpenCVEngine, "prepare", broken)
-    monkeypatch.setattr(runner, "_IN_VAIN", 5)
+    monkeypatch.setattr(runner, "_MOST_FAILURES", 5)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 70
     assert "5 times in a row" in done.stderr

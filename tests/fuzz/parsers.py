@@ -288,9 +288,9 @@ def _ortho(path: Path) -> None:
 
 
 def _address(path: Path) -> None:
-    from torchvision_dddas.live.server import address_of
+    from torchvision_dddas.live.server import parse_address
 
-    _, port = address_of(path.read_bytes().decode("utf-8", "surrogateescape"))
+    _, port = parse_address(path.read_bytes().decode("utf-8", "surrogateescape"))
     assert 0 <= port <= 65535
 
 

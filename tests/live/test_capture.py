@@ -23,13 +23,13 @@ APART_S = 0.04
 class Camera:
     """A live source before streams that play scripts; the first one begins when pictures are taken."""
 
-    def __init__(self, *scripts: list[Any] | None, rate_hz: float | None = 25.0, **parameters: Any) -> None:
-        self.health, self.clock, self.rest = Health(), FakeClock(), Gate()
+    def __init__(self, clock: FakeClock, *scripts: list[Any] | None, **parameters: Any) -> None:
+        self.health, self.clock, self.rest = Health(), clock, Gate()
         first, *more = scripts
         assert first is not None
         scripts_run = [[grey(0), self.begun, *first], *more]
         scripts_run[-1] = [*(scripts_run[-1] or []), self.rest]
-        self.streams = [None if s is None else FakeStream(s, rate_hz) for s in scripts_run]
+        self.streams = [None if s is None else FakeStream(s) for s in scripts_run]
         self.opener = Streams(*self.streams)
         self.source: LiveSource | None = None
         self.built = threading.Event()
@@ -47,14 +47,6 @@ class Camera:
         with inbox.changed:
             assert inbox.changed.wait_for(lambda: inbox.begun or inbox.closed, PATIENCE_S)
 
-    def passing(self, seconds: float = APART_S) -> Callable[[], None]:
-        """A step of a script: time passes."""
-
-        def step() -> None:
-            self.clock.now_s += seconds
-
-        return step
-
     @property
     def counts(self) -> dict[str, int]:
         return dict(self.health.snapshot().counts)
@@ -70,32 +62,27 @@ class Camera:
         self.source.close()
 
 
-class Later:
-    """Time that passes on a clock that is there once the camera is."""
-
-    def __init__(self) -> None:
-        self.camera: Camera | None = None
-
-    def __call__(self, seconds: float = APART_S) -> Callable[[], None]:
-        def step() -> None:
-            assert self.camera is not None
-            self.camera.clock.now_s += seconds
-
-        return step
+@pytest.fixture
+def clock() -> FakeClock:
+    return FakeClock()
 
 
 @pytest.fixture
-def later() -> Later:
-    return Later()
+def later(clock: FakeClock) -> Callable[..., Callable[[], None]]:
+    """A step of a script: time passes."""
+
+    def step(seconds: float = APART_S) -> Callable[[], None]:
+        return lambda: setattr(clock, "now_s", clock.now_s + seconds)
+
+    return step
 
 
 @pytest.fixture
-def camera(later: Later) -> Iterator[Callable[..., Camera]]:
+def camera(clock: FakeClock) -> Iterator[Callable[..., Camera]]:
     made: list[Camera] = []
 
     def make(*scripts: list[Any] | None, **options: Any) -> Camera:
-        made.append(Camera(*scripts, **options))
-        later.camera = made[-1]
+        made.append(Camera(clock, *scripts, **options))
         return made[-1]
 
     yield make

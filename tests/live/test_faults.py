@@ -19,7 +19,10 @@ import pytest
 
 from tests.synthetic_clip import render
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the limits and signals of Linux")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="needs the limits and signals of Linux"),
+]
 
 # Nothing that a test waits for takes this long, however busy the machine: a hang becomes a failure.
 PATIENCE_S = 180

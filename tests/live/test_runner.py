@@ -7,7 +7,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.runner import Feed, RepeatedFailure, results, send_result, told
+from torchvision_dddas.live.runner import Feed, RepeatedFailure, record_result, results, send_result
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Detections, Frame, FrameResult, Telemetry, TrackedFrame, Tracks
 
@@ -146,12 +146,12 @@ def test_telemetry_that_falls_silent_and_comes_back_is_told_once_each():
 def test_latency_is_of_the_newest_picture_and_lateness_is_counted():
     health, feed = Health(), feed_of(1, taken_s=time.monotonic() - 1.0)
     (frame,) = feed
-    told(result_of(frame, person=1), feed, health, 80.0)
+    record_result(result_of(frame, person=1), feed, health, 80.0)
     now = health.snapshot()
     assert now.counts["late"] == now.counts["results"] == 1
     assert now.seconds["latency"][0] >= 1.0
     assert now.gauges["targets"] == now.gauges["people"] == 1
-    told(result_of(frame), feed, health, 1e9)
+    record_result(result_of(frame), feed, health, 1e9)
     assert health.snapshot().counts["late"] == 1
 
 

@@ -44,14 +44,14 @@ def run_live(
     Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
     """
     from torchvision_dddas.detection import check_length
-    from torchvision_dddas.io.output.live_session import RESULTS, claim
+    from torchvision_dddas.io.output import RESULTS, make_session_folder
     from torchvision_dddas.io.video import without_secrets
     from torchvision_dddas.live import LiveSource
     from torchvision_dddas.live.runner import Feed, RepeatedFailure
-    from torchvision_dddas.live.server import HealthServer, Page, address_of, health_pages
+    from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
     from torchvision_dddas.live.watchdog import HUNG, StopSignals, Supervisor, Watchdog
 
-    address = None if serve is None else address_of(serve)
+    address = None if serve is None else parse_address(serve)
     health, supervisor, live = _health(), Supervisor(), settings.live
     with ExitStack() as stack:
         # What may be wrong at the start is found before the session has a folder.
@@ -65,7 +65,7 @@ def run_live(
         pages = dict[str, Page]()
         serving = None if address is None else HealthServer(address, pages)
 
-        folder = claim(out)
+        folder = make_session_folder(out)
         streams = _opened(opened, [f"json:{folder / RESULTS}"], said, health, live, "--out") + streams
         facts = _facts(clip, ready, given, telemetry, source, interval, people)
         keeping = _kept(stack, folder, facts, health, streams, live.status_s, quiet)
@@ -142,7 +142,7 @@ def _kept(
 ) -> "StatusWriter":
     """What keeps the folder's record, written a first time. Raises InputError where that cannot be."""
     from torchvision_dddas.io.atomic_files import cannot_write
-    from torchvision_dddas.io.output.live_session import SessionLog
+    from torchvision_dddas.io.output import SessionLog
     from torchvision_dddas.live.status import StatusWriter
 
     log = SessionLog(folder, facts)
@@ -211,9 +211,9 @@ def _work(
     deadline_ms: float,
 ) -> None:
     """Hand on results until the pictures end. Raises RepeatedFailure where none come any more."""
-    from torchvision_dddas.live.runner import results, send_result, told
+    from torchvision_dddas.live.runner import record_result, results, send_result
 
     for result in results(begin, feed, health):
         said.start_utc_s = source.start_utc_s
         send_result(result, streams, health)
-        told(result, feed, health, deadline_ms)
+        record_result(result, feed, health, deadline_ms)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from torchvision_dddas.live import Event, Health, Snapshot
+    from torchvision_dddas.io.output import Event
+    from torchvision_dddas.live import Health, Snapshot
 
 _CLEAR = "\r\x1b[K"
 

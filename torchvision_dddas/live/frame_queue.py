@@ -1,4 +1,4 @@
-"""What the capture thread and the run share: few waiting frames, the log of the capture, and the clock."""
+"""What the capture thread and the run share: a short queue of frames, the log of the capture, and the clock."""
 
 import threading
 import time
@@ -10,11 +10,11 @@ import numpy as np
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.types import Frame, Problem
 
-# What happens again and again is told so often; the counts tell the rest.
+# An event that may happen often is reported once in this time; the counts have all.
 _QUIET_S = 10.0
-# The machine's clock was set, not slowed or hurried, where it jumps by this against the one that only goes forward.
+# A larger jump of the time of day against the monotonic clock means that the clock was set.
 _CLOCK_SET_S = 0.5
-# How long pictures are counted to know how many come a second.
+# The rate is measured over this time.
 _COUNTED_S = 2.0
 _PROBLEMS = 64
 
@@ -23,22 +23,23 @@ class Clock:
     """The clocks of this machine."""
 
     def now(self) -> float:
-        """Seconds that only go forward."""
+        """Monotonic time, s."""
         return time.monotonic()
 
     def utc(self) -> float:
-        """Seconds since 1970, as far as the machine knows."""
+        """Seconds since 1970."""
         return time.time()
 
     def wait(self, changed: threading.Condition, seconds: float | None = None) -> None:
-        """Until someone notifies the condition, which the caller holds, or so many seconds are over."""
+        """Wait for the condition, which the caller holds, at most so many seconds."""
         changed.wait(seconds)
 
 
 class FrameQueue:
-    """Filled by one thread, emptied by another. changed: guards it and all that these two share.
+    """A queue with one thread on each side; a full one drops its oldest frame.
 
-    begun: somebody takes pictures. ended: no more come. closed: none is wanted any more.
+    changed: the condition that guards it and all that the two threads share. begun: frames are being taken. ended: the
+    source gives no more. closed: the run takes no more. every: one of so many frames is wanted.
     """
 
     def __init__(self, room: int, health: Health, clock: Clock) -> None:
@@ -47,24 +48,24 @@ class FrameQueue:
         self.every = 1
         self._room, self._health, self._clock = room, health, clock
         self._waiting: deque[Frame] = deque()
-        self._newest = 0  # number of the frame that was put in last
+        self._newest = 0  # number of the frame added last
 
     def wanted(self, number: int) -> bool:
-        """Whether a frame is one of those to look at."""
+        """Whether the run wants a frame."""
         return self.begun and (not self._newest or number - self._newest >= self.every)
 
     def put(self, frame: Frame) -> None:
-        """Put a frame in the place of the oldest, where there is no room."""
+        """Add a frame; drop the oldest if there is no room."""
         with self.changed:
             self._newest = frame.number
             while len(self._waiting) >= self._room:
                 self._waiting.popleft()
                 self._health.count("dropped")
             self._waiting.append(frame)
-            self._told()
+            self._notify()
 
     def take(self, until_s: float | None = None) -> Frame | None:
-        """The oldest frame; None when no more come or none is wanted, or when it is until_s."""
+        """Wait for the oldest frame; None if the queue is ended or closed, or at the time until_s."""
         with self.changed:
             while not self._waiting and not self.ended and not self.closed:
                 left = None if until_s is None else until_s - self._clock.now()
@@ -74,54 +75,54 @@ class FrameQueue:
             if self.closed or not self._waiting:
                 return None
             frame = self._waiting.popleft()
-            self._told()
+            self._notify()
             return frame
 
     @property
     def over(self) -> bool:
-        """Whether nothing will be taken any more."""
+        """Whether no further frame can be taken."""
         return self.closed or (self.ended and not self._waiting)
 
     def make_room(self) -> None:
-        """Wait until there is room, or none is wanted."""
+        """Wait until there is room, or the queue is closed."""
         with self.changed:
             while len(self._waiting) >= self._room and not self.closed:
                 self._clock.wait(self.changed)
 
     def sleep(self, until_s: float) -> None:
-        """Until it is until_s, or none is wanted."""
+        """Wait until the time until_s, or until the queue is closed."""
         with self.changed:
             while not self.closed and (left := until_s - self._clock.now()) > 0:
                 self._clock.wait(self.changed, left)
 
     def begin(self) -> bool:
-        """Somebody takes pictures from now on; returns whether nobody did before."""
+        """Note that frames are being taken; return whether this is the first time."""
         with self.changed:
             first, self.begun = not self.begun, True
             self.changed.notify_all()
             return first
 
     def end(self) -> None:
-        """No more frames come."""
+        """Note that the source gives no more frames."""
         with self.changed:
             self.ended = True
             self.changed.notify_all()
 
     def close(self) -> None:
-        """No frame is wanted any more: whoever waits, on either side, goes on."""
+        """Note that the run takes no more frames; both threads stop waiting."""
         with self.changed:
             self.closed = True
             self.changed.notify_all()
 
-    def _told(self) -> None:
+    def _notify(self) -> None:
         self._health.gauge("queue", len(self._waiting))
         self.changed.notify_all()
 
 
 class CaptureLog:
-    """Kept by the camera's thread. number: of the newest frame captured. start_utc_s: see LiveSource.
+    """What the capture thread records. number: of the newest frame. start_utc_s, problems: as in LiveSource.
 
-    sent_hz: pictures that came a second, lately; None while that is not known.
+    sent_hz: the rate measured last; None before the first measurement.
     """
 
     def __init__(self, health: Health, clock: Clock) -> None:
@@ -130,23 +131,23 @@ class CaptureLog:
         self.sent_hz: float | None = None
         self.problems: list[Problem] = []
         self._health, self._clock = health, clock
-        self._told_s: dict[str, float] = {}
-        self._ahead_s = float("nan")  # of the machine's clock before the one that only goes forward
+        self._reported_s: dict[str, float] = {}
+        self._ahead_s = float("nan")  # time of day minus monotonic time
         self._count, self._since_s = 0, float("nan")
 
-    def tell(self, what: str, number: int | None = None, topic: str = "") -> None:
-        """An event. topic: what may happen often is told once in a while."""
+    def report(self, what: str, number: int | None = None, topic: str = "") -> None:
+        """Record an event and a problem. topic: of events that may happen often; one of a topic every 10 s is kept."""
         now_s, number = self._clock.now(), self.number if number is None else number
-        if topic and now_s - self._told_s.get(topic, -np.inf) < _QUIET_S:
+        if topic and now_s - self._reported_s.get(topic, -np.inf) < _QUIET_S:
             return
         if topic:
-            self._told_s[topic] = now_s
+            self._reported_s[topic] = now_s
         self._health.event("stream", what, number)
         self.problems.append(Problem(number, what))
         del self.problems[:-_PROBLEMS]
 
     def captured(self, taken_s: float, note: Callable[[float], object] = lambda sent_hz: None) -> None:
-        """A picture came. note: called with how many come a second, whenever that is known anew."""
+        """Count a picture that came at taken_s. note: called with each new measurement of the rate, Hz."""
         self._health.count("captured")
         ahead_s = self._clock.utc() - self._clock.now()
         if np.isnan(self.start_utc_s):
@@ -155,7 +156,9 @@ class CaptureLog:
             self.start_utc_s += jump_s
             self._ahead_s = ahead_s
             which = "forward" if jump_s > 0 else "back"
-            self.tell(f"the machine's clock was set {which} by {abs(jump_s):.1f} s; times of day follow", topic="clock")
+            self.report(
+                f"the machine's clock was set {which} by {abs(jump_s):.1f} s; times of day follow", topic="clock"
+            )
         if np.isnan(self._since_s):
             self.restart(taken_s)
             return
@@ -167,5 +170,5 @@ class CaptureLog:
             self.restart(taken_s)
 
     def restart(self, since_s: float = float("nan")) -> None:
-        """Count pictures from now on, or from the next one: what was before is no measure."""
+        """Measure the rate anew from a time, or from the next picture."""
         self._count, self._since_s = 0, since_s

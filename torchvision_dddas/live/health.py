@@ -1,32 +1,24 @@
-"""How a live run is doing: counts, how long things take, what happened last. Many threads may tell and ask."""
+"""The health of a live run: counts, gauges, durations and the latest events. Any thread may write and read it."""
 
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-_REMEMBERED = 4096  # times of each kind: percentiles are of the latest
+from torchvision_dddas.io.output import Event
+
+_DURATIONS = 4096  # kept of each kind: percentiles are of the latest
 _EVENTS = 64
 
 
 @dataclass(frozen=True)
-class Event:
-    """Something that happened. utc_s: seconds since 1970; frame: 0 where it belongs to none; kind: one word."""
-
-    utc_s: float
-    frame: int
-    kind: str
-    text: str
-
-
-@dataclass(frozen=True)
 class Snapshot:
-    """Health at a moment. counts: since the start. gauges: now. seconds: (50, 95, 99 %) of the latest, by name.
+    """Health at one moment. since_s: since the start. idle_s: since the last result, or the start.
 
-    since_s: for how long the run goes on; idle_s: since the last result, since the start while there is none.
+    counts: since the start. gauges: now. seconds: 50, 95 and 99 % quantiles of the latest durations, by name.
     """
 
     since_s: float
@@ -34,11 +26,11 @@ class Snapshot:
     counts: Mapping[str, int]
     gauges: Mapping[str, float]
     seconds: Mapping[str, tuple[float, float, float]]
-    events: tuple[Event, ...] = field(default=())
+    events: tuple[Event, ...] = ()
 
 
 class Health:
-    """Filled by the capture and by the run; asked by the page, the watchdog and the record of the run."""
+    """Written by the capture and the run; read by the page, the watchdog and run.json."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -49,28 +41,28 @@ class Health:
         self._events: deque[Event] = deque(maxlen=_EVENTS)
 
     def count(self, name: str, by: int = 1) -> None:
-        """Something happened so many times more."""
+        """Add to a count."""
         with self._lock:
             self._counts[name] += by
 
     def gauge(self, name: str, value: float) -> None:
-        """Something is so large now."""
+        """Set a gauge."""
         with self._lock:
             self._gauges[name] = value
 
     def took(self, name: str, seconds: float) -> None:
-        """Something took so long."""
+        """Add a duration."""
         with self._lock:
-            self._seconds.setdefault(name, deque(maxlen=_REMEMBERED)).append(seconds)
+            self._seconds.setdefault(name, deque(maxlen=_DURATIONS)).append(seconds)
 
     def result(self) -> None:
-        """A result was handed on: the run is alive."""
+        """Count a result; the run is not idle."""
         with self._lock:
             self._counts["results"] += 1
             self._result = time.monotonic()
 
     def event(self, kind: str, text: str, frame: int = 0) -> Event:
-        """Something to tell a person."""
+        """Add an event of one word's kind, and return it. frame: 0 if it belongs to none."""
         event = Event(time.time(), frame, kind, text)
         with self._lock:
             self._counts[f"events_{kind}"] += 1
@@ -78,14 +70,14 @@ class Health:
         return event
 
     def events_since(self, known: int) -> tuple[int, tuple[Event, ...]]:
-        """How many events there were, and those after the first `known` of them, of the latest that are remembered."""
+        """The number of events so far, and those of the kept ones that came after the first `known`."""
         with self._lock:
-            told = sum(count for name, count in self._counts.items() if name.startswith("events_"))
-            new = min(told - known, len(self._events))
-            return told, tuple(self._events)[len(self._events) - new :]
+            total = sum(count for name, count in self._counts.items() if name.startswith("events_"))
+            new = min(total - known, len(self._events))
+            return total, tuple(self._events)[len(self._events) - new :]
 
     def snapshot(self) -> Snapshot:
-        """All of it, as it is now."""
+        """The health now."""
         with self._lock:
             now = time.monotonic()
             since_s, idle_s = now - self._start, now - self._result

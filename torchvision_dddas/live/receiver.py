@@ -1,4 +1,4 @@
-"""A camera or stream that may fall silent, hang or come back as another, and is opened again whenever it is lost."""
+"""Reads a camera or stream that may fall silent, hang or change its size, and opens it again when it is lost."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -13,32 +13,26 @@ from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.types import Frame
 
-# To open a stream takes longer than to read from it: it is looked at for a while before its first picture.
 OPENING = 2.0
-# What the driver is told to give up after stall_s is given up by us after so many times that.
-_GRACE = 1.25
-# Reads that may fail in a row before a stream counts as lost.
-_MOST_FAILED = 10
-# A stream that sends more than it announced is thinned once it is ahead of the clock by this.
-_AHEAD_S = 0.5
-# A rate that differs from what was announced by more than this share is told.
-_OFF = 0.2
-# A thread that hangs in a driver cannot be ended; no more than so many are left behind.
-_MOST_HUNG = 4
-# Pictures by which the rate is measured where none is announced, and what is taken where they come all at once.
-_MEASURED = 12
-_FALLBACK_HZ = 10.0
+"""Opening a stream may take so many times stall_s."""
+_GRACE = 1.25  # times stall_s after which a call that the driver should have ended is given up
+_MOST_FAILED = 10  # reads in a row, after which a stream is lost
+_AHEAD_S = 0.5  # frames of a stream that is further ahead of the clock are dropped
+_OFF = 0.2  # a larger relative error of the announced rate is reported
+_MOST_HUNG = 4  # threads that hang in a driver, which cannot be ended
+_MEASURED = 12  # pictures by which a rate that is not announced is measured
+_FALLBACK_HZ = 10.0  # where they come all at once
 
 
 class _GivenUp(Exception):
-    """Another thread took the place of this one while it hung."""
+    """Another thread replaced this one while it hung."""
 
 
 class Receiver:
-    """Reads a stream in a thread of its own, from the start on; hands pictures on once somebody takes them.
+    """Reads a stream in a thread of its own from the start on, and fills the queue once frames are taken.
 
-    rate_hz: as given, else as announced, else as the first pictures come. size: of the first picture; a stream that
-    comes back with larger or smaller pictures is scaled to it. Raises InputError where no first picture comes.
+    rate_hz: as given, else as announced, else measured. size: of the first picture, to which later ones are scaled.
+    Raises InputError if no first picture comes.
     """
 
     def __init__(
@@ -57,16 +51,16 @@ class Receiver:
         self._health, self._clock = health, clock
         self._failure: InputError | None = None
         self._ready = False
-        self._turn = 0  # of the thread that counts
-        self._call: tuple[float, float] | None = None  # since when it is in the driver, and how long it may be
+        self._turn = 0  # of the current thread
+        self._call: tuple[float, float] | None = None  # since when it is in the driver, and for how long it may be
         self._pause_s = parameters.retry_s
         self._lost_s: float | None = None
         self._tries = 0
         self._start_s = float("nan")
-        self._odd: tuple[tuple[int, ...], float] | None = None  # what does not fit: its shape, since when
-        self._off = False  # it was told that the rate is not as announced
+        self._odd: tuple[tuple[int, ...], float] | None = None  # shape of pictures of another size, since when
+        self._off = False  # the rate was reported to differ from the announced one
         self.threads: list[threading.Thread] = []
-        self._at_work: threading.Thread | None = None  # the one that counts; None where all that there are hang
+        self._at_work: threading.Thread | None = None  # the current thread; None if all hang
         self._spawn()
         try:
             self._await_first()
@@ -76,14 +70,14 @@ class Receiver:
 
     @property
     def apart_s(self) -> float:
-        """Seconds from picture to picture, as they really come."""
+        """Seconds between pictures as measured."""
         return 1 / (self._log.sent_hz or self.rate_hz)
 
     def begin(self) -> None:
-        """Nothing: it reads already, so that the first picture taken is a fresh one."""
+        """Nothing to do: it reads already, so that the first frame taken is a fresh one."""
 
     def check(self) -> float:
-        """Asked by who waits for a picture: gives up a thread that hangs. Returns when to ask again."""
+        """Replace a thread that hangs; called by the run while it waits. Returns the time of the next check."""
         with self._queue.changed:
             now_s = self._clock.now()
             if self._call is not None:
@@ -99,8 +93,6 @@ class Receiver:
             if len(self.threads) < _MOST_HUNG:
                 self._spawn()
             return now_s + self._parameters.stall_s
-
-    # -- beginning ---------------------------------------------------------------------------------------------------
 
     def _spawn(self) -> None:
         thread = threading.Thread(target=self._work, args=(self._turn,), name="receiving", daemon=True)
@@ -132,8 +124,6 @@ class Receiver:
         apart_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
         return 1 / apart_s if 0.001 < apart_s < 10 else _FALLBACK_HZ
 
-    # -- the thread --------------------------------------------------------------------------------------------------
-
     def _work(self, turn: int) -> None:
         try:
             while not self._queue.closed and turn == self._turn:
@@ -147,7 +137,7 @@ class Receiver:
             return
 
     def _connected(self, turn: int) -> None:
-        """Open the stream, read it until it is lost, let go of it."""
+        """Open the stream, read it until it is lost, and release it."""
         self._tries += 1
         stream: Stream | None = None
         why, since_s = "", self._clock.now()
@@ -155,7 +145,7 @@ class Receiver:
             with self._driver(turn, OPENING):
                 stream = self._opener()
             if not self._ready:
-                # The driver's own limits apply; who waits for the first picture has one for all of it.
+                # Here the driver's own limits apply; _await_first has one for all of it.
                 self._first(stream)
                 with self._queue.changed:
                     self._ready = turn == self._turn
@@ -163,7 +153,7 @@ class Receiver:
             why = self._read(stream, turn)
         except _GivenUp:
             raise
-        except Exception as error:  # whatever a driver may raise: the thread lives on
+        except Exception as error:  # a driver may raise anything
             why = f"{error}"
             if not self._ready:
                 failure = error if isinstance(error, InputError) else InputError(f"{self.name} cannot be read: {error}")
@@ -177,13 +167,13 @@ class Receiver:
                 with self._driver(turn):
                     stream.release()
         if self._clock.now() - since_s > max(self._parameters.stall_s, self._pause_s):
-            self._pause_s = self._parameters.retry_s  # it held
+            self._pause_s = self._parameters.retry_s  # the connection held
         if not self._queue.closed:
             self._lost(why)
 
     @contextmanager
     def _driver(self, turn: int, times: float = 1.0) -> Iterator[None]:
-        """A call that may never return."""
+        """Watch a call that may never return."""
         with self._queue.changed:
             if turn == self._turn:
                 self._call = (self._clock.now(), _GRACE * times * self._parameters.stall_s)
@@ -198,7 +188,7 @@ class Receiver:
             raise _GivenUp
 
     def _read(self, stream: Stream, turn: int) -> str:
-        """Read until the stream is lost; returns why it is."""
+        """Read until the stream is lost; return the reason."""
         failed, came_s = 0, self._clock.now()
         good_s = came_s
         while not self._queue.closed:
@@ -206,7 +196,7 @@ class Receiver:
                 came = stream.grab()
             if not came:
                 failed += 1
-                # A driver's own limit may pass again and again: one is enough.
+                # A driver may time out again and again: once is enough.
                 if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._parameters.stall_s:
                     return "it sends no more pictures"
                 continue
@@ -219,7 +209,7 @@ class Receiver:
         return ""
 
     def _picture(self, stream: Stream, taken_s: float) -> bool:
-        """Number the picture that was grabbed, and hand it on if it is wanted. Returns whether it was well."""
+        """Number the grabbed picture and put it into the queue if it is wanted. Returns whether it could be decoded."""
         if not self._queue.begun:
             return True
         log, rate_hz = self._log, self.rate_hz
@@ -229,14 +219,14 @@ class Receiver:
         if log.number - place > max(_AHEAD_S * rate_hz, 2):
             self._health.count("dropped")
             return True
-        # Never before its time, so that what comes in bursts is not numbered back and forth.
+        # Numbers never go back, also where pictures come in bursts.
         log.number = max(log.number + 1, 1 + round(place))
         if not self._queue.wanted(log.number):
             return True
         image = stream.retrieve()
         if image is None:
             self._health.count("undecoded")
-            log.tell(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
+            log.report(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
             return False
         if (fitted := self._fitted(image, taken_s)) is not None:
             self._found()
@@ -244,7 +234,7 @@ class Receiver:
         return True
 
     def _fitted(self, image: np.ndarray, taken_s: float) -> np.ndarray | None:
-        """A picture of the run's size; None for one that is left out."""
+        """The picture at the run's size; None if it is left out."""
         width, height = self.size
         if image.shape[:2] == (height, width):
             self._odd = None
@@ -253,22 +243,20 @@ class Receiver:
         what = f"pictures are {image.shape[1]}x{image.shape[0]} in place of {width}x{height}"
         if self._odd is None or self._odd[0] != image.shape:
             self._odd = (image.shape, taken_s)
-            self._log.tell(f"{what}: they are left out", topic="size")
-        # One is a slip; a camera that was set otherwise is another matter, as long as it shows the same.
+            self._log.report(f"{what}: they are left out", topic="size")
+        # Single ones are left out; a stream that stays at another size of the same shape is scaled.
         same = abs(image.shape[1] * height - image.shape[0] * width) <= 0.02 * image.shape[1] * height
         if taken_s - self._odd[1] < self._parameters.stall_s or not same:
             return None
-        self._log.tell(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
+        self._log.report(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
         return scaled(image, self.size)
-
-    # -- what is told ------------------------------------------------------------------------------------------------
 
     def _lost(self, why: str) -> None:
         self._log.restart()
         if self._lost_s is None:
             self._lost_s, self._tries = self._clock.now(), 0
             self._health.gauge("connected", 0)
-            self._log.tell(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
+            self._log.report(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
 
     def _found(self) -> None:
         self._health.gauge("connected", 1)
@@ -277,10 +265,9 @@ class Receiver:
         gone_s, self._lost_s = self._clock.now() - self._lost_s, None
         self._health.count("reconnects")
         tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
-        self._log.tell(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
+        self._log.report(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
 
     def _compare(self, sent_hz: float) -> None:
-        """Tell once where it sends many more or fewer pictures than it announced."""
         if not self._off and abs(sent_hz / self.rate_hz - 1) > _OFF:
             self._off = True
-            self._log.tell(f"{self.name} sends {sent_hz:.1f} pictures a second, not {self.rate_hz:g}")
+            self._log.report(f"{self.name} sends {sent_hz:.1f} pictures a second, not {self.rate_hz:g}")

@@ -1,70 +1,40 @@
-"""The loop that does not die: frames as they come, results as they settle, and a new beginning after an error."""
+"""The loop of a live run: frames in, results out, and a restart after an error."""
 
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from math import isfinite
-from typing import Protocol
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.streams import Stream
+from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
-from torchvision_dddas.pipeline import Clip
 from torchvision_dddas.types import Frame, FrameResult, Telemetry, TrackedFrame
 
-_IN_VAIN = 25
-"""So many new beginnings in a row without any result are enough: it would go on like this for ever."""
-
-
-class LiveFrames(Clip, Protocol):
-    """What the run needs of a live source; see live.capture.LiveSource."""
-
-    @property
-    def name(self) -> str:
-        """What to call it in messages."""
-        ...
-
-    @property
-    def last(self) -> int:
-        """Number of the last frame that was handed on."""
-        ...
-
-    def __iter__(self) -> Iterator[Frame]:
-        """A further iteration goes on where the one before ended."""
-        ...
-
-
-class Stream(Protocol):
-    """Where results go; see io.streams."""
-
-    @property
-    def name(self) -> str:
-        """As the user wrote it."""
-        ...
-
-    def write(self, surveyed: FrameResult | None, people: TrackedFrame | None = None) -> None:
-        """Send a frame."""
+_MOST_FAILURES = 25
+"""Restarts in a row without a result, after which the run gives up."""
 
 
 class RepeatedFailure(Exception):
-    """The work fails again and again. Its words are for the user."""
+    """The work failed too often in a row. The message is for the user."""
 
 
 class Feed:
-    """The source as the path sees it: one stream of frames, however often the path begins anew.
+    """The source as the pipeline sees it: one stream of frames, also after the pipeline was restarted.
 
-    The work on a frame is what happens between its being taken and the next one being asked for. newest: the frame
-    taken last. telemetry: as run.run asks of a source; None where there is none.
+    A step lasts from taking a frame to asking for the next one. newest: the frame taken last. telemetry: a function, as
+    the pipeline expects of a source; None if there is none.
     """
 
     count = None
     exact = False
 
     def __init__(
-        self, source: LiveFrames, health: Health, watchdog: Watchdog, telemetry: Telemetry | None = None
+        self, source: LiveSource, health: Health, watchdog: Watchdog, telemetry: Telemetry | None = None
     ) -> None:
-        """telemetry: where its silence is to be told."""
+        """telemetry: given if its gaps are to be reported."""
         self.name, self.rate_hz, self.size = source.name, source.rate_hz, source.size
         self.problems: list[object] = []
         self.newest: Frame | None = None
@@ -80,10 +50,10 @@ class Feed:
         """As in Source."""
         return self._source.last
 
-    def anew(self) -> None:
-        """Whoever iterates next has seen nothing so far."""
+    def restart(self) -> None:
+        """Prepare for a new iteration by a pipeline that has seen no frame."""
         self._watchdog.done()
-        self._frames = iter(self._source)  # what broke may have been the source's own iteration
+        self._frames = iter(self._source)  # the source's own iteration may have failed
         self._first = True
 
     def __iter__(self) -> Iterator[Frame]:
@@ -94,19 +64,18 @@ class Feed:
                 self.ended = True
                 return
             if self._first:
-                # What was before is not missing: it was seen by the path that failed.
+                # Earlier frames are not missing: the pipeline that failed has seen them.
                 frame, self._first = replace(frame, skipped=frame.number - 1), False
-            self._listen(frame)
+            self._check_telemetry(frame)
             self.newest = frame
             self._watchdog.begin(frame.number)
             yield frame
 
     def stop(self) -> None:
-        """No further frame is taken; what was seen is still settled."""
+        """Take no further frame; results of those taken still come."""
         self.ended = True
 
-    def _listen(self, frame: Frame) -> None:
-        """Say when the telemetry falls silent, and when it speaks again."""
+    def _check_telemetry(self, frame: Frame) -> None:
         if self._log is None:
             return
         flight = self._log.at(frame.time_s)
@@ -118,65 +87,65 @@ class Feed:
 
 
 Result = tuple[FrameResult, TrackedFrame | None]
-"""A frame, and the people in it; None where nobody is looked for."""
+"""A frame and the people in it; None if people are not searched for."""
 
 
-class _Renumbered:
-    """Identities go on where those before a new beginning ended: of what moves, and of people."""
+class _Renumbering:
+    """Makes identities of targets and of people go on after a restart where they ended before it."""
 
     def __init__(self) -> None:
         self._before, self._highest = [0, 0], [0, 0]
 
     def __call__(self, result: Result) -> Result:
         surveyed, people = result
-        followed, grounded = self._known(0, surveyed.followed), surveyed.grounded
+        followed, grounded = self._shifted(0, surveyed.followed), surveyed.grounded
         if grounded is not None and self._before[0]:
             places = grounded.positions
             grounded = replace(grounded, positions=replace(places, target=places.target + self._before[0]))
         surveyed = replace(surveyed, followed=followed, grounded=grounded)
-        return surveyed, None if people is None else self._known(1, people)
+        return surveyed, None if people is None else self._shifted(1, people)
 
-    def anew(self) -> None:
+    def restart(self) -> None:
         self._before = list(self._highest)
 
-    def _known(self, kind: int, followed: TrackedFrame) -> TrackedFrame:
+    def _shifted(self, kind: int, followed: TrackedFrame) -> TrackedFrame:
         before, tracks = self._before[kind], followed.tracks
         self._highest[kind] = max(self._highest[kind], before + int(tracks.identity.max(initial=0)))
         return replace(followed, tracks=replace(tracks, identity=tracks.identity + before)) if before else followed
 
 
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
-    """What `begin(feed)` yields; an error in it is an event, and it is begun anew with the frames that follow.
+    """Yield the results of `begin(feed)`; after an error it is called again and goes on with the frames that follow.
 
-    Raises RepeatedFailure where that happens again and again without a result between.
+    Each error is an event. Raises RepeatedFailure after 25 errors without a result between them.
     """
-    renumbered, in_vain = _Renumbered(), 0
+    renumbered, failures = _Renumbering(), 0
     while True:
         try:
             for result in begin(feed):
-                in_vain = 0
+                failures = 0
                 yield renumbered(result)
         except Exception as error:
             if feed.ended and isinstance(error, InputError):  # as of a clip that was stopped after its second frame
                 health.event("run", str(error))
                 return
-            in_vain += 1
+            failures += 1
             number = feed.newest.number if feed.newest is not None else 0
             words = f"{type(error).__name__}: {error} ({_where(error)})"
-            if in_vain >= _IN_VAIN:
+            if failures >= _MOST_FAILURES:
                 raise RepeatedFailure(
-                    f"{in_vain} times in a row the work on a frame failed, at last: {words}"
+                    f"{failures} times in a row the work on a frame failed, at last: {words}"
                 ) from error
             health.event("run", f"{words}; begun anew with the next frame", number)
             health.count("begun_anew")
         if feed.ended:
             return
-        feed.anew()
-        renumbered.anew()
+        feed.restart()
+        renumbered.restart()
 
 
 def send_result(result: Result, streams: Iterable[Stream], health: Health) -> None:
-    """To all streams; what one of them cannot write is left out of it, and told."""
+    """Write a result to all streams. A stream that raises leaves it out; that is an event."""
     for stream in streams:
         try:
             stream.write(*result)
@@ -185,8 +154,8 @@ def send_result(result: Result, streams: Iterable[Stream], health: Health) -> No
             health.event("sink", f"{stream.name}: left out, {type(error).__name__}: {error} ({_where(error)})", number)
 
 
-def told(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:
-    """Take note of a result that was handed on: how late it is, and what it holds."""
+def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:
+    """Record the latency of a result that was sent, and what it holds, in the health."""
     surveyed, people = result
     now_s, frame = time.monotonic(), surveyed.followed.frame
     if feed.newest is not None and isfinite(feed.newest.taken_s):
@@ -203,7 +172,7 @@ def told(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None
 
 
 def _where(error: BaseException) -> str:
-    """The innermost line of ours, for whoever mends it."""
+    """The innermost line of this package in the traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if "torchvision_dddas" in f.filename] or frames
     return f"{ours[-1].filename.rpartition('torchvision_dddas/')[2]}:{ours[-1].lineno}" if ours else "nowhere"

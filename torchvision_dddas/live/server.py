@@ -1,66 +1,38 @@
-"""A small page, Prometheus text and JSON about a live run, for whoever looks after the vehicle."""
+"""The state of a live run over HTTP: a page for people, text for Prometheus, JSON for programs."""
 
+import json
+import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.pages import find_trouble, health_json, html_page, metrics
-from torchvision_dddas.live.status import snapshot_facts
+from torchvision_dddas.io.output import finite
+from torchvision_dddas.io.report import render_page
+from torchvision_dddas.io.streams import Stream
+from torchvision_dddas.live.health import Health, Snapshot
+from torchvision_dddas.live.status import StatusWriter, snapshot_facts
 from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"
-_LINKS = ("/metrics", "/health.json")
+LINKS = ("/metrics", "/health.json")
 
 Page = Callable[[], tuple[int, str, str]]
-"""Gives (status, type, text); called in a thread of its own."""
+"""Returns (status, type, text); called in a thread of the server."""
 
-_PATIENCE_S = 5.0  # with a client that is slow
-_AT_ONCE = 8  # clients; more are turned away, so that they cannot take the run's time
-
-
-def address_of(spec: str) -> tuple[str, int]:
-    """PORT or HOST:PORT; a port alone is this machine's own. Raises InputError for anything else."""
-    host, _, port = spec.rpartition(":")
-    if not port.isdecimal() or len(port) > 5 or int(port) > 65535:
-        raise InputError(f"--serve {spec} is no address; wanted PORT or HOST:PORT, such as 8080 or 0.0.0.0:8080")
-    return host.strip("[]") or LOOPBACK, int(port)
-
-
-class Losing(Protocol):
-    """A stream that counts what nobody will get, as io.streams.Stream."""
-
-    @property
-    def name(self) -> str:
-        """As the user wrote it."""
-        ...
-
-    @property
-    def lost(self) -> int:
-        """Messages that nobody will get."""
-        ...
-
-
-class Going(Protocol):
-    """What tells how far the run is, as StatusWriter: running, complete, stopped or failed."""
-
-    @property
-    def state(self) -> str:
-        """One word."""
-        ...
+_CLIENT_TIMEOUT_S = 5.0
+_MOST_CLIENTS = 8  # at a time; more are refused, so that they cannot take the run's time
+_SHOWN_EVENTS = 20
 
 
 class HealthServer:
-    """A context in which the pages are there. address: (host, port), where.
-
-    pages: by their paths; may be filled until it begins.
-    """
+    """Serves pages while the context is open. address: (host, port) in use. pages: by path; may be filled later."""
 
     def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
-        """Raises InputError where the port is in use, or the host is none of this machine's."""
+        """Raises InputError if the port is in use, or the host is not one of this machine."""
         try:
             self._server = _Server(address, pages)
         except OSError as error:
@@ -83,34 +55,43 @@ class HealthServer:
         self._thread.join()
 
 
+def parse_address(spec: str) -> tuple[str, int]:
+    """(host, port) of PORT or HOST:PORT; a port alone is on this machine only. Raises InputError for anything else."""
+    host, _, port = spec.rpartition(":")
+    if not port.isdecimal() or len(port) > 5 or int(port) > 65535:
+        raise InputError(f"--serve {spec} is no address; wanted PORT or HOST:PORT, such as 8080 or 0.0.0.0:8080")
+    return host.strip("[]") or LOOPBACK, int(port)
+
+
 def health_pages(
     health: Health,
     watchdog: Watchdog,
-    streams: Sequence[Losing],
-    run: Going,
+    streams: Sequence[Stream],
+    run: StatusWriter,
     name: str,
     version: str,
     patience_s: float,
 ) -> dict[str, Page]:
-    """The pages. patience_s: no result for longer is trouble."""
+    """The pages of a run. patience_s: a longer time without a result is reported as trouble."""
 
-    def human() -> tuple[int, str, str]:
+    def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
-        trouble = find_trouble(now, patience_s, watchdog.hung)
-        return 200, "text/html", html_page(now, name, run.state, trouble, _LINKS)
+        return now, find_trouble(now, patience_s, watchdog.hung)
+
+    def page() -> tuple[int, str, str]:
+        now, trouble = state()
+        return 200, "text/html", html_page(now, name, run.state, trouble, LINKS)
 
     def prometheus() -> tuple[int, str, str]:
-        now = health.snapshot()
-        trouble, lost = find_trouble(now, patience_s, watchdog.hung), {stream.name: stream.lost for stream in streams}
-        return 200, "text/plain; version=0.0.4", metrics(now, version, trouble, lost)
+        text = metrics(*state(), version, {stream.name: stream.lost for stream in streams})
+        return 200, "text/plain; version=0.0.4", text
 
     def program() -> tuple[int, str, str]:
-        now = health.snapshot()
-        trouble = find_trouble(now, patience_s, watchdog.hung)
+        now, trouble = state()
         facts = {"state": run.state, "input": name, "version": version, **snapshot_facts(now)}
         return (503 if trouble else 200), "application/json", health_json(facts, trouble)
 
-    return {"/": human, "/metrics": prometheus, "/health.json": program}
+    return {"/": page, "/metrics": prometheus, "/health.json": program}
 
 
 class _Server(ThreadingHTTPServer):
@@ -119,7 +100,7 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
         self.pages = pages
-        self._free = threading.BoundedSemaphore(_AT_ONCE)
+        self._free = threading.BoundedSemaphore(_MOST_CLIENTS)
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -135,11 +116,11 @@ class _Server(ThreadingHTTPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away is nobody's trouble."""
+        """Ignore clients that hung up."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    timeout = _PATIENCE_S
+    timeout = _CLIENT_TIMEOUT_S
     server: _Server
     server_version, sys_version = "dddas", ""
 
@@ -151,7 +132,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Cache-Control", "no-store")
-        # Nothing from elsewhere, no script: what a stream says of itself stays text.
+        # Nothing from elsewhere and no script: a stream's name stays text.
         self.send_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
         self.end_headers()
         if self.command != "HEAD":
@@ -160,4 +141,145 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Who asks is not the run's business."""
+        """Requests are not logged."""
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# What the pages say.
+
+_TILES = {
+    "rate_hz": ("results a second", ""),
+    "targets": ("targets now", ""),
+    "people": ("people now", ""),
+    "every": ("looks at one picture of", ""),
+    "keypoints": ("keypoints", ""),
+    "queue": ("pictures waiting", ""),
+    "resident_bytes": ("memory", " MB"),
+}
+_TIME_TILES = {"latency": "latency, median · 99 %", "age": "age of a result", "step": "work on a picture"}
+_COUNT_TILES = {
+    "captured": "pictures captured",
+    "dropped": "dropped",
+    "late": "late",
+    "undecoded": "not decoded",
+    "unreliable": "without a conclusion",
+    "reconnects": "reconnected",
+    "begun_anew": "begun anew",
+}
+_HELP = {
+    "captured": "Pictures that the source gave.",
+    "dropped": "Pictures that were too late to be looked at.",
+    "looked_at": "Pictures that were looked at.",
+    "undecoded": "Pictures that could not be decoded.",
+    "reconnects": "Times that the stream was opened again.",
+    "results": "Frames whose results were handed on.",
+    "late": "Results later than the deadline.",
+    "unreliable": "Frames from which nothing could be concluded.",
+    "begun_anew": "Times that the work failed and was begun anew.",
+    "every": "One of so many pictures is looked at.",
+    "keypoints": "Keypoints that a registration may take.",
+    "queue": "Pictures that wait.",
+    "rate_hz": "Results a second.",
+    "targets": "Targets in the latest frame.",
+    "people": "People in the latest frame.",
+    "resident_bytes": "Memory of the process.",
+    "latency": "From the capture of the newest picture to the results that it settles.",
+    "age": "From the capture of a picture to its own results.",
+    "step": "Work on a picture.",
+}
+
+
+def html_page(now: Snapshot, name: str, state: str, trouble: str, links: tuple[str, ...], refresh_s: int = 2) -> str:
+    """The page for people: no scripts, nothing fetched from elsewhere, reloaded every refresh_s."""
+    latest = list(reversed(now.events))[:_SHOWN_EVENTS]
+    return render_page(
+        "live.html",
+        title=f"{state} · {name}",
+        name=name,
+        trouble=trouble,
+        figures=_figures(now),
+        events=[(_clock(event.utc_s), event.frame, event.text) for event in latest],
+        now=_clock(datetime.now(UTC).timestamp()),
+        links=links,
+        refresh_s=refresh_s,
+    )
+
+
+def _figures(now: Snapshot) -> list[tuple[str, str]]:
+    def count(name: str) -> str:
+        return f"{now.counts.get(name, 0):,}".replace(",", " ")
+
+    figures = [("running for", _span(now.since_s)), ("results", count("results"))]
+    for name, (title, unit) in _TILES.items():
+        if name in now.gauges:
+            figures.append((title, f"{now.gauges[name] / (1e6 if unit else 1):.3g}{unit}"))
+    for name, title in _TIME_TILES.items():
+        if name in now.seconds:
+            median, _, most = now.seconds[name]
+            figures += [(f"{title}, median", f"{1000 * median:.0f} ms"), (f"{title}, 99 %", f"{1000 * most:.0f} ms")]
+    return [*figures, *((title, count(name)) for name, title in _COUNT_TILES.items() if name in now.counts)]
+
+
+def _span(seconds: float) -> str:
+    whole = int(seconds)
+    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    return f"{days} d {hours} h" if days else f"{hours} h {minutes} min" if hours else f"{minutes}:{whole % 60:02d}"
+
+
+def _clock(utc_s: float) -> str:
+    return datetime.fromtimestamp(utc_s, UTC).strftime("%H:%M:%S")
+
+
+def metrics(now: Snapshot, trouble: str, version: str, lost: Mapping[str, int]) -> str:
+    """Prometheus' text exposition format, version 0.0.4. lost: messages lost for good, by stream."""
+    lines: list[str] = []
+
+    def add(name: str, kind: str, words: str, values: Mapping[str, float]) -> None:
+        """values: by labels in braces, or by an empty text."""
+        lines.extend([f"# HELP dddas_{name} {words}", f"# TYPE dddas_{name} {kind}"])
+        lines.extend(f"dddas_{name}{labels} {_value(value)}" for labels, value in values.items())
+
+    add("info", "gauge", "What runs.", {_labels(version=version): 1})
+    add("healthy", "gauge", "1 while all is well, as /health.json says.", {"": float(not trouble)})
+    add("uptime_seconds", "gauge", "Since the start.", {"": now.since_s})
+    add("idle_seconds", "gauge", "Since the last result.", {"": now.idle_s})
+    events = {name.removeprefix("events_"): count for name, count in now.counts.items() if name.startswith("events_")}
+    if events:
+        add("events_total", "counter", "Events.", {_labels(kind=kind): count for kind, count in events.items()})
+    for name, count in now.counts.items():
+        if not name.startswith("events_"):
+            add(f"{name}_total", "counter", _HELP.get(name, name), {"": count})
+    for name, value in now.gauges.items():
+        add(name, "gauge", _HELP.get(name, name), {"": value})
+    for name, values in now.seconds.items():
+        shares = zip(("0.5", "0.95", "0.99"), values, strict=True)
+        add(f"{name}_seconds", "gauge", _HELP.get(name, name), {_labels(quantile=q): v for q, v in shares})
+    if lost:
+        words = "Messages that nobody will get."
+        add("lost_messages_total", "counter", words, {_labels(stream=s): n for s, n in lost.items()})
+    return "\n".join(lines) + "\n"
+
+
+def _labels(**labels: str) -> str:
+    def quote(text: str) -> str:
+        return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+    return "{" + ",".join(f'{name}="{quote(value)}"' for name, value in labels.items()) + "}"
+
+
+def _value(value: float) -> str:
+    if math.isnan(value):
+        return "NaN"
+    return ("+Inf" if value > 0 else "-Inf") if math.isinf(value) else f"{value:.12g}"
+
+
+def find_trouble(now: Snapshot, patience_s: float, hung: str = "") -> str:
+    """What is wrong, in words; empty if nothing is. patience_s: a longer time without a result is wrong."""
+    if hung:
+        return hung
+    return f"no result for {_span(now.idle_s)}" if now.idle_s > patience_s else ""
+
+
+def health_json(state: Mapping[str, Any], trouble: str) -> str:
+    """The state of the run, and whether anything is wrong."""
+    return json.dumps(finite({"ok": not trouble, "trouble": trouble, **state}), indent=2) + "\n"

@@ -1,4 +1,4 @@
-"""How a run ends: a watchdog ends one that hangs, signals ask it to stop with valid outputs or end it at once."""
+"""How a live run ends: a watchdog for one that hangs, and signals that stop it with valid outputs or at once."""
 
 import os
 import signal
@@ -14,16 +14,17 @@ from typing import Any, Self
 from torchvision_dddas.live.health import Health
 
 HUNG = 70
-"""Exit code of a run that was ended because it hung, or failed again and again: EX_SOFTWARE of sysexits.h."""
+"""Exit code of a run that hung or failed again and again: EX_SOFTWARE of sysexits.h."""
 
-ASKED = (signal.SIGINT, signal.SIGTERM)
-_LOOK_S = 1.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_CHECK_S = 1.0
 
 
 class Supervisor:
-    """What systemd wants to hear of a service with Type=notify. Says nothing where nobody asked.
+    """Notifies systemd, as of a service with Type=notify; does nothing without NOTIFY_SOCKET.
 
-    every_s: how often it wants to hear WATCHDOG=1; 0: never. Source: sd_notify(3), sd_watchdog_enabled(3).
+    every_s: half the interval in which systemd expects WATCHDOG=1; 0: never.
+    Source: sd_notify(3), sd_watchdog_enabled(3).
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
@@ -34,7 +35,7 @@ class Supervisor:
         self.every_s = int(wanted) / 2e6 if wanted.isdigit() and mine and self._address else 0.0
 
     def say(self, *words: str) -> None:
-        """Such as READY=1. Never raises: a supervisor that is gone is no reason to stop."""
+        """Send words such as READY=1. Never raises."""
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
@@ -43,9 +44,9 @@ class Supervisor:
 
 
 class Watchdog:
-    """Told when a step begins and is done; a step that takes longer than hung_s is an event, twice that the end.
+    """Reports a step that takes longer than hung_s as an event, and ends the process after twice that.
 
-    A context: a thread looks within it, and tells the supervisor that all is well while it is.
+    While its context is open, a thread checks the step and notifies the supervisor as long as none hangs.
     """
 
     def __init__(
@@ -56,43 +57,43 @@ class Watchdog:
         abort: Callable[[str], object] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """hung_s: 0 lets steps take as long as they want. abort: called with words; by default the process ends."""
+        """hung_s: 0 for no limit. abort: called with the reason; by default it ends the process."""
         self._health, self._hung_s, self._clock = health, hung_s, clock
         self._supervisor = supervisor or Supervisor({})
         self._abort = abort or abort_process
-        self._step: tuple[int, float] | None = None  # its frame, and when it began; one word, so that no lock is needed
-        self._told = 0  # the frame of the step that was told
-        self._heard = -float("inf")
+        self._step: tuple[int, float] | None = None  # frame and start; one attribute needs no lock
+        self._reported = 0  # frame of the step that was reported
+        self._notified_s = -float("inf")
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
     def begin(self, frame: int) -> None:
-        """Work on a frame begins."""
+        """Note that work on a frame begins."""
         self._step = frame, self._clock()
 
     def done(self) -> None:
-        """The work is done; until the next begins, the run waits for pictures, as long as it takes."""
+        """Note that the work is done; waiting for frames has no limit."""
         self._step = None
 
     @property
     def hung(self) -> str:
-        """In words that a step hangs; empty where none does."""
+        """Which step hangs, in words; empty if none does."""
         step = self._step
         if step is None or not self._hung_s or self._clock() - step[1] <= self._hung_s:
             return ""
         return f"the work on frame {step[0]} has taken {self._clock() - step[1]:.0f} s"
 
-    def look(self) -> None:
-        """Once: tell of a hung step, end the process if it hangs for too long, reassure the supervisor."""
+    def check(self) -> None:
+        """Check the step once: report it, end the process, or notify the supervisor."""
         hung, step = self.hung, self._step
         if not hung or step is None:
-            self._told = 0
-            if self._supervisor.every_s and self._clock() - self._heard >= self._supervisor.every_s / 2:
-                self._heard = self._clock()
+            self._reported = 0
+            if self._supervisor.every_s and self._clock() - self._notified_s >= self._supervisor.every_s / 2:
+                self._notified_s = self._clock()
                 self._supervisor.say("WATCHDOG=1")
             return
-        if self._told != step[0]:
-            self._told = step[0]
+        if self._reported != step[0]:
+            self._reported = step[0]
             self._health.event("watchdog", f"{hung}: it counts as hung", step[0])
         if self._clock() - step[1] > 2 * self._hung_s:
             self._abort(f"{hung}: ended, to be started anew (live.watchdog_s = {self._hung_s:g})")
@@ -106,37 +107,37 @@ class Watchdog:
         self._thread.join()
 
     def _watch(self) -> None:
-        waits = [_LOOK_S, *(wait / 4 for wait in (self._hung_s, self._supervisor.every_s) if wait)]
+        waits = [_CHECK_S, *(wait / 4 for wait in (self._hung_s, self._supervisor.every_s) if wait)]
         while not self._ended.wait(min(waits)):
-            self.look()
+            self.check()
 
 
 def abort_process(words: str) -> None:
-    """The end of a process whose main thread hangs: nothing there can be asked to clean up."""
+    """End a process whose main thread hangs, without clean-up."""
     print(f"dddas: {words}", file=sys.stderr, flush=True)  # noqa: T201
     os._exit(HUNG)
 
 
 class StopSignals:
-    """A context within which the two signals are requests. signal: the one that came first; None while none has.
+    """A context in which SIGINT and SIGTERM are requests to stop. signal: the first that came, None before.
 
-    The system itself wakes a thread of our own: the main thread may be deep in a library, hold any lock, or hang.
+    The signals wake a thread of this class: the main thread may be deep in a library, hold any lock, or hang.
     """
 
     def __init__(self, ask: Callable[[int], object], at_once: Callable[[int], object] = os._exit) -> None:
-        """ask: called from another thread with the first signal. at_once: with the exit code, on the second."""
+        """ask: called in another thread with the first signal. at_once: called with the exit code at the second."""
         self._ask, self._at_once = ask, at_once
         self.signal: int | None = None
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        # Elsewhere Python takes no signals: then whoever embeds the run ends it in his own way.
+        # Python handles signals in the main thread only.
         if threading.current_thread() is not threading.main_thread():
             return self
         self._ours, self._theirs = socket.socketpair()
         self._theirs.setblocking(False)
         self._wakeup = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
-        self._before = {number: signal.signal(number, _nothing) for number in ASKED}
+        self._before = {number: signal.signal(number, _nothing) for number in _SIGNALS}
         self._thread = threading.Thread(target=self._listen, name="stopping", daemon=True)
         self._thread.start()
         return self
@@ -154,7 +155,7 @@ class StopSignals:
     def _listen(self) -> None:
         while numbers := self._ours.recv(64):
             for number in numbers:
-                if number not in ASKED:
+                if number not in _SIGNALS:
                     continue
                 if self.signal is not None:
                     self._at_once(128 + number)
@@ -164,4 +165,4 @@ class StopSignals:
 
 
 def _nothing(number: int, frame: FrameType | None) -> None:
-    """A signal without a handler would end the process before the thread hears of it."""
+    """Replaces the default handler, which would end the process."""

@@ -1,6 +1,7 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
 from torchvision_dddas.io.output.ground_maps import Site
+from torchvision_dddas.io.output.live_session import RESULTS, Event, SessionLog, make_session_folder
 from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
     AerialRecorder,
@@ -19,11 +20,13 @@ __all__ = [
     "CONFIRMATION_NAMES",
     "NOTICED",
     "PROBLEM",
+    "RESULTS",
     "RUN_JSON",
     "WORLD",
     "AerialRecorder",
     "ConfirmationRecorder",
     "DetectionRecorder",
+    "Event",
     "GroundRecorder",
     "Part",
     "PartOf",
@@ -31,9 +34,11 @@ __all__ = [
     "PipelineRecorder",
     "RunRecord",
     "RunRecorder",
+    "SessionLog",
     "Site",
     "TrackRecorder",
     "finite",
+    "make_session_folder",
     "parse_save",
     "versions",
 ]

@@ -1,16 +1,17 @@
-"""The folder of one live session: nothing of an earlier one is touched, and all in it is valid at every moment.
+"""The folder of one live session. Earlier sessions stay as they are, and its files are valid at every moment.
 
-results.jsonl grows by a line a frame, events.log by a line an event, run.json is replaced whole.
+results.jsonl grows by a line per frame, events.log by a line per event; run.json is replaced whole.
 """
 
 import json
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,32 +23,18 @@ from torchvision_dddas.io.output.run_record import RUN_JSON, finite, versions
 RESULTS, EVENTS = "results.jsonl", "events.log"
 
 
-class Told(Protocol):
-    """Something that happened, as `live.Event` tells it."""
+@dataclass(frozen=True)
+class Event:
+    """Something that happened. utc_s: seconds since 1970. frame: 0 if it belongs to none. kind: one word."""
 
-    @property
-    def utc_s(self) -> float:
-        """Seconds since 1970."""
-        ...
-
-    @property
-    def frame(self) -> int:
-        """0 where it belongs to none."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """One word."""
-        ...
-
-    @property
-    def text(self) -> str:
-        """What it was, in words."""
-        ...
+    utc_s: float
+    frame: int
+    kind: str
+    text: str
 
 
-def claim(out: Path, utc_s: float | None = None) -> Path:
-    """A new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError where none can be made."""
+def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
+    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError if none can be made."""
     name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -66,37 +53,34 @@ def claim(out: Path, utc_s: float | None = None) -> Path:
 
 
 class SessionLog:
-    """events.log and run.json of a session. Every method raises OSError where the disk refuses, and may be tried again.
-
-    facts: what is known before the run.
-    """
+    """events.log and run.json of a session. A method that raises OSError, as on a full disk, may be called again."""
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
+        """facts: what run.json says of the run from its start."""
         self.folder, self.facts = folder, facts
         self._events = os.open(folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
 
-    def tell(self, events: Iterable[Told]) -> None:
-        """Append events, a line each: UTC time, frame or -, kind, words."""
-        told = list(events)
-        stamps = iso_utc(np.array([event.utc_s for event in told]))
+    def append(self, events: Sequence[Event]) -> None:
+        """Append events, a line each: UTC time, frame or -, kind, text."""
+        stamps = iso_utc(np.array([event.utc_s for event in events]))
         lines = "".join(
             f"{stamp} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n"
-            for stamp, e in zip(stamps, told, strict=True)
+            for stamp, e in zip(stamps, events, strict=True)
         )
         size, rest = os.fstat(self._events).st_size, lines.encode()
         try:
             while rest:
                 rest = rest[os.write(self._events, rest) :]
         except OSError:
-            with suppress(OSError):  # what a full disk broke off comes again whole
+            with suppress(OSError):  # a line that a full disk broke off is written again whole
                 os.ftruncate(self._events, size)
             raise
 
-    def state(self, state: str, now: dict[str, Any]) -> None:
+    def write_state(self, state: str, now: dict[str, Any]) -> None:
         """Replace run.json. state: running, complete, stopped or failed."""
         record = {"state": state, "versions": versions(), **self.facts, **now}
         write_whole(self.folder / RUN_JSON, (json.dumps(finite(record), indent=2) + "\n").encode())
 
     def close(self) -> None:
-        """Nothing follows."""
+        """Close events.log."""
         os.close(self._events)

@@ -1,13 +1,18 @@
-"""How a run goes, for a person, for Prometheus, for programs."""
+"""The state of a run over HTTP: for a person, for Prometheus, for programs."""
 
 import json
 import re
+import socket
+import threading
+import urllib.error
+import urllib.request
 from html.parser import HTMLParser
 
 import pytest
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.pages import find_trouble, health_json, html_page, metrics
+from torchvision_dddas.live.server import HealthServer, find_trouble, health_json, html_page, metrics, parse_address
 from torchvision_dddas.live.status import snapshot_facts
 
 # The text exposition format, version 0.0.4.
@@ -32,7 +37,7 @@ def health():
 
 
 def test_every_line_of_metrics_is_of_the_format_and_of_a_family_that_was_announced_once(health):
-    text = metrics(health.snapshot(), '0.1"\\\n', "", {"cot:udp://h:1": 4})
+    text = metrics(health.snapshot(), "", '0.1"\\\n', {"cot:udp://h:1": 4})
     assert text.endswith("\n")
     announced, kinds, seen = [], {}, []
     for line in text.splitlines():
@@ -51,7 +56,7 @@ def test_every_line_of_metrics_is_of_the_format_and_of_a_family_that_was_announc
 
 
 def test_metrics_say_what_health_knows(health):
-    lines = metrics(health.snapshot(), "1", "hung", {"json:-": 4}).splitlines()
+    lines = metrics(health.snapshot(), "hung", "1", {"json:-": 4}).splitlines()
     for line in (
         "dddas_captured_total 3",
         "dddas_results_total 1",
@@ -106,3 +111,91 @@ def test_no_result_for_long_or_a_hung_step_is_trouble(health):
     assert find_trouble(now, 60.0) == ""
     assert find_trouble(now, 60.0, "the work on frame 3 has taken 40 s").startswith("the work")
     assert find_trouble(now, -1.0) == "no result for 0:00"
+
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def server():
+    pages = {"/": lambda: (200, "text/html", "<p>é"), "/health.json": lambda: (503, "application/json", "{}")}
+    with HealthServer(("127.0.0.1", 0), pages) as server:
+        yield server
+
+
+def asked(server, path="/", method="GET"):
+    request = urllib.request.Request("http://{}:{}{}".format(*server.address, path), method=method)
+    try:
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
+            return answer.status, answer.headers, answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.headers, error.read()
+
+
+def test_a_page_comes_with_its_status_type_and_length(server):
+    status, headers, body = asked(server, "/?again")
+    assert (status, body.decode()) == (200, "<p>é")
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    assert headers["Content-Length"] == str(len(body))
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert asked(server, "/health.json")[0] == 503
+
+
+def test_head_gives_no_body_and_another_path_names_those_that_are(server):
+    assert asked(server, "/", "HEAD")[2] == b""
+    status, _, body = asked(server, "/../etc/passwd")
+    assert status == 404
+    assert b"/health.json" in body
+
+
+def test_nothing_can_be_sent_to_it(server):
+    assert asked(server, "/", "POST")[0] == 501
+
+
+def test_clients_that_say_nothing_keep_nobody_from_the_pages(server):
+    with socket.create_connection(server.address), socket.create_connection(server.address):
+        assert asked(server)[0] == 200
+
+
+def test_a_page_that_fails_ends_nothing():
+    def failing() -> tuple[int, str, str]:
+        raise ZeroDivisionError
+
+    with HealthServer(("127.0.0.1", 0), {"/": failing, "/well": lambda: (200, "text/plain", "well")}) as server:
+        with pytest.raises((urllib.error.URLError, ConnectionError)):
+            asked(server)
+        assert asked(server, "/well")[0] == 200
+
+
+def test_a_port_in_use_is_one_line(server):
+    with pytest.raises(InputError, match=r"cannot serve at 127\.0\.0\.1:\d+: address already in use; choose another"):
+        HealthServer(server.address, {})
+
+
+def test_when_it_is_left_the_port_is_free_and_no_thread_stays():
+    before = threading.active_count()
+    with HealthServer(("127.0.0.1", 0), {}) as server:
+        address = server.address
+    assert threading.active_count() == before
+    with HealthServer(address, {}):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("spec", "address"),
+    [
+        ("8080", ("127.0.0.1", 8080)),
+        (":8080", ("127.0.0.1", 8080)),
+        ("0.0.0.0:1", ("0.0.0.0", 1)),
+        ("[::1]:9", ("::1", 9)),
+    ],
+)
+def test_a_port_alone_is_this_machines_own(spec, address):
+    assert parse_address(spec) == address
+
+
+@pytest.mark.parametrize("spec", ["", "eighty", "1.2.3.4", "host:", "70000", "-1", "8080/"])
+def test_what_is_no_address_is_one_line(spec):
+    with pytest.raises(InputError, match=r"--serve .* is no address; wanted PORT or HOST:PORT"):
+        parse_address(spec)
