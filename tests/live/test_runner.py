@@ -1,6 +1,7 @@
 """The loop that does not die."""
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from torchvision_dddas.types import Detections, Frame, FrameResult, Telemetry, T
 PICTURE = np.zeros((4, 4), np.uint8)
 
 
-class Camera:
+class Camera(Any):
     """Frames 1 to n; who iterates again goes on."""
 
     name, rate_hz, size, last = "camera", 10.0, (4, 4), 0
@@ -156,13 +157,13 @@ def test_latency_is_of_the_newest_picture_and_lateness_is_counted():
 
 
 def test_a_stream_that_cannot_write_a_frame_keeps_no_other_from_it():
-    class Good:
+    class Good(Any):
         name, got = "good", 0
 
         def write(self, surveyed, people=None):
             self.got += 1
 
-    class Bad:
+    class Bad(Any):
         name = "bad"
 
         def write(self, surveyed, people=None):
