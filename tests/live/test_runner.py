@@ -15,7 +15,7 @@ from torchvision_dddas.types import Detections, Frame, FrameResult, Telemetry, T
 PICTURE = np.zeros((4, 4), np.uint8)
 
 
-class Camera(Any):
+class Camera:
     """Frames 1 to n; who iterates again goes on."""
 
     name, rate_hz, size, last = "camera", 10.0, (4, 4), 0
@@ -31,7 +31,8 @@ class Camera(Any):
 
 def feed_of(count=10, health=None, telemetry=None, **how):
     health = health or Health()
-    return Feed(Camera(count, **how), health, Watchdog(health, 0), telemetry)
+    source: Any = Camera(count, **how)
+    return Feed(source, health, Watchdog(health, 0), telemetry)
 
 
 def result_of(frame, identity=1, person=None):
@@ -105,7 +106,8 @@ def test_a_source_that_breaks_is_iterated_again():
                     raise OSError("the driver")
 
     health = Health()
-    feed = Feed(Breaking(6), health, Watchdog(health, 0))
+    source: Any = Breaking(6)
+    feed = Feed(source, health, Watchdog(health, 0))
     assert numbers(results(path(), feed, health)) == [1, 2, 3, 4, 5, 6]
 
 
