@@ -1,94 +1,64 @@
-"""Accuracy beside the plain OpenCV chain: `python eval/accuracy.py DATA_FOLDER [--configs default,fast,source]`.
+"""Accuracy of moving targets beside the plain OpenCV chain: `python eval/accuracy.py DATA`.
 
-DATA_FOLDER holds clips: folders with frames/ and masks/ (PNG, 0 background, each other value one mover, any subset of
-the frames), or boxes_xywh.txt (one target a frame, other movers unlabelled), or neither (nothing moves: every blob is
-false). Detection runs in this process on every clip; pixel figures are pooled over a clip's frames. Prints tables in
-Markdown; `--write README.md` puts them between that file's accuracy marks. The same every time it is run.
+DATA holds clips: folders with frames/ and masks/ (PNG, 0 background, each other value one mover, any subset of the
+frames), or boxes_xywh.txt (one target a frame, other movers unlabelled), or neither (nothing moves: every blob is
+false). Pixel counts are pooled over a clip, boxes match at an IoU of 0.5. Of one labelled target: a hit is a frame in
+which more than a tenth of its box is foreground, an other blob one whose box meets the target's at an IoU below 0.05.
+The figures are the same in every run on one machine.
 """
 
-import argparse
-import json
-import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
+import bench
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
 import plain_chain
-import report
+from clips import clips_in
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics import boxes as detection
-from torchvision_dddas.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.evaluation.metrics import boxes as box_metrics
+from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.pixels import Pixels
 from torchvision_dddas.io.sources import open_source
 
 Found = tuple[np.ndarray, np.ndarray]
+"""(H, W) mask and (N, 4) boxes of a frame."""
 Figures = dict[str, float]
+MEASURES = {"precision": "precision", "recall": "recall", "f": "F", "gmean": "Gmean", "box_f1": "box F1"}
 
 
-def main() -> None:
-    """Score every clip with every chain and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--configs", default="default,fast,source", help="default, shipped names or TOML files")
-    parser.add_argument("--backend", default="onboard")
-    parser.add_argument("--only", default="", help="clips whose name contains this")
-    parser.add_argument("--json", type=Path, help="write all figures here")
-    parser.add_argument("--write", type=Path, help="a text file with the accuracy marks, such as README.md")
-    options = parser.parse_args()
-    places = [p for p in _clips(options.folder) if options.only in p.name]
-    if not places:
-        sys.exit(f"{options.folder} holds no clips: wanted folders with frames/; nothing was measured")
-    chains = {"plain": by_plain}
-    chains |= {name: by_us(name, options.backend) for name in options.configs.split(",")}
+def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, Figures]]]:
+    """Score every clip with the plain chain and with every configuration."""
+    cv2.setNumThreads(2)
+    chains: dict[str, Callable[[Path], Iterator[Found]]] = {"plain": run_plain}
+    chains |= {name: partial(run_ours, config=name, backend=options.backend) for name in options.configs}
     scores: dict[str, dict[str, Figures]] = {}
-    for place in places:
+    for place in clips_in(options.data, options.only):
         scores[place.name] = {}
         for name, chain in chains.items():
             scores[place.name][name] = score(place, chain)
-            print(place.name, name, _words(scores[place.name][name]), file=sys.stderr, flush=True)
-    text = tables(scores, list(chains))
-    print(text)
-    if options.json:
-        options.json.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
-    if options.write:
-        report.put(options.write, "accuracy", text)
+            bench.log(place.name, name, format_figures(scores[place.name][name]))
+    return format_tables(scores, list(chains)), scores
 
 
-def _clips(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if (p / "frames").is_dir()) if folder.is_dir() else []
-
-
-# -- chains: a clip's folder -> (mask, boxes (N, 4)) of every frame --------------------------------------------------
-
-
-def by_us(config: str, backend: str) -> Callable[[Path], Iterator[Found]]:
-    """This package under a configuration."""
+def run_ours(place: Path, config: str, backend: str) -> Iterator[Found]:
+    """Mask and boxes of every frame by this package under a configuration."""
     settings = load_config(None if config == "default" else config)
-
-    def chain(place: Path) -> Iterator[Found]:
-        for scene in detect_motion(open_source(place / "frames"), settings, backend):
-            yield scene.mask, scene.detections.box_px
-
-    return chain
+    for scene in detect_motion(open_source(place / "frames"), settings, backend):
+        yield scene.mask, scene.detections.box_px
 
 
-def by_plain(place: Path) -> Iterator[Found]:
-    """The plain chain on each frame and its next two; the last two frames look back."""
-    files = sorted((place / "frames").iterdir())
-    images = [cv2.imread(str(file)) for file in files]
+def run_plain(place: Path) -> Iterator[Found]:
+    """The same by the plain chain on each frame and its next two; the last two frames look back."""
+    images = [cv2.imread(str(file)) for file in sorted((place / "frames").iterdir())]
     for i in range(len(images)):
         step = 1 if i + 2 < len(images) else -1
         yield plain_chain.plain_window(images[i], images[i + step], images[i + 2 * step])
-
-
-# -- figures ---------------------------------------------------------------------------------------------------------
 
 
 def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
@@ -101,77 +71,57 @@ def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
             continue
         if number in truth.masks:
             labels = truths.read_mask(truth.masks[number])
-            pixels = pixels.plus(segmentation.count(mask, labels))
-            boxes = boxes.plus(detection.match(found, detection.boxes_of(labels)))
+            pixels = pixels.plus(pixel_metrics.count(mask, labels))
+            boxes = boxes.plus(box_metrics.match(found, box_metrics.boxes_of(labels)))
         elif number in truth.boxes:
-            target = target.plus(detection.one_target(mask, found, truth.boxes[number][0]))
+            target = target.plus(box_metrics.one_target(mask, found, truth.boxes[number][0]))
     if truth is None:
         return {"frames": frames, "still": blobs / frames}
     if truth.masks:
-        figures = segmentation.measures(pixels)
-        return {"frames": len(truth.masks), **figures, "box_f1": detection.measures(boxes)["f1"]}
-    return {"frames": target.frames, **detection.one_target_measures(target)}
+        box_f1 = box_metrics.measures(boxes)["f1"]
+        return {"frames": len(truth.masks), **pixel_metrics.measures(pixels), "box_f1": box_f1}
+    return {"frames": target.frames, **box_metrics.one_target_measures(target)}
 
 
-def tables(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> str:
-    """Markdown: F and box F1 of each clip with masks, the means over clips of a set, and the other clips."""
-    rows, masked = [], {clip: by for clip, by in scores.items() if "f" in by[chains[0]]}
+def format_tables(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> str:
+    """F and box F1 of each clip with masks, the means over clips of a set, and the other clips."""
+    masked = {clip: by for clip, by in scores.items() if "f" in by[chains[0]]}
     others = {clip: by for clip, by in scores.items() if clip not in masked}
+    parts = []
     if masked:
-        rows += ["F of pixels / F1 of boxes at IoU 0.5:", "", *_head("clip", chains)]
-        for clip, by in masked.items():
-            rows.append(_row(clip, [f"{_two(by[c]['f'])} / {_two(by[c]['box_f1'])}" for c in chains]))
-        rows += ["", "Means over the clips of a set:", "", *_head("set, measure", chains)]
-        for name, clips in _sets(masked).items():
-            for measure, word in (
-                ("precision", "precision"),
-                ("recall", "recall"),
-                ("f", "F"),
-                ("gmean", "Gmean"),
-                ("box_f1", "box F1"),
-            ):
-                means = [float(np.mean([masked[clip][c][measure] for clip in clips])) for c in chains]
-                rows.append(_row(f"{name}, {word}", [_two(m) for m in means]))
-            rows.append(_row(f"{name}, worst F", [_two(min(masked[clip][c]["f"] for clip in clips)) for c in chains]))
-        rows.append("")
+        rows = [[clip, *(f"{two(by[c]['f'])} / {two(by[c]['box_f1'])}" for c in chains)] for clip, by in masked.items()]
+        parts += ["F of pixels / F1 of boxes at IoU 0.5:", bench.format_table(["clip", *chains], rows)]
+        rows = []
+        for name in dict.fromkeys(clip.split("_")[0] for clip in masked):
+            of_set = [by for clip, by in masked.items() if clip.split("_")[0] == name]
+            for measure, word in MEASURES.items():
+                rows.append(
+                    [f"{name}, {word}", *(two(float(np.mean([by[c][measure] for by in of_set]))) for c in chains)]
+                )
+            rows.append([f"{name}, worst F", *(two(min(by[c]["f"] for by in of_set)) for c in chains)])
+        parts += ["Means over the clips of a set:", bench.format_table(["set, measure", *chains], rows)]
     if others:
-        rows += ["One labelled target: hit / box IoU ≥ 0.3 / other blobs a frame:", "", *_head("clip", chains)]
-        for clip, by in others.items():
-            still = "still" in by[chains[0]]
-            rows.append(_row(f"{clip}{' (nothing moves)' if still else ''}", [_words(by[c]) for c in chains]))
-        rows.append("")
-    return "\n".join(rows)
+        still = {clip: " (nothing moves)" * ("still" in by[chains[0]]) for clip, by in others.items()}
+        rows = [[clip + still[clip], *(format_figures(by[c]) for c in chains)] for clip, by in others.items()]
+        parts += ["One labelled target: hit / box IoU ≥ 0.3 / other blobs a frame:"]
+        parts += [bench.format_table(["clip", *chains], rows)]
+    return "\n\n".join(parts)
 
 
-def _sets(clips: Sequence[str] | dict) -> dict[str, list[str]]:
-    """Clips by what stands before the underscore in their names."""
-    sets: dict[str, list[str]] = {}
-    for clip in clips:
-        sets.setdefault(clip.split("_")[0], []).append(clip)
-    return sets
-
-
-def _words(figures: Figures) -> str:
+def format_figures(figures: Figures) -> str:
+    """A clip's figures in a cell."""
     if "still" in figures:
         return f"– / – / {figures['still']:.1f}"
     if "hit" in figures:
-        hit, near, other = figures["hit"], figures["iou_0.3"], figures["other_blobs_per_frame"]
-        return f"{_two(hit)} / {_two(near)} / {other:.1f}"
+        return f"{two(figures['hit'])} / {two(figures['iou_0.3'])} / {figures['other_blobs_per_frame']:.1f}"
     return f"F {figures['f']:.3f}, box F1 {figures['box_f1']:.3f}"
 
 
-def _two(value: float) -> str:
+def two(value: float) -> str:
+    """Two digits; a dash where there is no value."""
     return "–" if np.isnan(value) else f"{value:.2f}"
 
 
-def _head(first: str, chains: Sequence[str]) -> list[str]:
-    return [_row(first, chains), "| --- " + "| ---: " * len(chains) + "|"]
-
-
-def _row(first: str, cells: Sequence[str]) -> str:
-    return f"| {first} | " + " | ".join(cells) + " |"
-
-
 if __name__ == "__main__":
-    cv2.setNumThreads(2)
-    main()
+    options = {"data": Path, "--configs": ["default", "fast", "source"], "--backend": "onboard", "--only": ""}
+    bench.main(__doc__, {"": (measure_accuracy, options)})

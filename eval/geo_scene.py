@@ -1,10 +1,9 @@
-"""Simulated flights over landmarks, many at once: what is true, what is measured of it, and how sharp that can be.
+"""Simulated flights over landmarks, many at once: the truth, the measurements, and how accurate these allow to be.
 
-A scene is one frame: landmarks in a disc of 25 m radius; targets, half of them within 10 m of its middle as a crowd
-with its escort about it, half all over it; a camera at some altitude that looks at the middle. Measured are the
-landmarks' pixels and GPS, the targets' pixels and the telemetry, all with Gaussian errors. The picture's borders are
-left aside: from 50 m the disc is higher than the picture. The geometry is written out here and not taken from the
-package: so that an error there cannot hide.
+A scene is one frame: landmarks in a disc of 25 m radius; targets, half of them within 10 m of its middle (crowd), half
+all over it; a camera that looks at the middle. Measured are pixels and GPS of the landmarks, pixels of the targets and
+telemetry, all with Gaussian errors. The picture's borders are ignored: from 50 m the disc is higher than the picture.
+The geometry is written out here and not taken from the package, so that an error there cannot hide.
 
 `pose_bound` and `homography_bound` are Cramér-Rao bounds: no unbiased estimate of a target's place from the same
 measurements has a smaller covariance, that of the pose with the priors counted as measurements.
@@ -24,14 +23,11 @@ SIZE_PX = (1920, 1080)
 FOCAL_PX = SIZE_PX[0] / 2 / np.tan(np.radians(35))
 CAMERA = Camera("aerial", SIZE_PX, (FOCAL_PX, FOCAL_PX), ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2))
 """1080p, a lens of 70 degrees."""
-
 SIGMA_OF = 1 / np.sqrt(-2 * np.log(0.05))
 """Standard deviation along each axis of a GPS that is so many metres off in 95 %, as a share of those."""
-
 FOCAL_SIGMA, TILT_SIGMA, HEADING_SIGMA = 0.01, np.radians(1.0), np.radians(5.0)
 ALTITUDE_SIGMA, POSITION_SIGMA_M = 0.02, 3.5 * SIGMA_OF
 """Of the telemetry, one standard deviation."""
-
 GPS = {
     "exact": 0.0,
     "2 cm RTK": 0.02,
@@ -41,7 +37,6 @@ GPS = {
     "opposite RTK": np.nan,
 }
 """Standard deviation of a landmark's place along each axis. RTK: of two landmarks, any or opposite; others 3.5 m."""
-
 LAYOUTS = ("ring", "small ring", "disc", "row", "corner", "L")
 
 
@@ -63,8 +58,8 @@ class Scenes:
     """A batch of S scenes with n landmarks and T targets; the true_* are hidden from the estimates.
 
     true_axes: (S, 3, 3) camera's right, down, forward. true_place: (S, 3). true_focal: (S,) share of the camera's.
-    axes, place: the telemetry's. true_marks, marks: (S, n, 2) east, north. sigma_m: (S, n). common_m: (S, 2) that all
-    places told share. marks_px, targets_px: (S, n or T, 2). true_targets: (S, T, 2).
+    axes, place: the telemetry's. true_marks, marks: (S, n, 2) east, north. sigma_m: (S, n). common_m: (S, 2) of all
+    reported places. marks_px, targets_px: (S, n or T, 2). true_targets: (S, T, 2).
     """
 
     case: Case
@@ -126,14 +121,6 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     )  # fmt: skip
 
 
-def chosen(batch: Scenes, rows: np.ndarray) -> Scenes:
-    """The same scenes with some of their landmarks, rows (S, k)."""
-    which = np.arange(len(batch))[:, None], rows
-    case = replace(batch.case, landmarks=rows.shape[1])
-    parts = {name: getattr(batch, name)[which] for name in ("true_marks", "marks", "sigma_m", "marks_px")}
-    return replace(batch, case=case, **parts)
-
-
 def swapped(batch: Scenes, seed: int = 0) -> Scenes:
     """The same scenes with the identities of two landmarks swapped, that of the first and of any other."""
     other = np.random.default_rng([seed, 6]).integers(1, batch.case.landmarks, len(batch))
@@ -151,16 +138,16 @@ def outlying(batch: Scenes, away_m: float, seed: int = 0) -> Scenes:
 
 
 def flights(
-    case: Case, count: int, frames: int, step_s: float, alike_s: tuple[float, float], seed: int = 0
+    case: Case, count: int, frames: int, step_s: float, correlation_s: tuple[float, float], seed: int = 0
 ) -> list[Scenes]:
     """Batches of frames that follow each other: frame f of flight s is row s of batch f.
 
-    The errors of telemetry and of receivers stay alike over `alike_s` each, the focal length's for good; pixels err
-    anew.
-    The team drives about the middle at 1 m/s, the camera drifts at 1 m/s and sways by a degree.
+    The errors of telemetry and of receivers have time constants `correlation_s`, that of the focal
+    length never changes, and pixels are independent. The team
+    drives about the middle at 1 m/s, the camera drifts at 1 m/s and sways by a degree.
     """
     rng, first = np.random.default_rng([seed, 5]), scenes(case, count, 2, seed)
-    keep, keep_team = np.exp(-step_s / np.array(alike_s))
+    keep, keep_team = np.exp(-step_s / np.array(correlation_s))
     shape = first.marks.shape
     sigma = np.array(
         [TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m]
@@ -214,7 +201,8 @@ def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         return disc(rng, (MOST,))[:n]
     if name == "row":
         along = np.linspace(-RADIUS_M, RADIUS_M, n)
-        aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * _to_ends(rng.uniform(0, 1, MOST)[:n])
+        shares = rng.uniform(0, 1, MOST)[:n]  # stretched below to reach both edges of the row
+        aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * ((shares - shares.min()) / np.ptp(shares) - 0.5)
         points = np.stack([along, aside], axis=1)
     elif name == "corner":
         points = disc(rng, (MOST,), 6.0)[:n] + np.array([18.0, 0.0])
@@ -227,13 +215,7 @@ def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
     return points @ np.array([[c, s], [-s, c]])
 
 
-def _to_ends(shares: np.ndarray) -> np.ndarray:
-    """Stretched to go from -0.5 to 0.5."""
-    return (shares - shares.min()) / np.ptp(shares) - 0.5
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# The geometry.
+# -- geometry --------------------------------------------------------------------------------------------------------
 
 
 def looking(heading: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
@@ -262,15 +244,7 @@ def pixels(ground: np.ndarray, axes: np.ndarray, place: np.ndarray, focal: np.nd
     return np.array(CAMERA.centre_px) + FOCAL_PX * focal[:, None, None] * seen[..., :2] / seen[..., 2:]
 
 
-def image_from_ground(axes: np.ndarray, place: np.ndarray, focal: np.ndarray) -> np.ndarray:
-    """(S, 3, 3) homographies from metres to pixels about the middle in focal lengths."""
-    turn = np.swapaxes(axes, 1, 2)
-    matrix = np.concatenate([turn[..., :2], -turn @ place[..., None]], axis=-1)
-    return matrix * np.stack([focal, focal, np.ones_like(focal)], axis=-1)[..., None]
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Bounds.
+# -- bounds ----------------------------------------------------------------------------------------------------------
 
 
 def pose_bound(batch: Scenes) -> np.ndarray:
@@ -292,7 +266,9 @@ def pose_bound(batch: Scenes) -> np.ndarray:
 
 def homography_bound(batch: Scenes) -> np.ndarray:
     """(S, T, 2, 2) the same by the landmarks alone, for the eight parameters of a homography."""
-    case, matrix = batch.case, image_from_ground(batch.true_axes, batch.true_place, batch.true_focal)
+    case, turn = batch.case, np.swapaxes(batch.true_axes, 1, 2)
+    matrix = np.concatenate([turn[..., :2], -turn @ batch.true_place[..., None]], axis=-1)
+    matrix[:, :2] *= batch.true_focal[:, None, None]  # pixels about the middle, in focal lengths
     matrix = matrix @ np.diag([RADIUS_M, RADIUS_M, 1.0])
     matrix = matrix / matrix[:, 2:, 2:]
 
@@ -336,7 +312,7 @@ def _slopes(batch: Scenes, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gathered(by_state: np.ndarray, by_place: np.ndarray, sigma_m: np.ndarray, pixel_sigma: float) -> np.ndarray:
-    """(S, k, k) what the landmarks' pixels tell of the state."""
+    """(S, k, k) the landmarks' information about the state."""
     blur = pixel_sigma**2 * np.eye(2) + sigma_m[..., None, None] ** 2 * by_place @ np.swapaxes(by_place, -1, -2)
     return np.einsum("snia,snij,snjb->sab", by_state, np.linalg.inv(blur), by_state)
 

@@ -38,7 +38,7 @@ def plain_window(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) uint8 mask of what moves in the first of three BGR frames, and its (N, 4) boxes x, y, width, height.
 
-    lap: told the name of a stage when it is over.
+    lap: called with the name of each stage when it is over.
     """
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second, third)]
     lap("prepare")

@@ -1,62 +1,399 @@
-"""How quick the chains are beside the plain OpenCV chain, all in one run, and how well they register.
+"""Time and memory, always beside a reference in the same turns: ratios are medians over turns, with quartiles.
 
-usage: python eval/speed.py [CLIP...] [--sizes 640x480 1280x720] [--rounds 12] [--chains NAME...] [--json FILE]
+python eval/speed.py detection [DATA]   a frame by stage and resolution, beside the plain OpenCV chain; onboard, torch
+python eval/speed.py targets            a frame against the number of moving targets
+python eval/speed.py memory             peak memory of processes that run one chain, and `dddas detect`
+python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
+python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
 
-A clip is a video, a folder of pictures, or a folder that holds clips. With none the project's own scene is rendered at
-each of --sizes. All chains go through the same decoded frames, forwards and backwards, in turns of eight frames, so
-that whatever else the machine does meets them all; the first turns are left out. A ratio is the median over the turns
-of a chain's time through the plain chain's in the same turn. Garbage is collected between the turns. The processor's
-time, over all threads, is told as well: it says what a chain costs where other programs want the second core.
+The processor's time is summed over threads; a ratio of two in one turn suffers least from other programs. Without DATA
+detection is timed on the tests' synthetic scene.
 """
 
-import argparse
-import json
 import sys
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-import machine
-import registration_error
-from chains import CHAINS, available, lanes_of, row, timed
-from films import clips
+import bench
+import cv2
+import numpy as np
+import plain_chain
+from clips import Size, clips_in, read_frames, resize, scene, there_and_back, write_video
+
+from torchvision_dddas.config import PeopleParameters, load_config
+from torchvision_dddas.detection import Engine, Foreground, MotionDetector, View, Window, load_engine
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.types import Frame, Registration
+
+TURN_FRAMES, WARM_UP = 8, 3
+STAGES = ("prepare", "register", "foreground", "targets")
+"""Grey pictures; the camera's motion; difference to mask; mask to targets and all that belongs to no other stage."""
+CHAINS = (
+    "onboard fast", "onboard half", "onboard default", "torch fast b1", "torch fast b8", "torch default b1",
+    "torch default b8",
+)  # fmt: skip
+"""Engine, configuration and batch size."""
 
 
-def main() -> None:
-    """Measure, print a table a clip and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("clips", nargs="*")
-    parser.add_argument("--sizes", nargs="*", default=["640x480", "1280x720"])
-    parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--chains", nargs="*", help=f"of: {', '.join(CHAINS)}")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    chains = options.chains or available()
-    sizes = [(int(w), int(h)) for w, h in (size.split("x") for size in options.sizes)]
-    report: dict[str, dict] = {"machine": machine.about(), "clips": {}}
-    for name, frames in clips(options.clips, sizes):
-        if len(frames) < 10:
-            print(f"{name}: {len(frames)} frames are too few", file=sys.stderr)
+# -- chains ----------------------------------------------------------------------------------------------------------
+
+
+class Stopwatch:
+    """Seconds by clock and processor, summed for each stage."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, np.ndarray] = {}
+        self._last = bench.now()
+
+    def start(self) -> None:
+        """Start the stage that the next lap names."""
+        self._last = bench.now()
+
+    def lap(self, stage: str) -> None:
+        """End a stage and start another."""
+        now = bench.now()
+        self.spent[stage] = self.spent.get(stage, 0) + now - self._last
+        self._last = now
+
+
+class TimedEngine:
+    """An engine whose stages are timed."""
+
+    def __init__(self, engine: Engine, watch: Stopwatch) -> None:
+        self._engine, self._watch, self.name = engine, watch, engine.name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def prepare(self, image: np.ndarray) -> View:
+        """As the engine's own, and so the next two."""
+        return self._timed("prepare", self._engine.prepare, image)
+
+    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
+        """Camera motion of pairs."""
+        return self._timed("register", self._engine.register, pairs)
+
+    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+        """What differs in windows."""
+        return self._timed("foreground", self._engine.foreground, windows)
+
+    def _timed(self, stage: str, call: Callable[[Any], Any], argument: Any) -> Any:
+        self._watch.start()
+        result = call(argument)
+        self._watch.lap(stage)
+        return result
+
+
+class Chain:
+    """A detection chain on a clip: "plain", or engine, configuration and batch size as in CHAINS.
+
+    stages: of each turn, the seconds of its stages. targets: numbers of targets found.
+    """
+
+    def __init__(self, name: str, frames: Sequence[np.ndarray]) -> None:
+        self.frames, self.targets = frames, list[int]()
+        self.stages: list[dict[str, np.ndarray]] = []
+        self._watch = Stopwatch()
+        self._detector: MotionDetector | None = None
+        if name != "plain":
+            engine, config, *batch = name.split()
+            settings = load_config(None if config == "default" else config)
+            timed: Any = TimedEngine(load_engine(engine, settings), self._watch)
+            self._detector = MotionDetector(settings, timed, 10.0, batch=int(batch[0][1:]) if batch else 1)
+
+    def __call__(self, turn: int) -> None:
+        """Process the frames of a turn."""
+        self._watch.spent = {}
+        for i in range(turn * TURN_FRAMES, (turn + 1) * TURN_FRAMES):
+            self.process(i)
+        self.stages.append(self._watch.spent)
+
+    def process(self, i: int) -> None:
+        """Process one frame."""
+        if self._detector is None:
+            self._watch.start()
+            _, boxes = plain_chain.plain_window(*self.frames[i : i + 3], self._watch.lap)
+            self.targets.append(len(boxes))
+            return
+        for found in self._detector.update(Frame(i + 1, i / 10.0, self.frames[i])):
+            self.targets.append(len(found.detections.box_px))
+
+
+def available_chains(wanted: Iterable[str]) -> list[str]:
+    """The chains that can run here: torch only where it is installed."""
+    has_torch = find_spec("torch") is not None and find_spec("kornia") is not None
+    return [name for name in wanted if has_torch or not name.startswith("torch")]
+
+
+def time_chains(clips: Mapping[str, Sequence[np.ndarray]], names: Sequence[str], rounds: int) -> dict[str, Any]:
+    """{clip: {chain: figures}}: all chains on all clips in turns of TURN_FRAMES frames."""
+    count = (rounds + WARM_UP) * TURN_FRAMES + 2
+    chains = {
+        (clip, name): Chain(name, there_and_back(frames, count))
+        for clip, frames in clips.items()
+        for name in ("plain", *names)
+    }
+    labels = {f"{clip}|{name}": chain for (clip, name), chain in chains.items()}
+    spent = bench.time_in_turns(labels, rounds, WARM_UP)
+    found: dict[str, Any] = {clip: {} for clip in clips}
+    for (clip, name), chain in chains.items():
+        own, plain = (spent[f"{clip}|{one}"] / TURN_FRAMES for one in (name, "plain"))
+        found[clip][name] = bench.compare_turns(own, plain) | {
+            "stages_ms": stage_times(chain.stages[WARM_UP:], own),
+            "targets": float(np.median(chain.targets)) if chain.targets else 0.0,
+        }
+    return found
+
+
+def stage_times(turns: Sequence[Mapping[str, np.ndarray]], whole_s: np.ndarray) -> dict[str, float]:
+    """Median processor milliseconds a frame of each stage; the rest of the whole belongs to the targets."""
+    times = {
+        stage: np.array([turn.get(stage, np.zeros(2))[1] for turn in turns]) / TURN_FRAMES for stage in STAGES[:-1]
+    }
+    times["targets"] = whole_s[:, 1] - sum(times.values())
+    return {stage: 1e3 * float(np.median(values)) for stage, values in times.items()}
+
+
+# -- studies ---------------------------------------------------------------------------------------------------------
+
+
+def measure_detection(options: bench.Options) -> tuple[str, Any]:
+    """Time of a frame by stage at several resolutions, beside the plain chain."""
+    chains, load = available_chains(options.chains), bench.OtherLoad()
+    clips: dict[str, Sequence[np.ndarray]] = {}
+    sizes = [bench.parse_size(size) for size in options.sizes]
+    for name, frames in _films(options.data, sizes[0]):
+        for size in sizes:
+            if frames is None or (frames[0].shape[1] >= size[0] and frames[0].shape[0] >= size[1]):
+                shown = scene(size, 24) if frames is None else [resize(frame, size) for frame in frames]
+                clips[f"{name} {size[0]}×{size[1]}"] = shown
+    found = {}
+    for clip, frames in clips.items():
+        found |= time_chains({clip: frames}, chains, options.rounds)
+        bench.log(clip, {name: round(row["processor_ratio"], 2) for name, row in found[clip].items()})
+    rows, stages = [], []
+    for name in ("plain", *chains):
+        parts = [by[name] for by in found.values()]
+        rows.append([name, *(f"{p['clock_ms']:.1f}, {p['processor_ms']:.1f} / {bench.format_ratio(p)}" for p in parts)])
+    for clip, by in found.items():
+        for name, row in by.items():
+            stages.append([clip, name, *(f"{row['stages_ms'][stage]:.2f}" for stage in STAGES)])
+    text = (
+        f"{bench.machine_words()}; {load.words()}. Milliseconds a frame by the clock, processor milliseconds over all "
+        f"threads / their ratio to the plain chain's in the same turn (quartiles); medians of {options.rounds} turns "
+        f"of {TURN_FRAMES} frames:\n\n{bench.format_table(['chain', *found], rows)}\n\n"
+        "Processor milliseconds a frame by stage:\n\n"
+        f"{bench.format_table(['clip', 'chain', *STAGES], stages, words=2)}"
+    )
+    sides = {clip: frames[0].shape[0] * frames[0].shape[1] / 1e6 for clip, frames in clips.items()}
+    lines = {
+        name: {"x": list(sides.values()), "y": [found[clip][name]["processor_ratio"] for clip in sides]}
+        for name in chains
+    }
+    panel = {"title": "beside the plain chain", "xlabel": "megapixels", "ylabel": "processor time, ratio"}
+    bench.draw(options.plot, [panel | {"lines": lines}])
+    return text, found
+
+
+def _films(data: Path | None, size: Size) -> Iterable[tuple[str, list[np.ndarray] | None]]:
+    if data is None:
+        yield "scene", None
+        return
+    for place in clips_in(data):
+        yield place.name, read_frames(place / "frames", 40)
+
+
+def measure_targets(options: bench.Options) -> tuple[str, Any]:
+    """Time of a frame of 640×480 with so many movers added to the scene."""
+    chains, frames, load = available_chains(options.chains), scene((640, 480), 24), bench.OtherLoad()
+    found = time_chains({f"+{count}": add_movers(frames, count) for count in options.counts}, chains, options.rounds)
+    rows = [
+        [name, *(f"{by[name]['processor_ms']:.1f} ({by[name]['targets']:.0f})" for by in found.values())]
+        for name in ("plain", *chains)
+    ]
+    text = f"Processor milliseconds a frame, and in brackets the targets found ({load.words()}):"
+    return f"{text}\n\n{bench.format_table(['chain', *found], rows)}", found
+
+
+def add_movers(frames: Sequence[np.ndarray], count: int, seed: int = 0) -> list[np.ndarray]:
+    """The clip with textured patches that go to and fro, each in its own cell of the picture, so that none touch."""
+    if not count:
+        return list(frames)
+    rng = np.random.default_rng([seed, count])
+    height, width = frames[0].shape[:2]
+    columns = int(np.ceil(np.sqrt(count * width / height)))
+    cell = np.array([width / columns, height / np.ceil(count / columns)])
+    side = np.minimum([width / 20, height / 15], 0.45 * cell).astype(int).clip(4)
+    spots = rng.integers(30, 226, (count, -(-side[1] // 4), -(-side[0] // 4), 3), np.uint8)
+    patches = spots.repeat(4, axis=1).repeat(4, axis=2)[:, : side[1], : side[0]]
+    phases = rng.uniform(0, 2, count)
+    drawn = []
+    for number, frame in enumerate(frames):
+        picture = frame.copy()
+        for k, (patch, phase) in enumerate(zip(patches, phases, strict=True)):
+            room = cell - side - 2
+            travelled = phase + number * max(side[0] / 4, 2) / max(room[0], 1)
+            corner = cell * (k % columns, k // columns) + 1 + room * (abs((travelled + 1) % 2 - 1), 0.5)
+            x, y = corner.astype(int)
+            picture[y : y + side[1], x : x + side[0]] = patch
+        drawn.append(picture)
+    return drawn
+
+
+def measure_memory(options: bench.Options) -> tuple[str, Any]:
+    """Peak memory of a process that takes one chain through a video; "nothing" reads the video only.
+
+    `dddas detect` runs on videos of two lengths: its memory does not grow.
+    """
+    width, height = bench.parse_size(options.size)
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for frames in options.frames:
+            video = Path(folder) / f"{frames}.mp4"
+            write_video(video, scene((width, height), 24), frames)
+            commands = {
+                name: [sys.executable, __file__, "chain", str(video), "--name", name]
+                for name in ("nothing", "plain", *available_chains(options.chains))
+            }
+            detect = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()", "detect", str(video)]
+            detect += ["--backend", "onboard", "--quiet", "--save", "none", "--out"]
+            commands["dddas detect, default"] = [*detect, f"{folder}/default-{frames}"]
+            commands["dddas detect, fast"] = [*detect, f"{folder}/fast-{frames}", "--config", "fast"]
+            for name, command in commands.items():
+                found.setdefault(name, {})[frames] = bench.measure_memory(command)
+                bench.log(name, frames, found[name][frames])
+    rows = [[name, *(f"{by[n]['peak_mb']:.0f}" for n in options.frames)] for name, by in found.items()]
+    head = [f"peak MB at {options.size}", *(f"{n} frames" for n in options.frames)]
+    return bench.format_table(head, rows), found
+
+
+def run_chain(options: bench.Options) -> tuple[str, Any]:
+    """Take one chain through a video and end (used by `memory`)."""
+    frames: list[np.ndarray] = []
+    chain = None if options.name == "nothing" else Chain(options.name, frames)
+    for frame in open_source(options.data):
+        if chain is None:
             continue
-        others = machine.Others()
-        *_, found = timed(lanes_of(frames, chains, options.rounds), options.rounds)
-        rows = {chain: row(taken.whole, found["plain"].whole) for chain, taken in found.items()}
-        load = others.cores()
-        errors = registration_error.errors(frames)
-        height, width = frames[0].shape[:2]
-        report["clips"][name] = {"size": [width, height], "chains": rows, "registration_px": errors, "others": load}
-        print(f"\n{name}, {width}x{height}: ms a frame, and the ratio to plain (quartiles; of means)")
-        print(f"  {machine.load_in_words(load)}")
-        for chain, r in rows.items():
-            spread = f"{r['ratio']:5.2f} ({r['ratio_25']:.2f} to {r['ratio_75']:.2f}; {r['ratio_of_means']:.2f})"
-            busy = f"processor {r['processor_ms']:6.1f} ratio {r['processor_ratio']:.2f}"
-            print(f"  {chain:18} median {r['median_ms']:6.1f}  mean {r['mean_ms']:6.1f}  ratio {spread}  {busy}")
-        for chain, e in errors.items():
-            print(
-                f"  registration, {chain:10} median {e['median']:.3f} px  p90 {e['p90']:.3f} px  ({e['pairs']} pairs)"
-            )
-    if options.json:
-        options.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        frames.append(frame.image)
+        ready = len(frames) - (3 if options.name == "plain" else 1)
+        if ready >= 0:
+            chain.process(ready)
+            frames[ready] = frames[ready][:0]  # keeps indices, frees the picture
+    return "", None
+
+
+def measure_people(options: bench.Options) -> tuple[str, Any]:
+    """The person detector beside detectMultiScale with steps of 8 px and 1.05, no padding.
+
+    Regions are three of 192×256 px: "regions" scores windows whose body lies inside, "regions, blobs" those for bodies
+    of a third to 1.3 times a blob of 150 px.
+    """
+    from torchvision_dddas.people import pyramid
+    from torchvision_dddas.people.classifiers import read_classifier
+    from torchvision_dddas.people.scorer import load_scorer
+
+    parameters = PeopleParameters(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
+    svm, size = read_classifier("opencv", 3780), bench.parse_size(options.size)
+    images = [resize(image, size) for image in read_frames(options.data, 20)] if options.data else scene(size, 4)
+    opencv = cv2.HOGDescriptor()
+    opencv.setSVMDetector(np.append(svm.weights, svm.bias).astype(np.float32))
+    corners = np.array([(0.06, 0.2), (0.39, 0.3), (0.67, 0.12)]) * size
+    regions_px = np.concatenate([corners, np.tile((192, 256), (3, 1))], axis=1)
+    parts = {
+        "everywhere": pyramid.everywhere(size, parameters),
+        "regions": pyramid.within(regions_px, np.full((3, 2), np.nan), size, parameters),
+        "regions, blobs": pyramid.within(regions_px, np.tile((50.0, 195.0), (3, 1)), size, parameters),
+    }
+    calls: dict[str, Callable[[int], object]] = {
+        "cv2.HOGDescriptor": lambda turn: opencv.detectMultiScale(
+            images[turn % len(images)], winStride=(8, 8), padding=(0, 0), scale=1.05
+        )
+    }
+    for engine in available_chains(("onboard", "torch")):
+        scorer = load_scorer(engine, parameters, svm)
+        for name, part in parts.items() if engine == "onboard" else [("everywhere", parts["everywhere"])]:
+            calls[f"{engine}, {name}"] = lambda turn, s=scorer, p=part: s.scores([images[turn % len(images)]], [p])
+    return _beside_first(calls, options.rounds, f"People, {options.size}")
+
+
+def measure_geo(options: bench.Options) -> tuple[str, Any]:
+    """Homographies of landmarks, poses with all checks, and conversions of degrees."""
+    from geo_error import georeferencer_inputs, settings_for
+    from geo_scene import CAMERA, Case, scenes
+
+    from torchvision_dddas.geo.georeferencer import Georeferencer
+    from torchvision_dddas.geo.plane_solvers import load_solver
+    from torchvision_dddas.geometry import east_north, lonlat
+
+    solvers = {name: load_solver(name) for name in available_chains(("onboard", "torch"))}
+    calls: dict[str, Callable[[int], object]] = {}
+
+    def repeat(times: int, call: Callable[[], object]) -> Callable[[int], object]:
+        return lambda turn: [call() for _ in range(times)]
+
+    for n, sets, times in ((4, 1, 50), (6, 1, 50), (16, 1, 50), (6, 10_000, 1)):
+        ground, image = _landmark_sets(n, sets)
+        weight, label = np.ones((sets, n)), f"{50 * (sets == 1) or sets} sets of {n}"
+        calls[f"cv2.findHomography, {label}"] = repeat(
+            times, lambda g=ground, i=image: [cv2.findHomography(a, b, 0) for a, b in zip(g, i, strict=True)]
+        )
+        for name, solver in solvers.items():
+            calls[f"{name}, {label}"] = repeat(times, lambda s=solver, g=ground, i=image, w=weight: s.solve(g, i, w))
+    for n in (4, 6, 8):
+        inputs = georeferencer_inputs(scenes(Case(landmarks=n), 50))
+
+        def locate(turn: int, inputs: Any = inputs) -> None:
+            georeferencer = Georeferencer(CAMERA, settings_for("pose"), solvers["onboard"])
+            for number, (flight, landmarks) in enumerate(inputs, 1):
+                georeferencer.update(number, number / 10, flight, landmarks)
+
+        calls[f"pose of 50 frames, {n} landmarks"] = locate
+    metres = np.random.default_rng(0).uniform(-2000, 2000, (1_000_000, 2))
+    origin = (-110.95, 32.23)
+    degrees = lonlat(metres, origin)
+    calls["a million points to degrees"] = lambda turn: lonlat(metres, origin)
+    calls["a million points to metres"] = lambda turn: east_north(degrees, origin)
+    return _beside_first(calls, options.rounds, "Geo-localization")
+
+
+def _landmark_sets(n: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places and pixels, (sets, n, 2) each, from 50 m above and a little tilted, with 1 px of noise."""
+    rng = np.random.default_rng(n)
+    ground = rng.uniform(-12.5, 12.5, (sets, n, 2))
+    flat = ground * (27.4, -27.4) / (1 + ground @ (1e-3, 2e-3))[..., None]
+    return ground, rng.normal(np.array([959.5, 539.5]) + flat, 1)
+
+
+def _beside_first(calls: Mapping[str, Callable[[int], object]], rounds: int, title: str) -> tuple[str, Any]:
+    """Table of calls beside the first of them."""
+    load = bench.OtherLoad()
+    spent = bench.time_in_turns(calls, rounds)
+    reference = next(iter(spent.values()))
+    found = {name: bench.compare_turns(values, reference) for name, values in spent.items()}
+    rows = []
+    for name, r in found.items():
+        clock = f"{r['clock_ms']:.2f} ({r['clock_ms_25']:.2f}–{r['clock_ms_75']:.2f})"
+        ratios = bench.format_ratio(r, "clock"), bench.format_ratio(r)
+        rows.append([name, clock, f"{r['processor_ms']:.2f}", *ratios])
+    head = ["call", "ms (quartiles)", "processor ms", "ratio to the first (quartiles)", "processor ratio"]
+    about = f"{title}; {bench.machine_words()}; {load.words()}; medians of {rounds} turns:"
+    return f"{about}\n\n{bench.format_table(head, rows)}", found
 
 
 if __name__ == "__main__":
-    main()
+    sizes = ["640x480", "1280x720", "1920x1080"]
+    studies = {
+        "detection": (
+            measure_detection,
+            {"data": None, "--chains": CHAINS, "--sizes": sizes, "--rounds": 12, "--plot": None},
+        ),
+        "targets": (measure_targets, {"--chains": CHAINS[:3], "--counts": [0, 10, 30, 60], "--rounds": 12}),
+        "memory": (measure_memory, {"--chains": CHAINS[:4], "--size": "1280x720", "--frames": [60, 240]}),
+        "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
+        "geo": (measure_geo, {"--rounds": 15}),
+        "chain": (run_chain, {"data": Path, "--name": "plain"}),
+    }
+    bench.main(__doc__, studies)
