@@ -1,0 +1,60 @@
+"""Put the results of docs/results into the documents: `python eval/figures.py [--check]`, or `make figures`.
+
+Text between `<!-- NAME -->` and `<!-- /NAME -->` in README.md and docs/*.md is replaced by the Markdown of
+docs/results/NAME.json (with - for _), so that no measured table is typed by hand. --check changes nothing and ends with
+exit code 1 where a text differs from its result.
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import bench
+
+MARKED = re.compile(r"<!-- (?P<name>[\w-]+) -->(?P<text>.*?)<!-- /(?P=name) -->", re.DOTALL)
+
+
+def documents(root: Path = bench.ROOT) -> list[Path]:
+    """The texts that quote results."""
+    return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+
+
+def fill(text: str) -> str:
+    """The text with the results between its marks. Ends the program with one line for a mark without a result."""
+
+    def replace(found: re.Match[str]) -> str:
+        name = found["name"]
+        try:
+            result = bench.read_result(name.replace("_", "-"))
+        except FileNotFoundError:
+            sys.exit(f"docs/results has no {name.replace('_', '-')}.json for the marks {name}")
+        return f"<!-- {name} -->\n\n{bench.result_text(result).strip()}\n\n<!-- /{name} -->"
+
+    return MARKED.sub(replace, text)
+
+
+def outdated(root: Path = bench.ROOT) -> Iterator[tuple[Path, str]]:
+    """Documents that differ from their results, and what they should say."""
+    for path in documents(root):
+        text = path.read_text(encoding="utf-8")
+        if (filled := fill(text)) != text:
+            yield path, filled
+
+
+def update(options: bench.Options) -> tuple[str, None]:
+    """Write the documents, or name those that differ."""
+    changed = list(outdated())
+    if options.check and changed:
+        sys.exit(
+            "\n".join(
+                f"{path.relative_to(bench.ROOT)} is not what docs/results gives; make figures" for path, _ in changed
+            )
+        )
+    for path, text in changed:
+        path.write_text(text, encoding="utf-8")
+    return "\n".join(f"{path.relative_to(bench.ROOT)}: written" for path, _ in changed), None
+
+
+if __name__ == "__main__":
+    bench.main(__doc__, {"": (update, {"--check": False})})

@@ -1,0 +1,625 @@
+"""Studies on rendered video with known truth; no data needed, except real clips for `realism`.
+
+python eval/simulated.py altitude     errors of crowds from video to metres by altitude (appendix A, Fig. 7)
+python eval/simulated.py landmarks    centres of landmarks by colour or motion, four or six (A, Fig. 8, 9)
+python eval/simulated.py kernels      pixels and crowds found against morphological kernels (appendix B, Fig. 8)
+python eval/simulated.py resolution   time of a frame against the resolution (B, Fig. 9)
+python eval/simulated.py loop         what feedback buys: closed loop beside open loops
+python eval/simulated.py whole        whole scenarios in the closed loop
+python eval/simulated.py realism DATA whether rendered flights are as hard as real clips
+
+Figures are mean ± standard error (range) over seeds. --cache FILE keeps finished cases.
+"""
+
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice, pairwise, product
+from pathlib import Path
+from typing import Any
+
+import bench
+import cv2
+import numpy as np
+from bench import Spread
+from clips import clips_in, resize
+
+from torchvision_dddas import geometry
+from torchvision_dddas.config import Settings, load_config, with_parameters
+from torchvision_dddas.control import StartedSource, build_mission, fit_settings
+from torchvision_dddas.control.rules import every_least
+from torchvision_dddas.detection import MotionDetector, detect_motion, load_engine, pixels_per_metre
+from torchvision_dddas.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.evaluation.metrics.crowd_frames import shown
+from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
+from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.terrain import shift_origin
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
+from torchvision_dddas.simulation.drawing import view_from_pose
+from torchvision_dddas.simulation.sensor_errors import SIGMAS_95, Receivers
+from torchvision_dddas.types import Colours, Command, Frame, FrameResult, Landmarks, Scene, TrackedFrame, Tracks, Truth
+
+CONFIG = "patrol"
+"""The shipped configuration of a team that watches crowds."""
+Case = dict[str, Any]
+
+
+# -- one clip, located in several ways ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to locate the same pictures.
+
+    landmarks: rows of the team's that are used; empty: all. gps95_m: error of their receivers in 95 %, added to the
+    reports. settings: parameters beside the usual.
+    """
+
+    name: str
+    landmarks: tuple[int, ...] = ()
+    gps95_m: float = 0.0
+    settings: dict[str, object] = field(default_factory=dict)
+
+
+def usual(source: SimulatorSource, more: Mapping[str, object] | None = None) -> Settings:
+    """The settings of `dddas run sim:`, and more."""
+    settings = fit_settings(load_config(CONFIG, (), scenario_settings(source.scenario)), source)
+    return with_parameters(settings, more or {})
+
+
+class WayLocator:
+    """Locates the scenes of a clip in one way, and scores that. Targets are those of single frames, without tracks."""
+
+    def __init__(self, source: SimulatorSource, way: Way) -> None:
+        self._source, self._way, self._settings = source, way, usual(source, way.settings)
+        self._kept = np.array(way.landmarks or range(len(source.names)))
+        self._error_m = receiver_errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
+        self._local = partial(geometry.east_north, origin_deg=source.scenario.world.origin_deg)
+        self._watch: LandmarkWatch | None = None
+
+    def scorer(self) -> CrowdScorer:
+        """A new one in the truth's metres."""
+        return CrowdScorer(self._local)
+
+    def locate(self, scene: Scene, scorer: CrowdScorer, truth: Truth) -> float:
+        """Locate the targets of the next scene; the truth of its frame has been fed to the scorer.
+
+        Returns the error of the picture on the ground, m: mean over the crowds of the distance between their middle and
+        the place to which its pixel is projected; NaN where that is not known.
+        """
+        site = self._site()
+        if self._watch is None:
+            locator = AerialLocator.from_site(
+                site, self._source.camera, self._settings, load_solver("onboard"), self._source.rate_hz,
+                focal_known=True,
+            )  # fmt: skip
+            colours, rows = self._source.colours, self._kept
+            some = Colours(tuple(colours.names[k] for k in rows), colours.low[rows], colours.high[rows])
+            self._watch = LandmarkWatch(locator, some, load_colours("onboard"))
+        else:
+            self._watch.locator.set_site(site)
+        locator = self._watch.locator
+        watched = group_crowds(self._watch.update(scene), locator, self._source.rate_hz)
+        found = watched.scene.detections
+        rows = np.arange(len(found))
+        targets = Targets(
+            found.box_px, rows + 1, np.zeros(len(found), bool), found.score.clip(0, 1), bodies=True,
+            middle_px=found.middle_px if self._settings.crowds.join_m else None,
+        )  # fmt: skip
+        located = locator.locate_targets(watched.fixed, targets)
+        tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
+        tracked = TrackedFrame(scene.frame.number, scene.frame, found, tracks)
+        scorer.feed(FrameResult(tracked, located, watched.sighted_by))
+        return self._picture_error(truth, locator, watched.fixed.fix)
+
+    def _picture_error(self, truth: Truth, locator: AerialLocator, fix: Any) -> float:
+        bodies = truth.bodies
+        crowds = [bodies.target == number for number in np.unique(bodies.target[bodies.kind == "person"])]
+        middle = np.array([bodies.place_m[rows].mean(axis=0) for rows in crowds])
+        pixel = view_from_pose(truth.pose, self._source.camera).project(middle)
+        inside = ((pixel >= 0) & (pixel <= np.array(self._source.size) - 1)).all(axis=1)
+        if not fix.by or not inside.any():
+            return math.nan
+        places = geometry.lonlat(locator.ground_places(fix, pixel[inside]), locator.site.origin_deg)
+        return float(np.linalg.norm(self._local(places) - middle[inside, :2], axis=1).mean())
+
+    def _site(self) -> Site:
+        """What was reported until now, in the metres of the first report, with the ground's elevation."""
+        reports, telemetry = self._reports(), self._source.telemetry()
+        if self._watch is None:
+            site = build_site(reports, telemetry)
+            elevation = shift_origin(self._source.elevation, self._local(np.array([site.origin_deg]))[0])
+            return replace(site, elevation=elevation, sun_rad=self._source.sun_rad)
+        site = self._watch.locator.site
+        local = to_local(reports, site.origin_deg), to_local(telemetry, site.origin_deg)
+        return replace(site, landmarks=local[0], telemetry=local[1])
+
+    def _reports(self) -> Landmarks:
+        """Those of the landmarks in use, with the receivers' errors; without planned waypoints."""
+        table = self._source.landmarks()
+        kept = np.isin(table.landmark, self._kept) & ~table.planned
+        frame, which, place, sigma = table.frame[kept], table.landmark[kept], table.place[kept], table.sigma_m[kept]
+        if self._way.gps95_m:
+            metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
+            place = geometry.lonlat(metres, self._source.scenario.world.origin_deg)
+            sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / SIGMAS_95)
+        return Landmarks(
+            tuple(table.names[k] for k in self._kept), frame, np.searchsorted(self._kept, which),
+            table.image_px[kept], place, sigma, table.planned[kept], table.line[kept], True, table.path,
+        )  # fmt: skip
+
+
+def receiver_errors(scenario: Scenario, gps95_m: float, count: int, frames: int) -> np.ndarray:
+    """(F, K, 2) errors in metres in each frame: the same for all ways, except for their size."""
+    gps, errors = scenario.gps, []
+    receivers = Receivers(
+        count, gps95_m, gps.white_share, gps.correlation_s, 0.0, np.random.default_rng([scenario.seed, 77])
+    )
+    for _ in range(frames):
+        errors.append(receivers.error_m)
+        receivers.advance(1 / scenario.clip.rate_hz)
+    return np.array(errors).reshape(frames, count, 2)
+
+
+def locate_clip(scenario: Scenario, ways: Sequence[Way], edges_s: Sequence[float] = ()) -> dict[str, list[Case]]:
+    """The scores of each way, one for each part of the clip. edges_s: where later parts begin."""
+    source = SimulatorSource(scenario)
+    locators, edges = {way.name: WayLocator(source, way) for way in ways}, [*edges_s, np.inf]
+    scorers = {name: [one.scorer() for _ in edges] for name, one in locators.items()}
+    errors: dict[str, list[list[float]]] = {name: [[] for _ in edges] for name in locators}
+    truths, settings, started = {}, usual(source), StartedSource(source)
+    # As many frames are left out as the closed loop leaves out before anything is found.
+    least = every_least(
+        pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0]), source.rate_hz, settings.steering
+    )
+    source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
+    for scene in detect_motion(started, settings, "onboard"):
+        truths |= {truth.frame: truth for truth in source.truths()}
+        truth = truths.pop(scene.frame.number, None)
+        if truth is None:
+            continue
+        true, part = shown(truth), int(np.searchsorted(edges, scene.frame.time_s, side="right"))
+        for name, one in locators.items():
+            scorers[name][part].feed(true)
+            errors[name][part].append(one.locate(scene, scorers[name][part], truth))
+    return {
+        name: [
+            scorer.score().by_name() | {"picture_m": float(np.nanmean(off)) if np.isfinite(off).any() else None}
+            for scorer, off in zip(parts, errors[name], strict=True)
+        ]
+        for name, parts in scorers.items()
+    }
+
+
+def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
+    """A team about two crowds that walk side by side through its ring, to one side or past one another.
+
+    tables: parameters beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
+    """
+    rng = np.random.default_rng([seed, 5])
+    crowds = []
+    heading, turn = rng.uniform(0, 360), rng.choice([0.0, 180.0])
+    for k, people in enumerate(rng.integers(6, 13, 2).tolist()):
+        ahead = np.radians(heading + k * turn + rng.uniform(-10, 10))
+        speed = rng.uniform(0.7, 1.4)
+        # They pass one another at some distance: who is who where they meet is another question.
+        aside = (-1 if k == 0 else 1) * rng.uniform(5, 7) * (1 if turn == 0 or k == 0 else -1)
+        way = np.array([np.sin(ahead), np.cos(ahead)])
+        # In the middle of the ring halfway through the run.
+        start = -way * speed * min(seconds / 2, 12) + aside * way[::-1] * (1, -1)
+        crowds.append(
+            CrowdPlan(
+                people=people,
+                start_m=(float(start[0]), float(start[1])),
+                radius_m=float(rng.uniform(1.5, 2.5)),
+                speed_m_s=float(speed),
+                way_m=(tuple((start + way * 24).tolist()),),
+            )
+        )
+    car = CarPlan(start_m=(-60.0, float(rng.uniform(18, 22))), heading_deg=90.0, speed_m_s=5.0)
+    usual_tables: dict[str, dict[str, object]] = {"clip": {"seconds": seconds, "rate_hz": rate_hz}}
+    for name, parameters in tables.items():
+        usual_tables[name] = {**usual_tables.get(name, {}), **parameters}
+    return Scenario.model_validate({"seed": seed, "crowd": tuple(crowds), "car": (car,), **usual_tables})
+
+
+class Kept:
+    """All frames of a scenario that flies as planned, drawn once, to be searched several times.
+
+    truths: by the number of the frame. log: the telemetry of the whole run.
+    """
+
+    def __init__(self, source: SimulatorSource) -> None:
+        self.rate_hz, self.size = source.rate_hz, source.size
+        self.frames: list[Frame] = []
+        self.truths: dict[int, Truth] = {}
+        for frame in source:
+            self.frames.append(frame)
+            self.truths |= {truth.frame: truth for truth in source.truths()}
+        self.last = source.last
+        # A method of that name would be asked at every frame what was reported so far.
+        self.log = source.telemetry()
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+
+# -- altitude and landmarks ------------------------------------------------------------------------------------------
+
+GPS = {"exact": 0.0, "3.5 m": 3.5}
+SOURCE_M = {50.0: 1.3, 200.0: 3.5}
+"""The source's mean errors by altitude, simulated (appendix A, Fig. 7)."""
+
+
+def measure_altitude(options: bench.Options) -> tuple[str, Any]:
+    """Errors of crowds located from rendered video, with exact places of four landmarks and receivers of 3.5 m.
+
+    targets: of each located target from the people in its box. crowds: of each crowd from what was located of it.
+    picture: of the picture on the ground where the crowds are, by landmarks and telemetry alone.
+    """
+    cases = [
+        {"seed": seed, "altitude_m": altitude, "seconds": options.seconds, "size": bench.parse_size(options.size)}
+        for seed in range(options.seeds)
+        for altitude in options.altitudes
+    ]
+    results = bench.run_cases(cases, fly_altitude, options.jobs, options.cache)
+    errors, seen = [], []
+    for altitude in options.altitudes:
+        here = [r for c, r in zip(cases, results, strict=True) if c["altitude_m"] == altitude]
+        for gps in GPS:
+            of = [result[gps][0] for result in here]
+            target = [Spread(r["target_error_m"][key] for r in of) for key in ("mean", "median", "p95")]
+            cells = [target[0].text(), *(one.text(spread=False) for one in target[1:])]
+            cells += [Spread(r["inside"] for r in of).text(0, 100, spread=False)]
+            cells += [Spread(r["crowd_error_m"]["mean"] for r in of).text(), Spread(r["picture_m"] for r in of).text()]
+            source = f"{SOURCE_M[altitude]:g}" if altitude in SOURCE_M and gps == "exact" else "–"
+            errors.append([f"{altitude:g}", gps, *cells, source])
+        of = [result["exact"][0] for result in here]
+        cells = [Spread(r[key] for r in of).text(1, 100) for key in ("recall", "recall_moving", "detected")]
+        cells += [Spread(r[key] for r in of).text() for key in ("false_blobs", "landmark_blobs")]
+        seen.append([f"{altitude:g}", *cells])
+    head = ["AGL m", "GPS", "targets: mean error m", "median", "95 %", "in 95 % ellipses, %", "crowds: mean error m"]
+    text = bench.format_table([*head, "picture m", "source"], errors, words=2)
+    head = ["AGL m", "recall %", "of moving crowds %", "detected %", "false blobs a frame", "landmarks as targets"]
+    return f"{text}\n\n{bench.format_table(head, seen)}\n\n{about(options)}", results
+
+
+def fly_altitude(case: Case) -> Case:
+    """One clip, located in both ways."""
+    width, height = case["size"]
+    scenario = walking(
+        case["seed"], case["seconds"], uav={"altitude_m": case["altitude_m"]},
+        camera={"width_px": width, "height_px": height},
+    )  # fmt: skip
+    return locate_clip(scenario, [Way(name, gps95_m=error) for name, error in GPS.items()])
+
+
+FOUR = (0, 1, 3, 4)
+"""Of six landmarks in a ring: a rectangle."""
+SLOW_S = 15.0
+"""When the vehicles slow down."""
+LANDMARK_WAYS = [
+    Way(f"{mode}, {centre}, {count}, {gps}", FOUR if count == 4 else (), error,
+        {"aerial.mode": mode, "landmarks.centre": centre})
+    for gps, error in GPS.items()
+    for mode, centre, count in product(("pose", "homography"), ("colour", "motion"), (4, 6))
+]  # fmt: skip
+
+
+def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
+    """Centres by colour or motion, four landmarks or six, by pose or homography, in the same detections.
+
+    Six ground vehicles gather about two crowds, fast until t = 15 s, then slow. picture: error of the picture on the
+    ground where the crowds are; targets: of those found, from the people in their boxes.
+    """
+    cases = [{"seed": seed, "seconds": options.seconds} for seed in range(options.seeds)]
+    results = bench.run_cases(cases, fly_landmarks, options.jobs, options.cache)
+    rows = []
+    for way in LANDMARK_WAYS:
+        parts = [[result[way.name][part] for result in results] for part in (0, 1)]
+        picture = [Spread(r["picture_m"] for r in part).text() for part in parts]
+        targets = [Spread(r["target_error_m"]["mean"] for r in part).text() for part in parts]
+        rows.append([way.name, *picture, *targets])
+    head = ["by, centres, landmarks, GPS", *(f"{k}, {p}: m" for k in ("picture", "targets") for p in ("fast", "slow"))]
+    return f"{bench.format_table(head, rows)}\n\n{about(options)}", results
+
+
+def fly_landmarks(case: Case) -> Case:
+    """One clip, located in all ways, in two parts."""
+    scenario = walking(
+        case["seed"], case["seconds"], uav={"altitude_m": 50.0},
+        team={"ugvs": 6, "patrol": "gather", "ring_m": 18.0},
+    )  # fmt: skip
+    return locate_clip(scenario, LANDMARK_WAYS, (SLOW_S,))
+
+
+# -- kernels ---------------------------------------------------------------------------------------------------------
+
+KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}
+SKIPPED = 10
+"""Frames at the beginning that do not count: there is no past yet."""
+
+
+def measure_kernels(options: bench.Options) -> tuple[str, Any]:
+    """Pixels and crowds found against the kernels of erosion and closing, each with the usual other one.
+
+    Precision, recall and F are those of pixels, pooled over a clip, against bodies without their shadows.
+    """
+    cases = [{"seed": seed, "seconds": options.seconds} for seed in range(options.seeds)]
+    results = bench.run_cases(cases, search_with_kernels, options.jobs, options.cache)
+    rows = []
+    for name, size in ((name, size) for name, sizes in KERNELS.items() for size in sizes):
+        of = [result[f"{name} {size}"] for result in results]
+        cells = [Spread(r[key] for r in of).text(1, 100) for key in ("precision", "recall", "f", "detected")]
+        rows.append([f"`{name}`", size, *cells, Spread(r["false_blobs"] for r in of).text()])
+    head = ["kernel", "px", "precision %", "recall %", "F %", "crowds detected %", "false blobs a frame"]
+    return f"{bench.format_table(head, rows)}\n\n{about(options)}", results
+
+
+def search_with_kernels(case: Case) -> Case:
+    """One clip with all kernels."""
+    source = SimulatorSource(walking(case["seed"], case["seconds"]))
+    clip, found = Kept(source), {}
+    for name, size in ((name, size) for name, sizes in KERNELS.items() for size in sizes):
+        # A closing in metres would hide that in pixels.
+        metres = {"morphology.close_m": 0.0} if name == "morphology.close_px" else {}
+        settings = usual(source, {"crowds.join_m": 0.0, **metres, name: size})
+        pixels, scorer = segmentation.Pixels(), CrowdScorer()
+        for scene in detect_motion(clip, settings, "onboard", clip.log):
+            number = scene.frame.number
+            if number <= SKIPPED:
+                continue
+            pixels = pixels.plus(segmentation.count(scene.mask, clip.truths[number].mask))
+            rows = np.arange(len(scene.detections))
+            tracks = Tracks(number, rows + 1, scene.detections.box_px, scene.detections.score, rows)
+            scorer.feed(clip.truths[number])
+            scorer.feed(FrameResult(TrackedFrame(number, scene.frame, scene.detections, tracks)))
+        score = scorer.score()
+        more = {"detected": score.detected, "false_blobs": score.false_blobs}
+        found[f"{name} {size}"] = segmentation.measures(pixels) | more
+    return found
+
+
+# -- resolution ------------------------------------------------------------------------------------------------------
+
+SIZES = ((320, 240), (640, 480), (800, 600), (960, 720), (1280, 720), (1920, 1080))
+CONFIGS = (CONFIG, "fast", "source")
+TURN_FRAMES = 8
+
+
+def measure_resolution(options: bench.Options) -> tuple[str, Any]:
+    """Milliseconds a frame by the clock, detection alone, from 320×240 to 1920×1080, configurations in turns."""
+    cases = [{"seed": k, "seconds": options.seconds, "turns": options.turns} for k in range(options.seeds)]
+    results = bench.run_cases(cases, time_resolutions, 1, options.cache)
+    rows = [
+        [f"{w}×{h}", *(Spread(r[f"{w}x{h}, {config}"] for r in results).text(1, 1e3) for config in CONFIGS)]
+        for w, h in SIZES
+    ]
+    return f"{bench.format_table(['resolution', *CONFIGS], rows)}\n\n{about(options)} {bench.machine_words()}.", results
+
+
+def time_resolutions(case: Case) -> Case:
+    """The median time of a frame at each size with each configuration, s; one world is drawn at the largest size."""
+    camera = {"width_px": 1920, "height_px": 1440}
+    source = SimulatorSource(walking(case["seed"], case["seconds"], camera=camera, world={"side_m": 200.0}))
+    kept, calls = Kept(source), {}
+    for size, config in product(SIZES, CONFIGS):
+        images = [resize(frame.image, size) for frame in kept.frames]
+        focal_px = source.camera.focal_px[0] * size[0] / 1920
+        settings = with_parameters(load_config(config), {"gates.focal_px": focal_px})
+        detector = MotionDetector(settings, "onboard", kept.rate_hz, kept.log)
+
+        def detect(turn: int, images: list[np.ndarray] = images, detector: MotionDetector = detector) -> None:
+            period = 2 * len(images) - 2
+            for i in range(turn * TURN_FRAMES, (turn + 1) * TURN_FRAMES):
+                image = images[min(i % period, period - i % period)]
+                detector.update(Frame(i + 1, i / kept.rate_hz, image))
+
+        calls[f"{size[0]}x{size[1]}, {config}"] = detect
+    spent = bench.time_in_turns(calls, case["turns"], warm_up=3)
+    return {name: float(np.median(seconds[:, 0])) / TURN_FRAMES for name, seconds in spent.items()}
+
+
+# -- the loop --------------------------------------------------------------------------------------------------------
+
+OPEN: Case = {"steering.on": False, "interval.rule": False, "track.appearance": "never"}
+LOOPS: dict[str, Case] = {
+    "closed": {},
+    "closed, every frame": {"steering.sampling": False},
+    "closed, vehicles as planned": {"steering.look": False, "steering.follow": False},
+    **{f"open, every {every}": {**OPEN, "every": every} for every in (1, 2, 3, 5)},
+}
+
+
+class TimedSource:
+    """A source whose own processor time, drawing above all, is known."""
+
+    def __init__(self, source: SimulatorSource, every: int) -> None:
+        self._source, self._every = source, every
+        self.spent_s, self.frames = 0.0, 0
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = iter(self._source)
+        while True:
+            start = bench.now()[1]
+            frame = next(frames, None)
+            self.spent_s += bench.now()[1] - start
+            if frame is None:
+                return
+            if self.frames == 0 and self._every > 1:
+                self._source.steer(Command(every=self._every))
+            self.frames += 1
+            yield frame
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._source, name)
+
+
+def measure_loop(options: bench.Options) -> tuple[str, Any]:
+    """Error of the known place of every crowd at every moment, against processor time a second of clip.
+
+    A crowd of which nothing is known costs 10 m. Open loops fly as planned and look at every k-th frame. Time is of one
+    thread, without drawing and judging; "aerial": without people seen from the ground.
+    """
+    cases = [
+        {"scenario": name, "seed": seed, "seconds": options.seconds, "set": LOOPS[loop]}
+        for loop in LOOPS
+        for name in options.scenarios
+        for seed in range(options.seeds)
+    ]
+    results = bench.run_cases(cases, fly_loop, options.jobs, options.cache)
+    rows, lines = [], {}
+    for loop, settings in LOOPS.items():
+        of = [r for c, r in zip(cases, results, strict=True) if c["set"] == settings]
+        score = [r["score"] for r in of]
+        known, times = (
+            Spread(s["knowledge_m"] for s in score),
+            [Spread(r[key] for r in of) for key in ("cpu", "aerial")],
+        )
+        cells = [Spread(s[key] for s in score).text(1, 100, False) for key in ("known", "recall", "kind_right")]
+        cells += [Spread(s[key] for s in score).text(2, 1, False) for key in ("false_blobs", "switches_a_minute")]
+        rows.append([loop, known.text(), *cells, *(one.text(2, 1, False) for one in times)])
+        lines[loop] = {"x": [times[0].mean], "y": [known.mean], "error": [known.error], "style": "o"}
+    bench.draw(options.plot, [{"xlabel": "s of processor a s", "ylabel": "known to within, m", "lines": lines}])
+    head = ["setting", "known to within m", "of moments %", "recall %", "human or not %", "false blobs"]
+    head += ["switches a minute", "s/s", "aerial s/s"]
+    return f"{bench.format_table(head, rows)}\n\n{', '.join(options.scenarios)}; {about(options)}", results
+
+
+def fly_loop(case: Case) -> Case:
+    """One run."""
+    cv2.setNumThreads(1)
+    scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
+    source = SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"])
+    parameters = {name: value for name, value in case["set"].items() if name != "every"}
+    settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
+    timed: Any = TimedSource(source, case["set"].get("every", 1))
+    started = StartedSource(timed)
+    mission = build_mission(started, settings, "onboard")
+    engine = load_engine("onboard", mission.settings)
+    scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
+    stages, judging, timed.spent_s, start = Counter[str](), 0.0, 0.0, bench.now()[1]
+    for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(started):
+        stages.update(result.grounded.seconds if result.grounded is not None else result.followed.seconds)
+        before = bench.now()[1]
+        for truth in source.truths():
+            scorer.feed(truth)
+        scorer.feed(result)
+        judging += bench.now()[1] - before
+    cpu = (bench.now()[1] - start - judging - timed.spent_s) / source.scenario.clip.seconds
+    aerial = cpu * (1 - stages.get("people", 0.0) / max(sum(stages.values()), 1e-9))
+    return {"score": scorer.score().by_name(), "cpu": float(cpu), "aerial": float(aerial)}
+
+
+def measure_whole(options: bench.Options) -> tuple[str, Any]:
+    """Whole scenarios in the closed loop, from video to metres: what `dddas run sim:NAME --seed 11` says at its end.
+
+    Nothing was chosen on seed 11.
+    """
+    cases = [{"scenario": name, "seed": options.seed} for name in options.scenarios]
+    scores = bench.run_cases(cases, fly_whole, options.jobs, options.cache)
+    rows = []
+    for case, s in zip(cases, scores, strict=True):
+        right = f"{round((s['kind_right'] or 0) * s['kinds'])} of {s['kinds']}"
+        cells = [f"{100 * s['recall']:.1f} %", f"{s['false_blobs']:.2f}", f"{s['target_error_m']['mean']:.2f} m"]
+        rows.append([case["scenario"], *cells, f"{s['switches'] / s['crowd_minutes']:.1f}", right])
+    head = ["scenario", "crowds found and located", "false blobs a frame", "error of a target"]
+    return bench.format_table([*head, "switches a crowd and minute", "human or not, right"], rows), scores
+
+
+def fly_whole(case: Case) -> Case:
+    """The score of one run, by name."""
+    from torchvision_dddas.cli.mission import fly_into
+
+    with tempfile.TemporaryDirectory() as out:
+        _, score = fly_into(Path(out), case["scenario"], seed=case["seed"], quiet=True)
+    return score.by_name()
+
+
+# -- realism ---------------------------------------------------------------------------------------------------------
+
+FLIGHTS = ((50.0, 90.0, 0), (50.0, 45.0, 1), (100.0, 60.0, 2), (200.0, 90.0, 3), (20.0, 35.0, 4))
+"""Altitude in metres, pitch in degrees below the horizon, and the seed."""
+STATISTICS = ("inliers", "steady", "difference_median", "difference_p90", "difference_p99", "false_blobs")
+
+
+def measure_realism(options: bench.Options) -> tuple[str, Any]:
+    """Whether rendered flights over empty ground are as hard as real clips.
+
+    Medians over pairs of successive frames: share of inliers of the registration, share of pairs that are reliable,
+    difference of the registered frames in grey levels; and false blobs a frame where nothing moves.
+    """
+    found = {}
+    for place in clips_in(options.data, options.only):
+        frames = list(islice(open_source(place / "frames"), options.frames))
+        found[place.name] = describe_frames(frames, still=place.name == "uav123_building4")
+    width, height = bench.parse_size(options.size)
+    for altitude, pitch, seed in FLIGHTS:
+        scenario = Scenario.model_validate(
+            {
+                "seed": seed,
+                "clip": {"seconds": options.frames / 10, "located_by": "nothing"},
+                "world": {"side_m": float(np.clip(3 * altitude, 160, 600)), "texel_m": 0.05 if altitude < 40 else 0.1},
+                "uav": {"altitude_m": altitude, "pitch_deg": pitch, "way_m": ((30.0, 10.0),)},
+                "camera": {"width_px": width, "height_px": height},
+                "team": {"ugvs": 0},
+            }
+        )
+        frames = list(islice(SimulatorSource(scenario), options.frames))
+        found[f"simulated, {altitude:g} m, {pitch:g}°"] = describe_frames(frames, still=True)
+    rows = [[name, *(f"{by[key]:.3f}" if key in by else "–" for key in STATISTICS)] for name, by in found.items()]
+    return bench.format_table(["clip", *STATISTICS], rows), found
+
+
+def describe_frames(frames: Sequence[Frame], still: bool) -> dict[str, float]:
+    """The statistics of a clip; false blobs only where nothing moves."""
+    engine, rows, steady = load_engine("onboard", Settings()), [], []
+    views: list[Any] = [engine.prepare(frame.image) for frame in frames]
+    for earlier, later in pairwise(views):
+        found = engine.register([(earlier, later)])[0]
+        steady.append(found.reliable)
+        height, width = later.grey.shape
+        warp = partial(cv2.warpPerspective, M=found.later_from_earlier, dsize=(width, height))
+        moved = warp(earlier.grey.astype(np.float32), flags=cv2.INTER_CUBIC)
+        whole = cv2.erode(warp(np.full_like(earlier.grey, 255)), np.ones((17, 17), np.uint8), borderValue=0) > 0
+        if found.reliable and whole.any():
+            gain = float((later.grey[whole].mean() + 1) / (moved[whole].mean() + 1))
+            difference = np.abs(later.grey[whole] - gain * moved[whole])
+            rows.append([found.inlier_share, *np.percentile(difference, (50, 90, 99))])
+    values = np.median(np.array(rows).reshape(-1, 4), axis=0).tolist() if rows else [np.nan] * 4
+    result = dict(zip(("inliers", *STATISTICS[2:5]), values, strict=True)) | {"steady": float(np.mean(steady))}
+    if still:
+        result["false_blobs"] = float(
+            np.mean([len(s.detections) for s in detect_motion(frames, Settings(), "onboard")])
+        )
+    return result
+
+
+def about(options: bench.Options) -> str:
+    """The last line of a text."""
+    return f"{options.seeds} seeds, {options.seconds:g} s each: mean ± standard error (range over seeds)."
+
+
+if __name__ == "__main__":
+    common = {"--seeds": 20, "--jobs": 1, "--cache": None}
+    scenarios = ["joining", "splitting", "crossing", "random", "border50", "border100", "border200"]
+    altitudes = {"--seconds": 6.0, "--altitudes": [50.0, 100.0, 200.0], "--size": "640x480"}
+    loop = {"--seconds": 0.0, "--seeds": 10, "--scenarios": ["leaving"], "--plot": None}
+    real = {"data": Path, "--only": "", "--frames": 24, "--size": "1280x720"}
+    studies = {
+        "altitude": (measure_altitude, common | altitudes),
+        "landmarks": (measure_landmarks, common | {"--seconds": 19.0}),
+        "kernels": (measure_kernels, common | {"--seconds": 5.0}),
+        "resolution": (measure_resolution, common | {"--seconds": 1.6, "--turns": 2}),
+        "loop": (measure_loop, common | loop),
+        "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
+        "realism": (measure_realism, real),
+    }
+    bench.main(__doc__, studies)
