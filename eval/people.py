@@ -28,9 +28,8 @@ from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.detector import people_in, recognize, recognizer_of
-from torchvision_dddas.people.scorer import load_scorer
-from torchvision_dddas.people.suppression import group
+from torchvision_dddas.people.detector import detect_in_clip, detect_people, load_scorer
+from torchvision_dddas.people.suppression import group_rectangles
 from torchvision_dddas.types import DetectionTable
 
 CLIPS = ("PETS09-S2L1", "TUD-Stadtmitte")
@@ -147,7 +146,7 @@ def measure_miss_rate(options: bench.Options) -> tuple[str, Any]:
     parameters = load_config(overrides=options.set).people
     rows, found, panels = [], {}, []
     for clip in read_clips(options.data, options.every, options.only):
-        ours = detect_people(clip, parameters)
+        ours = detect_clip(clip, parameters)
         curves = {"ours": curve({n: (p.box_px, p.margin) for n, p in ours.items()}, clip)}
         if options.grid_frames:
             curves |= measure_opencv(clip, parameters, max(1, len(clip.frames) // options.grid_frames))
@@ -165,10 +164,10 @@ def measure_miss_rate(options: bench.Options) -> tuple[str, Any]:
     return bench.format_table(["clip", "detector", "recall at 1", "at 0.1", "log-average miss rate"], rows, 2), found
 
 
-def detect_people(clip: Clip, parameters: PeopleParameters) -> dict[int, Any]:
+def detect_clip(clip: Clip, parameters: PeopleParameters) -> dict[int, Any]:
     """The people of every frame, by the onboard engine."""
-    scorer = recognizer_of(parameters, "onboard")
-    return {number: people_in([image], scorer, parameters)[0] for number, image in clip.frames.items()}
+    scorer = load_scorer(parameters, "onboard")
+    return {number: detect_people([image], scorer, parameters)[0] for number, image in clip.frames.items()}
 
 
 def measure_opencv(clip: Clip, parameters: PeopleParameters, every: int) -> dict[str, Curve]:
@@ -220,7 +219,7 @@ def rectangles(scored: np.ndarray, size: tuple[int, int], setting: Setting) -> F
     there = (x >= -padding) & (y >= -padding) & (x + 64 <= width + padding) & (y + 128 <= height + padding)
     there &= ((x + padding) % stride == 0) & ((y + padding) % stride == 0) & (score >= setting.hit)
     corner = np.stack([x, y, np.full_like(x, 64), np.full_like(x, 128)], axis=1)
-    box, best = group(np.rint(corner * level_scale[:, None])[there], score[there], setting.groups)
+    box, best = group_rectangles(np.rint(corner * level_scale[:, None])[there], score[there], setting.groups)
     low = np.maximum(box[:, :2], 0)
     high = np.minimum(box[:, :2] + box[:, 2:], np.rint(np.array(size) * setting.enlarge))
     return np.concatenate([low, high - low], axis=1) / setting.enlarge, best
@@ -292,14 +291,14 @@ def measure_parity(options: bench.Options) -> tuple[str, Any]:
         )  # fmt: skip
         parts = pyramid.everywhere(size, parameters)
         for engine in options.engines:
-            scorer, windows, worst, signs, boxes, other = load_scorer(engine, parameters, svm), 0, 0.0, 0, 0, 0
+            scorer, windows, worst, signs, boxes, other = load_scorer(parameters, engine, svm), 0, 0.0, 0, 0, 0
             for image in images:
                 (maps,) = scorer.scores([image], [parts])
                 for part, scores in zip(parts, maps, strict=True):
                     wanted = opencv_scores(image, part.level, parameters)
                     windows, worst = windows + wanted.size, max(worst, float(np.abs(scores - wanted).max(initial=0)))
                     signs += int(((scores > 0) != (wanted > 0)).sum())
-                found = people_in([image], scorer, parameters)[0].window_px
+                found = detect_people([image], scorer, parameters)[0].window_px
                 theirs, _ = opencv_detector().detectMultiScale(
                     image, 0, (stride,) * 2, (padding,) * 2, parameters.scale_step, parameters.group
                 )
@@ -341,7 +340,7 @@ def measure_regions(options: bench.Options) -> tuple[str, Any]:
     over frames of a frame's ratio to the whole search, all taken in turn frame by frame.
     """
     settings, rows = load_config(overrides=options.set), []
-    scorer = recognizer_of(settings.people, options.engine)
+    scorer = load_scorer(settings.people, options.engine)
     for name in CLIPS:
         place = options.data / name
         if not (place / "gt/gt.txt").is_file() or film_of(place) is None:
@@ -350,8 +349,9 @@ def measure_regions(options: bench.Options) -> tuple[str, Any]:
         moving = find_movers(video, settings, options.frames)
         frames = tee(islice(open_source(video), options.frames), len(MODES))
         runs = [
-            recognize(one, scorer, with_parameters(settings, {"people.search": search}), moving if around else None,
-                      batch=1)
+            detect_in_clip(
+                one, scorer, with_parameters(settings, {"people.search": search}), moving if around else None, batch=1
+            )
             for one, (search, around) in zip(frames, MODES.values(), strict=True)
         ]  # fmt: skip
         hits, false, share, people, times = np.zeros(len(MODES)), np.zeros(len(MODES)), np.zeros(len(MODES)), 0, []

@@ -1,12 +1,9 @@
-"""Studies on rendered video with known truth; no data needed, except real clips for `realism`.
+"""Studies on rendered video with known truth; no data needed.
 
 python eval/simulated.py altitude     errors of crowds from video to metres by altitude (appendix A, Fig. 7)
 python eval/simulated.py landmarks    centres of landmarks by colour or motion, four or six (A, Fig. 8, 9)
-python eval/simulated.py kernels      pixels and crowds found against morphological kernels (appendix B, Fig. 8)
-python eval/simulated.py resolution   time of a frame against the resolution (B, Fig. 9)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
 python eval/simulated.py whole        whole scenarios in the closed loop
-python eval/simulated.py realism DATA whether rendered flights are as hard as real clips
 
 Figures are mean ± standard error (range) over seeds. --cache FILE keeps finished cases.
 """
@@ -17,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice, pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +22,18 @@ import bench
 import cv2
 import numpy as np
 from bench import Spread
-from clips import clips_in, resize
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control import StartedSource, build_mission, fit_settings
 from torchvision_dddas.control.rules import every_least
-from torchvision_dddas.detection import MotionDetector, detect_motion, load_engine, pixels_per_metre
-from torchvision_dddas.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.detection import detect_motion, load_engine, pixels_per_metre
 from torchvision_dddas.evaluation.metrics.crowd_frames import shown
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.geo.terrain import shift_origin
-from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.simulation.drawing import view_from_pose
@@ -230,27 +224,6 @@ def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str
     return Scenario.model_validate({"seed": seed, "crowd": tuple(crowds), "car": (car,), **usual_tables})
 
 
-class Kept:
-    """All frames of a scenario that flies as planned, drawn once, to be searched several times.
-
-    truths: by the number of the frame. log: the telemetry of the whole run.
-    """
-
-    def __init__(self, source: SimulatorSource) -> None:
-        self.rate_hz, self.size = source.rate_hz, source.size
-        self.frames: list[Frame] = []
-        self.truths: dict[int, Truth] = {}
-        for frame in source:
-            self.frames.append(frame)
-            self.truths |= {truth.frame: truth for truth in source.truths()}
-        self.last = source.last
-        # A method of that name would be asked at every frame what was reported so far.
-        self.log = source.telemetry()
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
-
-
 # -- altitude and landmarks ------------------------------------------------------------------------------------------
 
 GPS = {"exact": 0.0, "3.5 m": 3.5}
@@ -338,93 +311,6 @@ def fly_landmarks(case: Case) -> Case:
         team={"ugvs": 6, "patrol": "gather", "ring_m": 18.0},
     )  # fmt: skip
     return locate_clip(scenario, LANDMARK_WAYS, (SLOW_S,))
-
-
-# -- kernels ---------------------------------------------------------------------------------------------------------
-
-KERNELS = {"morphology.erode_px": (1, 2, 3, 4, 5, 7), "morphology.close_px": (1, 7, 13, 19, 25, 31, 41)}
-SKIPPED = 10
-"""Frames at the beginning that do not count: there is no past yet."""
-
-
-def measure_kernels(options: bench.Options) -> tuple[str, Any]:
-    """Pixels and crowds found against the kernels of erosion and closing, each with the usual other one.
-
-    Precision, recall and F are those of pixels, pooled over a clip, against bodies without their shadows.
-    """
-    cases = [{"seed": seed, "seconds": options.seconds} for seed in range(options.seeds)]
-    results = bench.run_cases(cases, search_with_kernels, options.jobs, options.cache)
-    rows = []
-    for name, size in ((name, size) for name, sizes in KERNELS.items() for size in sizes):
-        of = [result[f"{name} {size}"] for result in results]
-        cells = [Spread(r[key] for r in of).text(1, 100) for key in ("precision", "recall", "f", "detected")]
-        rows.append([f"`{name}`", size, *cells, Spread(r["false_blobs"] for r in of).text()])
-    head = ["kernel", "px", "precision %", "recall %", "F %", "crowds detected %", "false blobs a frame"]
-    return f"{bench.format_table(head, rows)}\n\n{about(options)}", results
-
-
-def search_with_kernels(case: Case) -> Case:
-    """One clip with all kernels."""
-    source = SimulatorSource(walking(case["seed"], case["seconds"]))
-    clip, found = Kept(source), {}
-    for name, size in ((name, size) for name, sizes in KERNELS.items() for size in sizes):
-        # A closing in metres would hide that in pixels.
-        metres = {"morphology.close_m": 0.0} if name == "morphology.close_px" else {}
-        settings = usual(source, {"crowds.join_m": 0.0, **metres, name: size})
-        pixels, scorer = segmentation.Pixels(), CrowdScorer()
-        for scene in detect_motion(clip, settings, "onboard", clip.log):
-            number = scene.frame.number
-            if number <= SKIPPED:
-                continue
-            pixels = pixels.plus(segmentation.count(scene.mask, clip.truths[number].mask))
-            rows = np.arange(len(scene.detections))
-            tracks = Tracks(number, rows + 1, scene.detections.box_px, scene.detections.score, rows)
-            scorer.feed(clip.truths[number])
-            scorer.feed(FrameResult(TrackedFrame(number, scene.frame, scene.detections, tracks)))
-        score = scorer.score()
-        more = {"detected": score.detected, "false_blobs": score.false_blobs}
-        found[f"{name} {size}"] = segmentation.measures(pixels) | more
-    return found
-
-
-# -- resolution ------------------------------------------------------------------------------------------------------
-
-SIZES = ((320, 240), (640, 480), (800, 600), (960, 720), (1280, 720), (1920, 1080))
-CONFIGS = (CONFIG, "fast", "source")
-TURN_FRAMES = 8
-
-
-def measure_resolution(options: bench.Options) -> tuple[str, Any]:
-    """Milliseconds a frame by the clock, detection alone, from 320×240 to 1920×1080, configurations in turns."""
-    cases = [{"seed": k, "seconds": options.seconds, "turns": options.turns} for k in range(options.seeds)]
-    results = bench.run_cases(cases, time_resolutions, 1, options.cache)
-    rows = [
-        [f"{w}×{h}", *(Spread(r[f"{w}x{h}, {config}"] for r in results).text(1, 1e3) for config in CONFIGS)]
-        for w, h in SIZES
-    ]
-    return f"{bench.format_table(['resolution', *CONFIGS], rows)}\n\n{about(options)} {bench.machine_words()}.", results
-
-
-def time_resolutions(case: Case) -> Case:
-    """The median time of a frame at each size with each configuration, s; one world is drawn at the largest size."""
-    camera = {"width_px": 1920, "height_px": 1440}
-    source = SimulatorSource(walking(case["seed"], case["seconds"], camera=camera, world={"side_m": 200.0}))
-    kept, calls = Kept(source), {}
-    for size, config in product(SIZES, CONFIGS):
-        images = [resize(frame.image, size) for frame in kept.frames]
-        focal_px = source.camera.focal_px[0] * size[0] / 1920
-        settings = with_parameters(load_config(config), {"gates.focal_px": focal_px})
-        detector = MotionDetector(settings, "onboard", kept.rate_hz, kept.log)
-
-        def detect(turn: int, images: list[np.ndarray] = images, detector: MotionDetector = detector) -> None:
-            period = 2 * len(images) - 2
-            for i in range(turn * TURN_FRAMES, (turn + 1) * TURN_FRAMES):
-                image = images[min(i % period, period - i % period)]
-                detector.update(Frame(i + 1, i / kept.rate_hz, image))
-
-        calls[f"{size[0]}x{size[1]}, {config}"] = detect
-    spent = bench.time_in_turns(calls, case["turns"], warm_up=3)
-    return {name: float(np.median(seconds[:, 0])) / TURN_FRAMES for name, seconds in spent.items()}
 
 
 # -- the loop --------------------------------------------------------------------------------------------------------
@@ -543,65 +429,6 @@ def fly_whole(case: Case) -> Case:
     return score.by_name()
 
 
-# -- realism ---------------------------------------------------------------------------------------------------------
-
-FLIGHTS = ((50.0, 90.0, 0), (50.0, 45.0, 1), (100.0, 60.0, 2), (200.0, 90.0, 3), (20.0, 35.0, 4))
-"""Altitude in metres, pitch in degrees below the horizon, and the seed."""
-STATISTICS = ("inliers", "steady", "difference_median", "difference_p90", "difference_p99", "false_blobs")
-
-
-def measure_realism(options: bench.Options) -> tuple[str, Any]:
-    """Whether rendered flights over empty ground are as hard as real clips.
-
-    Medians over pairs of successive frames: share of inliers of the registration, share of pairs that are reliable,
-    difference of the registered frames in grey levels; and false blobs a frame where nothing moves.
-    """
-    found = {}
-    for place in clips_in(options.data, options.only):
-        frames = list(islice(open_source(place / "frames"), options.frames))
-        found[place.name] = describe_frames(frames, still=place.name == "uav123_building4")
-    width, height = bench.parse_size(options.size)
-    for altitude, pitch, seed in FLIGHTS:
-        scenario = Scenario.model_validate(
-            {
-                "seed": seed,
-                "clip": {"seconds": options.frames / 10, "located_by": "nothing"},
-                "world": {"side_m": float(np.clip(3 * altitude, 160, 600)), "texel_m": 0.05 if altitude < 40 else 0.1},
-                "uav": {"altitude_m": altitude, "pitch_deg": pitch, "way_m": ((30.0, 10.0),)},
-                "camera": {"width_px": width, "height_px": height},
-                "team": {"ugvs": 0},
-            }
-        )
-        frames = list(islice(SimulatorSource(scenario), options.frames))
-        found[f"simulated, {altitude:g} m, {pitch:g}°"] = describe_frames(frames, still=True)
-    rows = [[name, *(f"{by[key]:.3f}" if key in by else "–" for key in STATISTICS)] for name, by in found.items()]
-    return bench.format_table(["clip", *STATISTICS], rows), found
-
-
-def describe_frames(frames: Sequence[Frame], still: bool) -> dict[str, float]:
-    """The statistics of a clip; false blobs only where nothing moves."""
-    engine, rows, steady = load_engine("onboard", Settings()), [], []
-    views: list[Any] = [engine.prepare(frame.image) for frame in frames]
-    for earlier, later in pairwise(views):
-        found = engine.register([(earlier, later)])[0]
-        steady.append(found.reliable)
-        height, width = later.grey.shape
-        warp = partial(cv2.warpPerspective, M=found.later_from_earlier, dsize=(width, height))
-        moved = warp(earlier.grey.astype(np.float32), flags=cv2.INTER_CUBIC)
-        whole = cv2.erode(warp(np.full_like(earlier.grey, 255)), np.ones((17, 17), np.uint8), borderValue=0) > 0
-        if found.reliable and whole.any():
-            gain = float((later.grey[whole].mean() + 1) / (moved[whole].mean() + 1))
-            difference = np.abs(later.grey[whole] - gain * moved[whole])
-            rows.append([found.inlier_share, *np.percentile(difference, (50, 90, 99))])
-    values = np.median(np.array(rows).reshape(-1, 4), axis=0).tolist() if rows else [np.nan] * 4
-    result = dict(zip(("inliers", *STATISTICS[2:5]), values, strict=True)) | {"steady": float(np.mean(steady))}
-    if still:
-        result["false_blobs"] = float(
-            np.mean([len(s.detections) for s in detect_motion(frames, Settings(), "onboard")])
-        )
-    return result
-
-
 def about(options: bench.Options) -> str:
     """The last line of a text."""
     return f"{options.seeds} seeds, {options.seconds:g} s each: mean ± standard error (range over seeds)."
@@ -612,14 +439,10 @@ if __name__ == "__main__":
     scenarios = ["joining", "splitting", "crossing", "random", "border50", "border100", "border200"]
     altitudes = {"--seconds": 6.0, "--altitudes": [50.0, 100.0, 200.0], "--size": "640x480"}
     loop = {"--seconds": 0.0, "--seeds": 10, "--scenarios": ["leaving"], "--plot": None}
-    real = {"data": Path, "--only": "", "--frames": 24, "--size": "1280x720"}
     studies = {
         "altitude": (measure_altitude, common | altitudes),
         "landmarks": (measure_landmarks, common | {"--seconds": 19.0}),
-        "kernels": (measure_kernels, common | {"--seconds": 5.0}),
-        "resolution": (measure_resolution, common | {"--seconds": 1.6, "--turns": 2}),
         "loop": (measure_loop, common | loop),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
-        "realism": (measure_realism, real),
     }
     bench.main(__doc__, studies)

@@ -293,7 +293,7 @@ def measure_people(options: bench.Options) -> tuple[str, Any]:
     """
     from torchvision_dddas.people import pyramid
     from torchvision_dddas.people.classifiers import read_classifier
-    from torchvision_dddas.people.scorer import load_scorer
+    from torchvision_dddas.people.detector import load_scorer
 
     parameters = PeopleParameters(window_stride_px=8, padding_px=0, scale_step=1.05, enlarge=1, threshold=0)
     svm, size = read_classifier("opencv", 3780), bench.parse_size(options.size)
@@ -313,7 +313,7 @@ def measure_people(options: bench.Options) -> tuple[str, Any]:
         )
     }
     for engine in available_chains(("onboard", "torch")):
-        scorer = load_scorer(engine, parameters, svm)
+        scorer = load_scorer(parameters, engine, svm)
         for name, part in parts.items() if engine == "onboard" else [("everywhere", parts["everywhere"])]:
             calls[f"{engine}, {name}"] = lambda turn, s=scorer, p=part: s.scores([images[turn % len(images)]], [p])
     return _beside_first(calls, options.rounds, f"People, {options.size}")

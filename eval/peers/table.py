@@ -4,13 +4,10 @@ DATA holds MOTChallenge 2015 sequences: NAME/gt/gt.txt, NAME/det/det.txt, an opt
 true boxes at an interval (identities stripped, rows shuffled within a frame; switches and IDF1, matched at an IoU of
 0.9, which only the box itself reaches), and detections at interval 1 (HOTA, MOTA, IDF1, switches, all sequences
 pooled). Each peer runs at its defaults and with thresholds tuned for that very study over BOXES or DETECTIONS below, on
-the sequences that the figures are of: the peers get every advantage; ours runs as it is. Prints Markdown, clip by clip;
---details puts it between a file's `peers` marks, --write the sums and means alone, --json keeps everything. Few
-switches say little beside a low IDF1: a tracker that confirms late or loses its targets leaves boxes without identity,
-and those cannot switch.
+the sequences that the figures are of: the peers get every advantage; ours runs as it is. Few switches say little beside
+a low IDF1: a tracker that confirms late or loses its targets leaves boxes without identity, and those cannot switch.
 """
 
-import argparse
 import itertools
 import json
 import subprocess
@@ -24,8 +21,8 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import report
-from footage import sequences
+import bench
+from clips import sequences
 
 from torchvision_dddas.evaluation.datasets import motchallenge
 from torchvision_dddas.evaluation.metrics import tracking, truth
@@ -40,52 +37,22 @@ SAME = 0.9
 Settings = dict[str, Any]
 
 # Around each tracker's defaults and towards looser gates, shorter confirmation and longer memory.
+GATES = {"minimum_iou_threshold": [0.01, 0.1, 0.3]}
 BOXES: dict[str, dict[str, list]] = {
-    "SORT": {
-        "minimum_iou_threshold": [0.01, 0.1, 0.3],
-        "lost_track_buffer": [3, 30],
-        "minimum_consecutive_frames": [1, 3],
-    },
-    "ByteTrack": {
-        "minimum_iou_threshold": [0.01, 0.1, 0.3],
-        "lost_track_buffer": [3, 30],
-        "minimum_consecutive_frames": [1, 2],
-    },
-    "OC-SORT": {
-        "minimum_iou_threshold": [0.01, 0.1, 0.3],
-        "minimum_consecutive_frames": [1, 3],
-        "direction_consistency_weight": [0.0, 0.2],
-    },
-    "norfair": {
-        "distance_threshold": [0.7, 0.9, 0.99],
-        "hit_counter_max": [3, 15],
-        "initialization_delay": [0, 1],
-    },
+    "SORT": GATES | {"lost_track_buffer": [3, 30], "minimum_consecutive_frames": [1, 3]},
+    "ByteTrack": GATES | {"lost_track_buffer": [3, 30], "minimum_consecutive_frames": [1, 2]},
+    "OC-SORT": GATES | {"minimum_consecutive_frames": [1, 3], "direction_consistency_weight": [0.0, 0.2]},
+    "norfair": {"distance_threshold": [0.7, 0.9, 0.99], "hit_counter_max": [3, 15], "initialization_delay": [0, 1]},
 }
 DETECTIONS: dict[str, dict[str, list]] = {
-    "SORT": {
-        "least_score": [0.0, 0.7, 0.8, 0.9],
-        "track_activation_threshold": [0.25, 0.9],
-        "minimum_iou_threshold": [0.2, 0.3],
-        "minimum_consecutive_frames": [2, 3],
-    },
-    "ByteTrack": {
-        "least_score": [0.0, 0.7, 0.8],
-        "track_activation_threshold": [0.7, 0.9],
-        "high_conf_det_threshold": [0.6, 0.8],
-        "minimum_iou_threshold": [0.1, 0.2],
-    },
-    "OC-SORT": {
-        "high_conf_det_threshold": [0.6, 0.7, 0.8, 0.9],
-        "minimum_iou_threshold": [0.1, 0.3],
-        "lost_track_buffer": [30, 60],
-    },
-    "norfair": {
-        "least_score": [0.0, 0.7, 0.8, 0.9],
-        "distance_threshold": [0.7, 0.9],
-        "hit_counter_max": [8, 15],
-        "initialization_delay": [1, 3],
-    },
+    "SORT": {"least_score": [0.0, 0.7, 0.8, 0.9], "track_activation_threshold": [0.25, 0.9]}
+    | {"minimum_iou_threshold": [0.2, 0.3], "minimum_consecutive_frames": [2, 3]},
+    "ByteTrack": {"least_score": [0.0, 0.7, 0.8], "track_activation_threshold": [0.7, 0.9]}
+    | {"high_conf_det_threshold": [0.6, 0.8], "minimum_iou_threshold": [0.1, 0.2]},
+    "OC-SORT": {"high_conf_det_threshold": [0.6, 0.7, 0.8, 0.9], "minimum_iou_threshold": [0.1, 0.3]}
+    | {"lost_track_buffer": [30, 60]},
+    "norfair": {"least_score": [0.0, 0.7, 0.8, 0.9], "distance_threshold": [0.7, 0.9]}
+    | {"hit_counter_max": [8, 15], "initialization_delay": [1, 3]},
 }
 
 
@@ -100,36 +67,15 @@ class Sequence:
     detections: Path | None
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--studies", default="boxes,detections,speed")
-    parser.add_argument("--peers", default=",".join(BOXES), help="those to run; '' for ours alone")
-    parser.add_argument("--json", type=Path, help="write all figures here, and keep those in it that are not run")
-    parser.add_argument("--write", type=Path, help="a text file with the peers marks, such as README.md: a summary")
-    parser.add_argument("--details", type=Path, help="another, such as eval/README.md: every clip and every setting")
-    options = parser.parse_args()
+def compare(options: bench.Options) -> tuple[str, Any]:
+    """Run the studies asked for and print the tables."""
     sequences = read(options.data)
-    if not sequences:
-        sys.exit(f"{options.data} holds no sequences NAME/gt/gt.txt; nothing was measured")
     for python in (TRACKERS, NORFAIR):
         if not python.exists():
             sys.exit(f"{python} is missing; run make peers first")
-    peers = [peer for peer in options.peers.split(",") if peer]
-    figures = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
-    for study in options.studies.split(","):
-        found = {"boxes": on_boxes, "detections": on_detections, "speed": on_speed}[study](sequences, peers)
-        kept = figures.setdefault(study, {})
-        for name, value in found.items():
-            kept[name] = {**kept.get(name, {}), **value} if study == "boxes" else value
-        if options.json:
-            options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    text = markdown(figures)
-    print(text)
-    if options.write:
-        report.put(options.write, "peers", summary(figures))
-    if options.details:
-        report.put(options.details, "peers", text)
+    studies = {"boxes": on_boxes, "detections": on_detections, "speed": on_speed}
+    figures = {study: studies[study](sequences, options.peers) for study in options.studies}
+    return markdown(figures), figures
 
 
 def read(data: Path) -> list[Sequence]:
@@ -341,27 +287,6 @@ def markdown(figures: dict) -> str:
     return "\n".join(lines)
 
 
-def summary(figures: dict) -> str:
-    """True boxes of all intervals in one table: all sequences as one, and each that has a clip."""
-    boxes = figures.get("boxes", {})
-    places = [(i, None) for i, rows in boxes.items() if len(first(rows)) > len(first(boxes["15"]))]
-    places += [(i, clip) for clip in first(boxes["15"]) for i in boxes if i != "1"] if boxes else []
-    heads = [f"{clip or f'{len(first(boxes[i]))} sequences'}, {i}" for i, clip in places]
-    lines = ["True boxes at an interval: switches / IDF1 in percent.", ""]
-    lines += ["| tracker | " + " | ".join(heads) + " |", "| --- |" + " ---: |" * len(heads)]
-    for name in boxes.get("1", {}):
-        cells = []
-        for interval, clip in places:
-            found = boxes[interval][name]["clips"]
-            if clip is None and len(found) < len(first(boxes[interval])):
-                cells.append("–")
-                continue
-            chosen = list(found.values()) if clip is None else [found[clip]]
-            cells.append(f"{sum(s for s, _ in chosen)} / {np.mean([idf1 for _, idf1 in chosen]):.1f}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *others(figures)])
-
-
 def first(rows: dict) -> dict:
     """The clips of a study: those of its first row."""
     return next(iter(rows.values()))["clips"]
@@ -371,12 +296,12 @@ def others(figures: dict) -> list[str]:
     """Detections and speed."""
     lines: list[str] = []
     if rows := figures.get("detections", {}):
+        cells = [
+            [name, *(f"{100 * row[k]:.1f}" for k in ("hota", "deta", "assa", "mota", "idf1")), row["switches"]]
+            for name, row in rows.items()
+        ]
         lines += [f"Detections of {len(rows['ours']['clips'])} sequences at interval 1, pooled; in percent.", ""]
-        lines += ["| tracker | HOTA | DetA | AssA | MOTA | IDF1 | switches |", "| --- |" + " ---: |" * 6]
-        for name, row in rows.items():
-            cells = " | ".join(f"{100 * row[k]:.1f}" for k in ("hota", "deta", "assa", "mota", "idf1"))
-            lines.append(f"| {name} | {cells} | {row['switches']} |")
-        lines.append("")
+        lines += [bench.format_table(["tracker", "HOTA", "DetA", "AssA", "MOTA", "IDF1", "switches"], cells), ""]
     if figures.get("speed"):
         speeds = ", ".join(f"{name} {round(s, -1):.0f}" for name, s in figures["speed"].items())
         lines += [f"Frames a second on the detections of PETS09-S2L1, one process each, medians: {speeds}.", ""]
@@ -396,4 +321,5 @@ def settings_of(figures: dict) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    options = {"data": Path, "--studies": ["boxes", "detections", "speed"], "--peers": list(BOXES)}
+    bench.main(__doc__, {"": (compare, options)})
