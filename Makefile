@@ -31,9 +31,8 @@ onboard: .venv-onboard/.installed
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check .
 	@touch $@
 
-# Tables and plots of the texts from the results that studies keep in docs/results: none of their figures is typed.
+# Tables of the documents from the results that studies keep in docs/results: none of their figures is typed.
 figures: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	$(BIN)/python eval/figures.py
 
 # Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our

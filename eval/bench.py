@@ -50,7 +50,9 @@ def main(description: str | None, studies: Mapping[str, tuple[Study, Mapping[str
         commands = parser.add_subparsers(dest="study", required=True, metavar="STUDY")
         for name, (study, options) in studies.items():
             lines = (study.__doc__ or "").strip().splitlines()
-            command = commands.add_parser(name, help=lines[0], description=study.__doc__, formatter_class=_Formatter)
+            command = commands.add_parser(
+                name, help=lines[0].replace("%", "%%"), description=study.__doc__, formatter_class=_Formatter
+            )
             _add_options(command, options)
     options = parser.parse_args()
     study = studies[getattr(options, "study", "")][0]

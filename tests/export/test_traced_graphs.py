@@ -1,7 +1,7 @@
 """Graphs traced from `functional`: what torch computes, of standard operations, the same bytes each time.
 
 A graph takes time for every node, so the step is traced once, at a small size and with as little flow and morphology
-as there can be; eval/step_graph.py compares the whole of it, on real clips too.
+as there can be.
 """
 
 from pathlib import Path

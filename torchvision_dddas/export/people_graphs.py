@@ -6,7 +6,7 @@
     people_scores.onnx      `histograms` -> `scores`
 
 The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
-tiles together, and has OpenCV take the gradient, which makes it several times quicker (eval/people_speed.py). Any SVM
+tiles together, and has OpenCV take the gradient, which makes it several times quicker (`eval/speed.py people`). Any SVM
 of the same cells, blocks and bins runs on them, with windows of any size: `functional.hog.arranged` gives `weights`.
 
 Traced graphs of `functional.hog` are right too, but take 160 ns a pixel on one core at 640x480 where people.onnx takes
