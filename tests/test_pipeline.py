@@ -54,7 +54,7 @@ def test_a_source_and_single_frames_give_the_same_results(frames):
 def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))
-    assert all(r.grounded is not None and r.grounded.fix.by == "telemetry" for r in results)
+    assert all(r.locations is not None and r.locations.fix.by == "telemetry" for r in results)
 
 
 WRONG: Any = "flight.csv"  # where a record is wanted

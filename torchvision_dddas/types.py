@@ -928,16 +928,17 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """All that is known of one frame at the end of the whole path. grounded: None where nothing lays it on the ground.
+    """The result of the whole pipeline for one frame.
 
-    followed: its targets, without the landmarks. sighted_by: (n,) what showed each of the landmarks of grounded.marks:
-    motion, colour or table. mark_lonlat_deg: (n, 2) where they were; None where there is no geographic origin.
-    confirmed: what ground vehicles say of the targets, row = that of grounded.positions; None where none looks.
-    command: what the instruments were asked to do after this frame; None where they stay as they are.
+    tracked: its targets, without the landmarks. locations: where they are on the ground; None if nothing locates them.
+    sighted_by: (n,) how each landmark of locations.marks was seen: motion, colour or table.
+    mark_lonlat_deg: (n, 2) positions of the landmarks; None without a geographic origin.
+    confirmed: the UGVs' verdict on each row of locations.positions; None without UGV cameras.
+    command: the order to the vehicles after this frame; None: no change.
     """
 
-    followed: TrackedFrame
-    grounded: AerialLocations | None = None
+    tracked: TrackedFrame
+    locations: AerialLocations | None = None
     sighted_by: tuple[str, ...] = ()
     mark_lonlat_deg: np.ndarray | None = None
     confirmed: Confirmation | None = None
@@ -946,17 +947,17 @@ class FrameResult:
     @property
     def frame(self) -> Frame | None:
         """The frame; None where it could not be read."""
-        return self.followed.frame
+        return self.tracked.frame
 
     @property
     def number(self) -> int:
         """1-based number of the frame."""
-        return self.followed.number
+        return self.tracked.number
 
     @property
     def tracks(self) -> Tracks:
         """The targets of the frame with their identities."""
-        return self.followed.tracks
+        return self.tracked.tracks
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dd
 
     def short(self, item):
         survey(self, item)
-        if item.followed.number == 6:
+        if item.tracked.number == 6:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(SimulatedRunRecorder, "write", short)

@@ -111,7 +111,7 @@ def test_targets_are_judged_by_what_ground_vehicles_saw(flown):
 
 def test_places_are_those_of_the_world(flown):
     """The crowd walks eastward about the middle: what is found of it is near."""
-    places = np.concatenate([s.grounded.positions.east_north_m for s in flown.surveyed if s.grounded is not None])
+    places = np.concatenate([s.locations.positions.east_north_m for s in flown.surveyed if s.locations is not None])
     assert len(places) > 20
     origin = flown.mission.watch.locator.site.origin_deg
     assert origin is not None
@@ -130,22 +130,22 @@ def test_what_goes_wrong_is_noticed(flown):
 
 
 def test_dropped_frames_are_scenes_without_targets(flown):
-    lost = [s.followed for s in flown.surveyed if "could not be read" in s.followed.cause]
+    lost = [s.tracked for s in flown.surveyed if "could not be read" in s.tracked.cause]
     assert [f.number for f in lost] == [17, 18]
 
 
 @pytest.mark.slow
 def test_frames_left_out_on_purpose_leave_no_empty_scenes():
     flown = fly(("steering.sampling=true", "steering.sampling_share=2.0"), 3.0, clip={"rate_hz": 10.0})
-    numbers = [s.followed.number for s in flown.surveyed]
+    numbers = [s.tracked.number for s in flown.surveyed]
     assert numbers[0] == 1
     assert max(np.diff(numbers)) > 1
     assert len(numbers) < 25
-    assert not [s.followed.cause for s in flown.surveyed if "could not be read" in s.followed.cause]
+    assert not [s.tracked.cause for s in flown.surveyed if "could not be read" in s.tracked.cause]
     assert numbers == sorted(flown.places)
 
 
 def test_without_ground_vehicles_telemetry_lays_the_pictures_on_the_ground():
     flown = fly((), 1.0, team={"ugvs": 0}, clip={"located_by": "telemetry"})
-    assert {s.grounded.fix.by for s in flown.surveyed if s.grounded is not None} == {"telemetry"}
+    assert {s.locations.fix.by for s in flown.surveyed if s.locations is not None} == {"telemetry"}
     assert flown.mission.watch.locator.site.origin_deg == flown.source.origin_deg

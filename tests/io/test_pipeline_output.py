@@ -125,7 +125,7 @@ def test_the_caption_says_why_a_frame_is_not_located():
 
 
 def test_a_frame_that_nothing_lays_on_the_ground_is_drawn_with_its_tracks():
-    drawn = RunPictures((200, 120), ())(FrameResult(surveyed(1).followed))
+    drawn = RunPictures((200, 120), ())(FrameResult(surveyed(1).tracked))
     assert drawn.shape == (120, 200, 3)
     assert cv2.absdiff(drawn, np.full_like(drawn, 128)).any()
 
@@ -139,7 +139,7 @@ def confirmed(surveyed, kind, by=()):
     one = np.ones(1)
     probability = {"human": 0.96, "not_human": 0.04, "unseen": 0.5}[kind]
     said = Confirmation(
-        surveyed.followed.number, np.zeros(1, np.int64), (kind,), probability * one, (by,), 4 * np.ones(1, np.int64),
+        surveyed.tracked.number, np.zeros(1, np.int64), (kind,), probability * one, (by,), 4 * np.ones(1, np.int64),
         0.3 * one, 0.5 * one, np.nan * one,
     )  # fmt: skip
     return replace(surveyed, confirmed=said)
@@ -147,7 +147,7 @@ def confirmed(surveyed, kind, by=()):
 
 def moved(surveyed, *adjustments):
     """The same, with adjustments at it."""
-    return replace(surveyed, grounded=replace(surveyed.grounded, adjustments=adjustments, seconds={"fix": 0.01}))
+    return replace(surveyed, locations=replace(surveyed.locations, adjustments=adjustments, seconds={"fix": 0.01}))
 
 
 def flown(folder, frames, save=("report",), events=(), score=None, geographic=False):
@@ -192,9 +192,9 @@ def test_the_log_tells_the_run_from_top_to_bottom(tmp_path):
 def test_a_landmark_that_is_not_seen_for_a_while_is_told_once(tmp_path):
     def without(frame):
         item = surveyed(frame)
-        marks = item.grounded.marks
+        marks = item.locations.marks
         gone = np.where(np.arange(2)[:, None] == 1, np.nan, marks.image_px)
-        return replace(item, grounded=replace(item.grounded, marks=replace(marks, image_px=gone)))
+        return replace(item, locations=replace(item.locations, marks=replace(marks, image_px=gone)))
 
     flown(tmp_path, [surveyed(1), *(without(k) for k in range(2, 9)), surveyed(9), without(10)])
     (line,) = [line for line in log(tmp_path) if " landmark " in line]
@@ -259,7 +259,7 @@ def test_a_run_that_locates_nothing_has_a_log_and_a_report_without_a_map(tmp_pat
         output.begin({"input": "clip"}, 10.0, (200, 120))
         output.story.event(3, "frame 3 could not be read", None, PROBLEM)
         for k in (1, 2, 3):
-            output.write(FrameResult(replace(surveyed(k).followed, adjustments=(change,) if k == 2 else ())))
+            output.write(FrameResult(replace(surveyed(k).tracked, adjustments=(change,) if k == 2 else ())))
     assert [line.split()[2] for line in log(tmp_path)] == ["adjusted", "problem"]
     text = (tmp_path / "report.html").read_text()
     assert "data:image/png" not in text and text.count("data:image/jpeg") == 3
@@ -271,7 +271,7 @@ def test_a_report_that_is_not_wanted_is_not_made_and_an_old_one_goes(tmp_path):
     for save, there in ((("report",), True), ((), False)):
         with PipelineRecorder(tmp_path, save) as output:
             output.begin({"input": "clip"}, 10.0, (200, 120))
-            output.write(FrameResult(surveyed(1).followed))
+            output.write(FrameResult(surveyed(1).tracked))
         assert (tmp_path / "report.html").exists() is there
         assert (tmp_path / "log.txt").exists()
 
@@ -289,8 +289,8 @@ def test_an_order_is_an_arrow_from_the_vehicle_towards_its_goal():
     item = surveyed(1)
     place = np.array([[0.0, 0], [5, 0], [0, 4]])
     marks = LandmarkObservations(np.arange(3), place * (10, -10) + (60, 50), place, np.ones(3), np.ones(3), np.zeros(3))
-    fix = replace(item.grounded.fix, landmark=np.arange(3), state=("used",) * 3)
-    item = replace(item, grounded=replace(item.grounded, marks=marks, fix=fix))
+    fix = replace(item.locations.fix, landmark=np.arange(3), state=("used",) * 3)
+    item = replace(item, locations=replace(item.locations, marks=marks, fix=fix))
     sent = replace(item, command=Command(orders=(Order("a", np.array([30.0, 0]), 2.0),)))
     plain, drawn = (RunPictures((200, 120), ("a", "b", "c"))(one) for one in (item, sent))
     _, columns = np.nonzero((np.abs(plain.astype(int) - drawn) > 60).any(axis=2)[40:60])

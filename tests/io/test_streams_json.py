@@ -40,13 +40,13 @@ def example():
     """The frame of the page: a crowd that was located, and a person."""
     moved = Adjustment(41, "interval_frames", 1.0, 2.0, "background flow 0.4 px a frame")
     found = surveyed(42, targets=2, rate=30.0)
-    assert found.grounded is not None
-    near = replace(found.grounded.marks, image_px=np.array([[40.0, 30], [120, 50], [99, 99], [7, 7]]))
+    assert found.locations is not None
+    near = replace(found.locations.marks, image_px=np.array([[40.0, 30], [120, 50], [99, 99], [7, 7]]))
     states = ("used", "excluded", "used", "used")
-    fix = replace(found.grounded.fix, state=states, changes=("bravo excluded: 9.1 px off",))
+    fix = replace(found.locations.fix, state=states, changes=("bravo excluded: 9.1 px off",))
     marks = replace(near, **{name: getattr(near, name)[:2] for name in ("landmark", "image_px", "east_north_m")})
-    ground = replace(found.grounded, marks=marks, fix=fix)
-    found = replace(found, grounded=ground, followed=replace(found.followed, adjustments=(moved,)))
+    ground = replace(found.locations, marks=marks, fix=fix)
+    found = replace(found, locations=ground, tracked=replace(found.tracked, adjustments=(moved,)))
     return json_lines(found, followed(42, 0, kind="person", rate=30.0), ABOUT, 0.0612)[0].decode()
 
 
@@ -132,24 +132,24 @@ def test_without_degrees_there_are_metres_only():
 def test_whatever_the_numbers_and_names_a_line_is_one_line_of_strict_json(values, start, cause, name):
     a, b, c, d, *rest = values
     found = surveyed(1)
-    assert found.grounded is not None
-    tracks = found.followed.tracks
+    assert found.locations is not None
+    tracks = found.tracked.tracks
     own = replace(
-        found.followed,
+        found.tracked,
         cause=cause,
         tracks=replace(tracks, box_px=np.array([[a, b, c, d]] * 2), score=np.array([a, b])),
         adjustments=(Adjustment(1, "track.gate", c, d, cause),),
     )
-    at = found.grounded.positions
+    at = found.locations.positions
     places = replace(
         at,
         east_north_m=np.array([rest[:2]]),
         covariance_m2=np.array(rest[2:6]).reshape(1, 2, 2),
         lonlat_deg=np.array([rest[6:8]]),
     )
-    ground = replace(found.grounded, positions=places, velocity_m_s=np.array([[a, d]]))
+    ground = replace(found.locations, positions=places, velocity_m_s=np.array([[a, d]]))
     fields = one(
-        replace(found, followed=own, grounded=ground), None, replace(ABOUT, start_utc_s=start, landmarks=(name,) * 4), b
+        replace(found, tracked=own, locations=ground), None, replace(ABOUT, start_utc_s=start, landmarks=(name,) * 4), b
     )
     assert fields["cause"] == cause
     assert fields["ground"]["landmarks"][0]["name"] == name

@@ -11,7 +11,7 @@ FRAME = surveyed(on_ground=False)
 
 
 def numbered(surveyed, people, age_s, most_bytes):
-    return [b"%d\n" % (surveyed or people).followed.number]
+    return [b"%d\n" % (surveyed or people).tracked.number]
 
 
 class Bench:
@@ -23,7 +23,7 @@ class Bench:
 
     def write(self, *numbers):
         for number in numbers:
-            self.stream.write(replace(FRAME, followed=replace(FRAME.followed, number=number)))
+            self.stream.write(replace(FRAME, tracked=replace(FRAME.tracked, number=number)))
 
 
 def test_what_a_full_disk_refused_is_written_when_there_is_room_again():
@@ -86,7 +86,7 @@ def test_closing_says_nothing_where_nothing_was_lost():
 
 def test_a_frame_that_cannot_be_told_is_an_event_and_the_next_one_goes_out():
     def of_odd_frames(surveyed, people, age_s, most_bytes):
-        if surveyed.followed.number % 2 == 0:
+        if surveyed.tracked.number % 2 == 0:
             raise ZeroDivisionError("division by zero")
         return numbered(surveyed, people, age_s, most_bytes)
 

@@ -29,8 +29,8 @@ def test_rows_that_need_several_datagrams_are_cut_between_lines():
 def test_a_box_without_end_is_no_row_and_a_frame_without_boxes_no_message():
     found = surveyed(1)
     boxes = np.array([[1e300, 0, 1, 1], [np.nan, 0, 1, 1]])
-    odd = replace(found.followed, tracks=replace(found.followed.tracks, box_px=boxes))
-    assert mot_rows(replace(found, followed=odd), None) == []
+    odd = replace(found.tracked, tracks=replace(found.tracked.tracks, box_px=boxes))
+    assert mot_rows(replace(found, tracked=odd), None) == []
 
 
 def walk(events, count=25, targets=3):
@@ -38,7 +38,7 @@ def walk(events, count=25, targets=3):
 
 
 def test_events_that_come_one_by_one_are_those_of_the_file():
-    frames = [surveyed(k + 1, 3).grounded for k in range(25)]
+    frames = [surveyed(k + 1, 3).locations for k in range(25)]
     kept = tracks([f.positions for f in frames if f is not None])
     still = replace(kept, velocity_m_s=np.tile((3.0, 4.0), (len(kept), 1)))
     assert walk(CotEvents(ABOUT)) == cot(still).splitlines(keepends=True)[2:-1]
@@ -59,18 +59,18 @@ def test_what_is_remembered_of_targets_does_not_grow_with_time():
     events = CotEvents(ABOUT)
     for k in range(1, 300):
         found = surveyed(k)
-        assert found.grounded is not None
-        at = replace(found.grounded.positions, target=np.array([k]))
-        events(replace(found, grounded=replace(found.grounded, positions=at)))
+        assert found.locations is not None
+        at = replace(found.locations.positions, target=np.array([k]))
+        events(replace(found, locations=replace(found.locations, positions=at)))
     assert len(events._sent_s) <= 10
 
 
 @pytest.mark.parametrize("lonlat", [(np.nan, 32.0), (np.inf, 32.0), (-110.0, 91.0), (1e300, 0.0)])
 def test_a_place_that_is_none_on_earth_is_no_event(lonlat):
     found = surveyed(1)
-    assert found.grounded is not None
-    at = replace(found.grounded.positions, lonlat_deg=np.array([lonlat]))
-    assert CotEvents(ABOUT)(replace(found, grounded=replace(found.grounded, positions=at))) == []
+    assert found.locations is not None
+    at = replace(found.locations.positions, lonlat_deg=np.array([lonlat]))
+    assert CotEvents(ABOUT)(replace(found, locations=replace(found.locations, positions=at))) == []
 
 
 def test_a_name_with_odd_characters_leaves_the_event_whole():

@@ -61,7 +61,7 @@ def path(broken=(), seen=None):
 
 
 def numbers(got):
-    return [surveyed.followed.number for surveyed, _ in got]
+    return [surveyed.tracked.number for surveyed, _ in got]
 
 
 def test_an_error_costs_its_frame_alone_and_is_told():
@@ -82,7 +82,7 @@ def test_after_an_error_no_frame_before_counts_as_missing():
 
 def test_identities_after_an_error_are_new_ones():
     got = list(results(path(broken=(4, 7)), feed_of(), Health()))
-    assert [surveyed.followed.tracks.identity.tolist() for surveyed, _ in got] == [[1]] * 3 + [[2]] * 2 + [[3]] * 3
+    assert [surveyed.tracked.tracks.identity.tolist() for surveyed, _ in got] == [[1]] * 3 + [[2]] * 2 + [[3]] * 3
     found = [people.tracks.identity.tolist() for _, people in got if people is not None]
     assert found == [[2]] * 3 + [[4]] * 2 + [[6]] * 3
 

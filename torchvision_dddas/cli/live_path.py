@@ -53,7 +53,7 @@ def path(
             engine, shedding.settings, None, watch, interval, seen=seen, retune=retune, pictures=False
         )
         for surveyed in pipeline(feed):
-            number = surveyed.followed.number
+            number = surveyed.tracked.number
             yield surveyed, None if people_tracker is None else people_tracker.people_of(number, feed.ended)
 
     return begin

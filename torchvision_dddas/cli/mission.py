@@ -111,9 +111,9 @@ def fly_into(
                     _noticed(output, mission)
                     scorer.feed(surveyed)
                     output.write(surveyed)
-                    for _ in range(surveyed.followed.number - done):
+                    for _ in range(surveyed.tracked.number - done):
                         tick()
-                    done = surveyed.followed.number
+                    done = surveyed.tracked.number
         finally:
             _noticed(output, mission)
             journal.problems += [str(problem) for problem in simulated.problems]

@@ -184,7 +184,7 @@ class Mission:
 
         step: how the background moved up to the frame.
         """
-        grounded = result.grounded
+        grounded = result.locations
         if grounded is None:
             return result
         seconds, locator = dict(grounded.seconds), self.watch.locator
@@ -206,7 +206,7 @@ class Mission:
             adjustments = (*adjustments, *made)
             seconds["steer"] = time.perf_counter() - start
         grounded = replace(grounded, adjustments=adjustments, seconds=seconds)
-        return replace(result, grounded=grounded, confirmed=confirmed, command=command)
+        return replace(result, locations=grounded, confirmed=confirmed, command=command)
 
     def _metres_per_px(self, time_s: float) -> float:
         """On level ground in the middle of the picture; NaN without telemetry."""

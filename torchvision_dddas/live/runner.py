@@ -98,11 +98,11 @@ class _Renumbering:
 
     def __call__(self, result: Result) -> Result:
         surveyed, people = result
-        followed, grounded = self._shifted(0, surveyed.followed), surveyed.grounded
-        if grounded is not None and self._before[0]:
-            places = grounded.positions
-            grounded = replace(grounded, positions=replace(places, target=places.target + self._before[0]))
-        surveyed = replace(surveyed, followed=followed, grounded=grounded)
+        tracked, locations = self._shifted(0, surveyed.tracked), surveyed.locations
+        if locations is not None and self._before[0]:
+            places = locations.positions
+            locations = replace(locations, positions=replace(places, target=places.target + self._before[0]))
+        surveyed = replace(surveyed, tracked=tracked, locations=locations)
         return surveyed, None if people is None else self._shifted(1, people)
 
     def restart(self) -> None:
@@ -150,24 +150,24 @@ def send_result(result: Result, streams: Iterable[Stream], health: Health) -> No
         try:
             stream.write(*result)
         except Exception as error:
-            number = result[0].followed.number
+            number = result[0].tracked.number
             health.event("sink", f"{stream.name}: left out, {type(error).__name__}: {error} ({_where(error)})", number)
 
 
 def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:
     """Record the latency of a result that was sent, and what it holds, in the health."""
     surveyed, people = result
-    now_s, frame = time.monotonic(), surveyed.followed.frame
+    now_s, frame = time.monotonic(), surveyed.tracked.frame
     if feed.newest is not None and isfinite(feed.newest.taken_s):
         latency_s = now_s - feed.newest.taken_s
         health.took("latency", latency_s)
         health.count("late", int(1000 * latency_s > deadline_ms))
     if frame is not None and isfinite(frame.taken_s):
         health.took("age", now_s - frame.taken_s)
-    health.gauge("targets", len(surveyed.followed.tracks))
+    health.gauge("targets", len(surveyed.tracked.tracks))
     if people is not None:
         health.gauge("people", len(people.tracks))
-    health.count("unreliable", int(bool(surveyed.followed.cause)))
+    health.count("unreliable", int(bool(surveyed.tracked.cause)))
     health.result()
 
 

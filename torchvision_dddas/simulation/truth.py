@@ -197,7 +197,7 @@ class SimulatedRunRecorder(PipelineRecorder):
         """Write a frame and the truth until then. Raises InputError if the disk refuses."""
         with uninterrupted():
             super().write(item)
-            self._write_truth(item.followed.number)
+            self._write_truth(item.tracked.number)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place; without `truth` in save, that of an earlier run is removed."""

@@ -368,7 +368,7 @@ def _along(clip: Clip, settings: Settings, backend: str) -> Iterator[tuple[Aeria
     assert ready.watch is not None, "there are landmarks"
     pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, pictures=False)
     for surveyed in pipeline(source):
-        grounded = surveyed.grounded
+        grounded = surveyed.locations
         if grounded is not None:
             count = len(grounded.box_px)
             none = np.zeros(count, bool)

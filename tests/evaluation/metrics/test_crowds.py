@@ -236,7 +236,7 @@ def test_a_blob_over_two_crowds_carries_one_identity_and_the_others_returns():
     close = [(-0.4, 0), (-0.4, 0.8)], [(0.4, 0), (0.4, 0.8)]
     crossing = world((1, "person", close[0]), (2, "person", close[1]), frame=2)
     blob = found((7, box(*close[0], *close[1]), (0, 0.4)), frame=2)
-    after = world(*TWO, frame=3), replace(apart, followed=replace(apart.followed, number=3))
+    after = world(*TWO, frame=3), replace(apart, tracked=replace(apart.tracked, number=3))
     score = scored((world(*TWO), apart), (crossing, blob), after)
     assert (score.switches, score.recall) == (0, 1)
 
@@ -279,10 +279,10 @@ def test_frames_without_truth_are_left_out_and_a_run_without_any_has_no_figures(
 
 def test_places_told_in_degrees_are_taken_to_the_truths_metres():
     told = found((7, box(*WEST), (0, 0)))
-    positions = replace(told.grounded.positions, lonlat_deg=np.array([[1.0, 2.0]]))
+    positions = replace(told.locations.positions, lonlat_deg=np.array([[1.0, 2.0]]))
     scorer = CrowdScorer(local=lambda degrees: degrees + MIDDLE - (1.0, 2.0))
     scorer.feed(world((1, "person", WEST)))
-    scorer.feed(replace(told, grounded=replace(told.grounded, positions=positions)))
+    scorer.feed(replace(told, locations=replace(told.locations, positions=positions)))
     assert scorer.score().crowd_error_m.mean == pytest.approx(0)
 
 

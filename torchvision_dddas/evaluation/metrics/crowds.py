@@ -177,11 +177,11 @@ class CrowdScorer:
         if not isinstance(item, FrameResult):
             self._waiting[item.frame] = shown(item) if isinstance(item, Truth) else item
             return
-        number = item.followed.number
+        number = item.tracked.number
         truth = self._waiting.get(number)
         for old in [frame for frame in self._waiting if frame <= number]:
             del self._waiting[old]
-        frame = item.followed.frame
+        frame = item.tracked.frame
         if truth is not None and (frame is None or frame.image.any()):
             self._judge(truth, told_of(item, self._local))
 
@@ -319,12 +319,12 @@ class CrowdScorer:
 
 def told_of(surveyed: FrameResult, local: Callable[[np.ndarray], np.ndarray] | None = None) -> Told:
     """What a run says of a frame: its targets that were seen, located or not. local: as in CrowdScorer."""
-    tracks = surveyed.followed.tracks
+    tracks = surveyed.tracked.tracks
     seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is where nothing was found
     count = len(seen)
     place, velocity = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
     covariance, kind = np.full((count, 2, 2), np.nan), ["unseen"] * count
-    grounded = surveyed.grounded
+    grounded = surveyed.locations
     if grounded is not None:
         positions, row = grounded.positions, grounded.row
         told = positions.east_north_m
@@ -334,7 +334,7 @@ def told_of(surveyed: FrameResult, local: Callable[[np.ndarray], np.ndarray] | N
             for which, what in zip(row[surveyed.confirmed.row].tolist(), surveyed.confirmed.kind, strict=True):
                 kind[which] = what
     boxes = np.asarray(tracks.box_px, float).reshape(-1, 4)[seen]
-    blobs = np.asarray(surveyed.followed.detections.box_px, float).reshape(-1, 4)
+    blobs = np.asarray(surveyed.tracked.detections.box_px, float).reshape(-1, 4)
     return Told(boxes, tracks.identity[seen], place, covariance, velocity, tuple(kind), blobs)
 
 

@@ -329,11 +329,11 @@ def _locate_along(job: _Job, files: AerialInput) -> Rows:
         ready.engine, ready.settings, ready.flight, ready.watch, job.interval, pictures=False
     )
     for result in pipeline(source):
-        tracks, located = result.followed.tracks, result.grounded
+        tracks, located = result.tracked.tracks, result.locations
         seen = tracks.row >= 0
         columns = {"box_px": tracks.box_px[seen], "identity": tracks.identity[seen], "score": tracks.score[seen]}
-        seconds = result.followed.seconds if located is None else located.seconds
-        rows.add(result.followed.number, seconds, **_with_places(columns, located))
+        seconds = result.tracked.seconds if located is None else located.seconds
+        rows.add(result.tracked.number, seconds, **_with_places(columns, located))
         job.tick()
     rows.notes += [*ready.notes, *map(str, source.problems)]
     return rows

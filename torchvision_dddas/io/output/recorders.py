@@ -225,15 +225,15 @@ def _aerial_record(folder: Path, facts: Mapping[str, Any], site: Site, save: Seq
 
 
 def _followed(result: FrameResult) -> TrackedFrame:
-    return result.followed
+    return result.tracked
 
 
 def _grounded(result: FrameResult) -> AerialLocations:
-    assert result.grounded is not None
-    return result.grounded
+    assert result.locations is not None
+    return result.locations
 
 
 def _scene(result: FrameResult) -> Scene:
     """The part of a scene that tables of detections need."""
-    assert result.followed.frame is not None
-    return Scene(result.followed.frame, np.zeros((0, 0), np.uint16), result.followed.detections, 1)
+    assert result.tracked.frame is not None
+    return Scene(result.tracked.frame, np.zeros((0, 0), np.uint16), result.tracked.detections, 1)

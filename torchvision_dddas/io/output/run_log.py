@@ -146,7 +146,7 @@ class CommandLog:
 
     def add(self, surveyed: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
         """Log the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
-        command, frame = surveyed.command, surveyed.followed.number
+        command, frame = surveyed.command, surveyed.tracked.number
         if command is None:
             return
         scale = command_metres(surveyed)

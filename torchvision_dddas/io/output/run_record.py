@@ -353,7 +353,7 @@ class IdentityCounts:
 
     def write(self, result: FrameResult) -> None:
         """Count a frame."""
-        followed = result.followed
+        followed = result.tracked
         self._identities = int(followed.tracks.identity.max(initial=self._identities))
         self._bridges += int((followed.tracks.row < 0).sum())
         self._untracked += len(followed.untracked)

@@ -76,7 +76,7 @@ class RunStory:
 
     def write(self, result: FrameResult) -> None:
         """Add a frame."""
-        followed, grounded = result.followed, result.grounded
+        followed, grounded = result.tracked, result.locations
         number, source = followed.number, followed if grounded is None else grounded
         self._timeline.add(result, source.seconds, source.adjustments)
         for moved in source.adjustments:
@@ -158,7 +158,7 @@ class RunStory:
 
     def _log_location(self, result: FrameResult) -> None:
         """Log how the picture was located, and the landmarks that it does not show."""
-        grounded = result.grounded
+        grounded = result.locations
         if grounded is None:
             return
         frame, fix, marks = grounded.frame, grounded.fix, grounded.marks
@@ -175,7 +175,7 @@ class RunStory:
 
     def _log_confirmations(self, result: FrameResult) -> None:
         """Log what ground vehicles say of targets, where it is new."""
-        confirmed, grounded = result.confirmed, result.grounded
+        confirmed, grounded = result.confirmed, result.locations
         if confirmed is None or grounded is None:
             return
         at, marks = grounded.positions, grounded.marks
@@ -200,7 +200,7 @@ class RunStory:
 
     def _add_picture(self, result: FrameResult, time_s: float, pictures: RunPictures) -> None:
         pictures.show(result)
-        number = result.followed.number
+        number = result.tracked.number
         self._waiting += self.log.entries[self._read :]
         self._read = len(self.log.entries)
         due = [e for e in self._waiting if self._before < e.first <= number and e.kind != MARK]

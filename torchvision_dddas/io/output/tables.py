@@ -144,7 +144,7 @@ def landmark_table(folder: Path, names: Sequence[str], has_degrees: bool) -> Tab
     )
 
     def rows(result: FrameResult) -> Rows:
-        grounded = result.grounded
+        grounded = result.locations
         if grounded is None:
             return dict.fromkeys(schema.names, ())
         marks, fix = grounded.marks, grounded.fix
@@ -188,7 +188,7 @@ class ConfirmedPositions(TableFiles[FrameResult]):
 
     def write(self, item: FrameResult) -> None:
         """Add the targets of a frame."""
-        if item.confirmed is not None and item.grounded is not None:
+        if item.confirmed is not None and item.locations is not None:
             self._is_written = True
             super().write(item)
 
@@ -303,8 +303,8 @@ def _aerial_rows(grounded: AerialLocations) -> Rows:
 
 def _confirmed_position_rows(result: FrameResult) -> Rows:
     assert result.confirmed is not None
-    assert result.grounded is not None
-    own = _position_rows(result.grounded.positions)
+    assert result.locations is not None
+    own = _position_rows(result.locations.positions)
     rows = result.confirmed.row
     return {
         **{name: values if values is None else np.asarray(values)[rows] for name, values in own.items()},

@@ -113,7 +113,7 @@ class RunTimeline(Timeline):
 
     def add(self, surveyed: FrameResult, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
         """Add a frame, the time spent on it, and what was adjusted."""
-        followed, grounded = surveyed.followed, surveyed.grounded
+        followed, grounded = surveyed.tracked, surveyed.locations
         time_s = math.nan if followed.frame is None else followed.frame.time_s
         for stage in seconds:
             if stage not in self._seconds:

@@ -197,7 +197,7 @@ class RunPictures:
         if surveyed is self._shown:
             return
         if self._shown is not None and self._picture is None:
-            self._tracks.skip(self._shown.followed)
+            self._tracks.skip(self._shown.tracked)
         self._shown, self._picture = surveyed, None
 
     def __call__(self, surveyed: FrameResult) -> np.ndarray:
@@ -208,12 +208,12 @@ class RunPictures:
         return self._picture
 
     def _draw(self, surveyed: FrameResult) -> np.ndarray:
-        grounded, command = surveyed.grounded, surveyed.command
+        grounded, command = surveyed.locations, surveyed.command
         commanded = "" if command is None else summarize_command(command)
         lines = [(commanded, TEXT)] if commanded else []
         if grounded is None:
-            return self._tracks(surveyed.followed, lines)
-        picture = self._tracks(surveyed.followed, [_location_line(grounded), *lines], _letters(surveyed))
+            return self._tracks(surveyed.tracked, lines)
+        picture = self._tracks(surveyed.tracked, [_location_line(grounded), *lines], _letters(surveyed))
         state = dict(zip(grounded.fix.landmark.tolist(), grounded.fix.state, strict=True))
         arm = 6 * line_width(picture)
         for which, place in zip(grounded.marks.landmark.tolist(), grounded.marks.image_px, strict=True):
@@ -231,7 +231,7 @@ class RunPictures:
 
     def _draw_orders(self, picture: np.ndarray, surveyed: FrameResult) -> None:
         """Draw an arrow from each vehicle towards its goal, at most a tenth of the picture long."""
-        grounded, command, scale = surveyed.grounded, surveyed.command, command_metres(surveyed)
+        grounded, command, scale = surveyed.locations, surveyed.command, command_metres(surveyed)
         if grounded is None or command is None or scale is None or not command.orders:
             return
         turned = pixels_per_metre(grounded)
@@ -254,7 +254,7 @@ class RunPictures:
 
 def _letters(surveyed: FrameResult) -> dict[int, str]:
     """The letter of each identity that ground vehicles were asked about."""
-    confirmed, grounded = surveyed.confirmed, surveyed.grounded
+    confirmed, grounded = surveyed.confirmed, surveyed.locations
     if confirmed is None or grounded is None:
         return {}
     targets = grounded.positions.target[confirmed.row].tolist()
@@ -284,7 +284,7 @@ def command_metres(surveyed: FrameResult) -> ToMetres | None:
 
     Commands are in degrees where landmarks have degrees, else in local metres. The scale follows from the landmarks.
     """
-    grounded, degrees = surveyed.grounded, surveyed.mark_lonlat_deg
+    grounded, degrees = surveyed.locations, surveyed.mark_lonlat_deg
     if grounded is None:
         return None
     if degrees is None:

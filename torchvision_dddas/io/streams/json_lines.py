@@ -29,7 +29,7 @@ def json_lines(
     A line of one target that is still longer is left as it is.
     Numbers that are not finite are null: NaN is no JSON.
     """
-    apart = surveyed is not None and people is not None and surveyed.followed.number != people.number
+    apart = surveyed is not None and people is not None and surveyed.tracked.number != people.number
     frames = [(surveyed, None), (None, people)] if apart else [(surveyed, people)]
     lines = []
     for of, seen in frames:
@@ -40,9 +40,9 @@ def json_lines(
 
 
 def _frame(surveyed: FrameResult | None, people: TrackedFrame | None, about: About, age_s: float) -> dict[str, Any]:
-    followed = surveyed.followed if surveyed is not None else people
+    followed = surveyed.tracked if surveyed is not None else people
     assert followed is not None
-    grounded = surveyed.grounded if surveyed is not None else None
+    grounded = surveyed.locations if surveyed is not None else None
     time_s = math.nan
     if followed.frame is not None:
         time_s = followed.frame.time_s
@@ -63,8 +63,8 @@ def _frame(surveyed: FrameResult | None, people: TrackedFrame | None, about: Abo
 
 
 def _targets(surveyed: FrameResult) -> list[dict[str, Any]]:
-    targets = list(_boxes(surveyed.followed))
-    places = {} if surveyed.grounded is None else _places(surveyed)
+    targets = list(_boxes(surveyed.tracked))
+    places = {} if surveyed.locations is None else _places(surveyed)
     for target in targets:
         target |= places.get(target["id"], {})
     return targets
@@ -93,7 +93,7 @@ def _boxes(followed: TrackedFrame) -> Iterator[dict[str, Any]]:
 
 def _places(surveyed: FrameResult) -> dict[int, dict[str, Any]]:
     """Where the targets stand, and what ground vehicles say of them, by identity."""
-    grounded, confirmed = surveyed.grounded, surveyed.confirmed
+    grounded, confirmed = surveyed.locations, surveyed.confirmed
     assert grounded is not None
     at = grounded.positions
     places = {}

@@ -110,7 +110,7 @@ class Stream:
 
     def write(self, surveyed: FrameResult | None, people: TrackedFrame | None = None) -> None:
         """Send a frame: its targets, and the people seen in it; None: not told, or not searched for. Never raises."""
-        followed = surveyed.followed if surveyed is not None else people
+        followed = surveyed.tracked if surveyed is not None else people
         if followed is None:
             return
         age_s = float("nan") if followed.frame is None else self._clock() - followed.frame.taken_s

@@ -25,7 +25,7 @@ def mot_rows(surveyed: FrameResult | None, people: TrackedFrame | None, most_byt
 
     One message a frame, or where that is longer than most_bytes several of whole lines. A box without end is no row.
     """
-    text = "" if surveyed is None else MOT_TRACKS.format_rows(track_rows(_with_identity(surveyed.followed, 0)))
+    text = "" if surveyed is None else MOT_TRACKS.format_rows(track_rows(_with_identity(surveyed.tracked, 0)))
     text += "" if people is None else MOT_TRACKS.format_rows(track_rows(_with_identity(people, PEOPLE_FROM)))
     messages = [b""]
     for line in text.encode("ascii").splitlines(keepends=True):
@@ -58,7 +58,7 @@ class CotEvents:
 
     def __call__(self, surveyed: FrameResult | None) -> list[bytes]:
         """The events of a frame, a message with its line end each; none for places without longitude and latitude."""
-        grounded = None if surveyed is None else surveyed.grounded
+        grounded = None if surveyed is None else surveyed.locations
         degrees = None if grounded is None else grounded.positions.lonlat_deg
         if grounded is None or degrees is None or utc(self._utc(grounded.time_s)) is None:
             return []
