@@ -76,7 +76,7 @@ def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(st
     def none(*_, **__):
         raise AssertionError("something was computed again")
 
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.workers.work", none)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.workers.do_job", none)
     out = study.parent / "again"
     assert asked(study, *GRID, "--holdout", "h*", "--out", str(out), "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):

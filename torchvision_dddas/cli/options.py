@@ -24,7 +24,9 @@ Overrides = Annotated[
 EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")]
 Clips = Annotated[str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")]
-Jobs = Annotated[int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one a core]")]
+Jobs = Annotated[
+    int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")
+]
 CacheFolder = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
 ]

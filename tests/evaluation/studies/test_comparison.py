@@ -104,8 +104,8 @@ def test_another_truth_or_other_frames_are_not_compared(tmp_path):
 
 def test_less_is_better_where_it_is(tmp_path):
     entry = {"change": -0.1, "over_frames": {"p_holm": 0.01, "enough": True}}
-    assert comparison._says(entry, "log_average_miss_rate") == "better"
-    assert comparison._says(entry, "f") == "worse"
+    assert comparison._verdict(entry, "log_average_miss_rate") == "better"
+    assert comparison._verdict(entry, "f") == "worse"
 
 
 def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):

@@ -10,7 +10,7 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
-from torchvision_dddas.evaluation.studies.jobs import FrameCounter, Job, kept, make_keys, work
+from torchvision_dddas.evaluation.studies.jobs import FrameCounter, Job, do_job, find_cached, make_keys
 from torchvision_dddas.evaluation.studies.spec import Source, Task
 from torchvision_dddas.evaluation.studies.storage import Cache
 
@@ -33,7 +33,7 @@ def job_of(place, *overrides, interval=1):
 
 
 def do(place, job, cache=None):
-    return work(job, make_keys(job, FileDigests()), cache or Cache(place / "cache"))
+    return do_job(job, make_keys(job, FileDigests()), cache or Cache(place / "cache"))
 
 
 def computed(place, job):
@@ -92,9 +92,9 @@ def test_other_code_is_another_key(folder, monkeypatch) -> None:
 def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
     cache, job = Cache(folder / "cache"), job_of(folder)
     keys = make_keys(job, FileDigests())
-    assert kept(job, keys, cache) == do(folder, job)
+    assert find_cached(job, keys, cache) == do(folder, job)
     cache.path(keys.found["tracking"]).write_bytes(b"damaged")
-    assert kept(job, keys, cache) is None
+    assert find_cached(job, keys, cache) is None
     assert [stage for d in do(folder, job, cache) for stage in d.computed] == ["tracking"]
     assert len(cache.notes) == 1 and "computed again" in cache.notes[0]
 

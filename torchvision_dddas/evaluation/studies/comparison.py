@@ -25,7 +25,7 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "location": ("located",),
     METRES: ("median_m", "in_ellipse", "relative_median_m", "relative_in_ellipse"),
 }
-"""The measures that are asked about, the first of each group for single clips too."""
+"""The measures that are compared, the first of each group for single clips too."""
 
 LEVEL = 0.05
 
@@ -38,9 +38,9 @@ def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
     {"first", "second": names, "tasks": {task: {"same": clips whose counts are alike to the last digit, "pooled":
     {group: {measure: {"first", "second", "change", "over_clips", "over_frames", "says"}}}, "clips": {name: {group:
     {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames,
-    {"interval", "p", "p_holm", "enough"} or None, speak of other clips like these, and of other frames of these very
-    clips. p_holm is corrected for all that is asked of a task's pooled figures, or of all its clips. Not enough: so few
-    clips or blocks of frames could not make it small, whatever changed. Raises InputError where no task has a clip in
+    {"interval", "p", "p_holm", "enough"} or None, hold for other clips like these, and for other frames of the same
+    clips. p_holm is corrected for all tests of a task's pooled figures, or of all its clips. Not enough: so few clips
+    or blocks of frames could not make it small, whatever changed. Raises InputError where no task has a clip in
     both.
     """
     by_key = [{(case.task, case.clip): case.scored for case in study.cases} for study in (first, second)]
@@ -83,7 +83,7 @@ def _task(pairs: Pairs) -> dict[str, Any]:
     for entries in (pooled, *clips.values()):
         for group in entries:
             for name, entry in entries[group].items():
-                entry["says"] = _says(entry, name)
+                entry["says"] = _verdict(entry, name)
     return {"same": same, "pooled": pooled, "clips": clips}
 
 
@@ -111,18 +111,15 @@ def _entries(
             entry: dict[str, Any] = {"first": before[group][name], "second": after[group][name], "change": change}
             for way, effects in ways.items():
                 effect = effects.get(group, {}).get(name)
-                entry[way] = None if effect is None or math.isnan(effect.p) else _told(effect)
+                entry[way] = None if effect is None or math.isnan(effect.p) else _describe(effect)
             if not (math.isnan(before[group][name]) and math.isnan(after[group][name])):
                 found.setdefault(group, {})[name] = entry
     return found
 
 
-def _told(effect: Effect) -> dict[str, Any]:
-    return {
-        "interval": None if effect.interval is None else list(effect.interval),
-        "p": effect.p,
-        "least": effect.least,
-    }
+def _describe(effect: Effect) -> dict[str, Any]:
+    interval = None if effect.interval is None else list(effect.interval)
+    return {"interval": interval, "p": effect.p, "least": effect.least}
 
 
 def _over_clips(first: Sequence[Scored], second: Sequence[Scored]) -> dict[str, dict[str, Effect]]:
@@ -152,15 +149,15 @@ def _paired_strata(estimate: Estimate) -> tuple[Stratum, ...]:
 
 
 def _correct(entries: Sequence[dict[str, Any]], way: str) -> None:
-    """Add p_holm to all that are asked together, and whether it could be below LEVEL at all."""
-    told = [entry[way] for entry in entries if entry.get(way) is not None]
-    adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(told)})
-    for i, one in enumerate(told):
+    """Add p_holm to all entries that are tested together, and whether it could be below LEVEL at all."""
+    effects = [entry[way] for entry in entries if entry.get(way) is not None]
+    adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(effects)})
+    for i, one in enumerate(effects):
         one["p_holm"] = adjusted[str(i)]
-        one["enough"] = one.pop("least") * len(told) < LEVEL
+        one["enough"] = one.pop("least") * len(effects) < LEVEL
 
 
-def _says(entry: Mapping[str, Any], name: str) -> str:
+def _verdict(entry: Mapping[str, Any], name: str) -> str:
     change = entry["change"]
     if not change:
         return "the same"

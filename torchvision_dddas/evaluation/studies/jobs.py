@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import (
     PARAMETER_GROUPS,
     STAGES,
-    Tick,
+    OnFrame,
     allowed_tasks,
     files_of,
     find,
@@ -26,7 +26,7 @@ from torchvision_dddas.evaluation.studies.stages import (
 )
 from torchvision_dddas.evaluation.studies.storage import Cache, Store, digest
 
-_TELL_S = 0.25
+_REPORT_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -75,26 +75,26 @@ class Event:
     note: str = ""
 
 
-Tell = Callable[[Event], object]
+OnEvent = Callable[[Event], object]
 
 
 class FrameCounter:
-    """Called once per frame; tells the number of new frames a few times a second, and the rest by `flush`."""
+    """Called once per frame; reports the number of new frames a few times a second, and the rest by `flush`."""
 
-    def __init__(self, tell: Callable[[int], object]) -> None:
-        self._tell, self._count, self._told = tell, 0, time.monotonic()
+    def __init__(self, report: Callable[[int], object]) -> None:
+        self._report, self._count, self._reported_s = report, 0, time.monotonic()
 
     def __call__(self) -> None:
         """Count another frame."""
         self._count += 1
-        if time.monotonic() - self._told >= _TELL_S:
+        if time.monotonic() - self._reported_s >= _REPORT_S:
             self.flush()
 
     def flush(self) -> None:
-        """Tell the rest."""
+        """Report the rest."""
         if self._count:
-            self._tell(self._count)
-        self._count, self._told = 0, time.monotonic()
+            self._report(self._count)
+        self._count, self._reported_s = 0, time.monotonic()
 
 
 def make_keys(job: Job, files: FileDigests) -> Keys:
@@ -116,7 +116,7 @@ def code_identity(backend: str) -> str:
     return digest(code_digest(score), *(code_digest(stage, backend) for stage in STAGES.values()))
 
 
-def kept(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
+def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
     """The outcome of a job if all of it is in the cache, else None."""
     if any(task not in keys.scored for task in job.tasks):
         return None
@@ -124,19 +124,19 @@ def kept(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
     return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
-def work(job: Job, keys: Keys, store: Store, tick: Tick = lambda: None) -> tuple[Done, ...]:
-    """Do a job. Bad input of one task does not stop the others. tick: called once per frame."""
-    return tuple(_do_task(job, task, keys, store, tick) for task in job.tasks)
+def do_job(job: Job, keys: Keys, store: Store, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
+    """Do all tasks of a job. Bad input of one does not stop the others. on_frame: called once per frame."""
+    return tuple(_do_task(job, task, keys, store, on_frame) for task in job.tasks)
 
 
-def _do_task(job: Job, task: Task, keys: Keys, store: Store, tick: Tick) -> Done:
+def _do_task(job: Job, task: Task, keys: Keys, store: Store, on_frame: OnFrame) -> Done:
     computed: list[str] = []
     try:
         if task not in allowed_tasks(job.clip):
             raise InputError(f"its pictures and truth do not allow {task}")
         if task in keys.causes:
             raise InputError(keys.causes[task])
-        found = _find_or_take(job, task, keys, store, tick, computed)
+        found = _find(job, task, keys, store, on_frame, computed)
         if store.get(keys.scored[task]) is None:
             store.put(keys.scored[task], score(job.clip, task, found, job.interval))
             computed.append(f"{task}: score")
@@ -148,13 +148,13 @@ def _do_task(job: Job, task: Task, keys: Keys, store: Store, tick: Tick) -> Done
     return Done(task, keys.found[task], keys.scored[task], computed=tuple(computed))
 
 
-def _find_or_take(job: Job, task: Task, keys: Keys, store: Store, tick: Tick, computed: list[str]) -> Found:
+def _find(job: Job, task: Task, keys: Keys, store: Store, on_frame: OnFrame, computed: list[str]) -> Found:
     known: Found | None = store.get(keys.found[task])
     if known is not None:
         return known
     need = upstream_task(job.clip, task)
-    before = None if need is None else _find_or_take(job, need, keys, store, lambda: None, computed)
-    found = find(job.clip, task, job.settings, job.backend, job.interval, before, tick)
+    before = None if need is None else _find(job, need, keys, store, lambda: None, computed)
+    found = find(job.clip, task, job.settings, job.backend, job.interval, before, on_frame)
     store.put(keys.found[task], found)
     computed.append(task)
     return found

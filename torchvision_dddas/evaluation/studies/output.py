@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchvision_dddas.evaluation.report import study_report
-from torchvision_dddas.evaluation.studies.jobs import Tell
+from torchvision_dddas.evaluation.studies.jobs import OnEvent
 from torchvision_dddas.evaluation.studies.results import Results, ScoredCase
 from torchvision_dddas.evaluation.studies.runner import Plan, cache_folder, run_study
 from torchvision_dddas.evaluation.studies.spec import Spec
@@ -57,27 +57,27 @@ def write_study(
     workers: Workers | None = None,
     cache: Path | None = None,
     clips: Sequence[str] = (),
-    tell: Tell = lambda event: None,
-    begun: Callable[[Plan], object] = lambda planned: None,
+    on_event: OnEvent = lambda event: None,
+    on_start: Callable[[Plan], object] = lambda planned: None,
 ) -> tuple[Results, dict[str, Any]]:
     """Run a study as `run_study` does and write FILES into a folder; its results and its measures.
 
     run.json says whether the study is running, complete or interrupted. Raises InputError as `run_study` does, and if
     the disk refuses; bad input leaves the files of an earlier study in the folder as they were.
     """
-    began, place = time.perf_counter(), cache or cache_folder()
+    start_s, place = time.perf_counter(), cache or cache_folder()
     has_begun = False
 
     def begin(planned: Plan) -> None:
         nonlocal has_begun
         _write_json(folder / "run.json", {"state": "running", "study": spec.name})
         has_begun = True
-        begun(planned)
+        on_start(planned)
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            results = run_study(spec, base, workers, place, clips, tell, begin)
+            results = run_study(spec, base, workers, place, clips, on_event, begin)
             measures = summarize(results)
             _write_json(folder / "metrics.json", measures)
             write_csv(folder / "metrics.csv", measures)
@@ -85,7 +85,7 @@ def write_study(
             scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
             write_scores(folder, spec.name, scored)
             write_whole(folder / "report.html", study_report(finite(measures), results).encode())
-            _write_json(folder / "run.json", _record(results, time.perf_counter() - began, place))
+            _write_json(folder / "run.json", _record(results, time.perf_counter() - start_s, place))
         except BaseException:
             if has_begun:
                 with suppress(OSError):
@@ -162,7 +162,7 @@ def _write_json(path: Path, content: Any) -> None:
 
 
 def _record(results: Results, wall_s: float, cache: Path) -> dict[str, Any]:
-    """What run.json says of a study that is complete."""
+    """The content of run.json of a complete study."""
     spec = results.spec
     return {
         "state": "complete",

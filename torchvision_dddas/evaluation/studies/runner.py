@@ -13,7 +13,16 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
-from torchvision_dddas.evaluation.studies.jobs import Done, Event, Job, Keys, Tell, code_identity, kept, make_keys
+from torchvision_dddas.evaluation.studies.jobs import (
+    Done,
+    Event,
+    Job,
+    Keys,
+    OnEvent,
+    code_identity,
+    find_cached,
+    make_keys,
+)
 from torchvision_dddas.evaluation.studies.results import Case, Results
 from torchvision_dddas.evaluation.studies.spec import TASKS, Spec, Task
 from torchvision_dddas.evaluation.studies.stages import allowed_tasks
@@ -22,7 +31,7 @@ from torchvision_dddas.evaluation.studies.workers import Workers
 
 
 def cache_folder() -> Path:
-    """Where results are kept unless another folder is named."""
+    """The default folder of cached results."""
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "torchvision_dddas" / "studies"
 
@@ -49,26 +58,26 @@ def run_study(
     workers: Workers | None = None,
     cache: Path | None = None,
     clips: Sequence[str] = (),
-    tell: Tell = lambda event: None,
-    begun: Callable[[Plan], object] = lambda planned: None,
+    on_event: OnEvent = lambda event: None,
+    on_start: Callable[[Plan], object] = lambda planned: None,
 ) -> Results:
     """Run a study.
 
     base: what its folders are relative to. workers: by default this process alone. cache: the folder of results.
-    clips: patterns of names, none for all. begun: is given the plan before the first job. The results depend on none of
-    these but the clips. Raises InputError as `plan_study` does, and if the workers cannot do the jobs.
+    clips: patterns of names, none for all. on_start: called with the plan before the first job. The results depend on
+    none of these but the clips. Raises InputError as `plan_study` does, and if the workers cannot do the jobs.
     """
     planned = plan_study(spec, base, clips)
     store = Cache(cache or cache_folder())
     notes = list(planned.notes)
 
-    def tell_and_note(event: Event) -> None:
+    def collect_note(event: Event) -> None:
         if event.note:
             notes.append(event.note)
-        tell(event)
+        on_event(event)
 
-    begun(planned)
-    outcomes = run_jobs(planned.jobs, workers or Workers(1), store, tell_and_note)
+    on_start(planned)
+    outcomes = run_jobs(planned.jobs, workers or Workers(1), store, collect_note)
     cases: list[Case] = []
     left_out = list(planned.left_out)
     faults, computed = [], 0
@@ -93,26 +102,26 @@ def run_study(
 
 
 def run_jobs(
-    jobs: Sequence[Job], workers: Workers, cache: Cache, tell: Tell = lambda event: None
+    jobs: Sequence[Job], workers: Workers, cache: Cache, on_event: OnEvent = lambda event: None
 ) -> dict[int, tuple[Done, ...]]:
     """Do jobs, the longest first; their outcomes by number. What is in the cache needs no worker."""
     outcomes: dict[int, tuple[Done, ...]] = {}
 
-    def take_note(event: Event) -> None:
+    def collect_outcome(event: Event) -> None:
         if event.done is not None:
             outcomes[event.job.number] = event.done
-        tell(event)
+        on_event(event)
 
-    def missing() -> Iterator[tuple[Job, Keys]]:
+    def list_missing() -> Iterator[tuple[Job, Keys]]:
         files = FileDigests(cache.folder / "files")
         for job in sorted(jobs, key=lambda job: (-_length(job.clip) * len(job.tasks), job.number)):
             keys = make_keys(job, files)
-            if (done := kept(job, keys, cache)) is not None:
-                take_note(Event(job, done))
+            if (done := find_cached(job, keys, cache)) is not None:
+                collect_outcome(Event(job, done))
             else:
                 yield job, keys
 
-    workers.run(missing(), cache, take_note)
+    workers.run(list_missing(), cache, collect_outcome)
     return outcomes
 
 
@@ -163,8 +172,8 @@ def _why_no_task(spec: Spec, clip: Clip, allowed: Sequence[Task]) -> str:
 def _why_no_clip(patterns: Sequence[str], names: Sequence[str], left_out: Sequence[str]) -> str:
     if patterns and names and not any(fnmatchcase(name, pattern) for name in names for pattern in patterns):
         more = f" and {len(names) - 9} more" if len(names) > 10 else ""
-        shown = ", ".join(names[:9] if more else names)
-        return f": {' and '.join(patterns)} {'fits' if len(patterns) == 1 else 'fit'} none; there are {shown}{more}"
+        listed = ", ".join(names[:9] if more else names)
+        return f": {' and '.join(patterns)} {'fits' if len(patterns) == 1 else 'fit'} none; there are {listed}{more}"
     more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
     return f": {left_out[0]}{more}" if left_out else ""
 

@@ -24,7 +24,7 @@ from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.images import decode_image
 
 _NOBODY, _NOT_ASKED = -1, -2
-"""In place of a row: a place that is nobody's; one of a target that does not count."""
+"""In place of a row: a place that belongs to no target; one of a target that does not count."""
 
 
 def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
@@ -42,7 +42,7 @@ def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
     followed = task in ("tracking", "association")
     truth = judged = clip.truth
     if followed and truth.kind == "masks":
-        # A simulated clip has both: masks tell pixels, boxes tell identities, but of the ground vehicles.
+        # A simulated clip has both masks and boxes; only its boxes have identities, but for the ground vehicles'.
         vehicles = _fleet(truth)
         truth = replace(truth, kind="boxes")
         judged = replace(truth, ignored=vehicles, regions=vehicles, ignoring="removed")
@@ -112,7 +112,7 @@ def _fleet(truth: Truth) -> TrackTable:
 
 
 def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N,) bool: boxes more than half of whose pixels nobody labelled, in masks that say so."""
+    """(N,) bool: boxes of which more than half the pixels are marked as unlabelled in the masks."""
     out = np.zeros(len(frame), bool)
     if truth.kind != "masks" or not truth.labels.unscored:
         return out
@@ -152,13 +152,13 @@ def _beside(each: dict[str, Each], whole: np.ndarray) -> tuple[np.ndarray, dict[
 
 
 def score_places(clip: Clip, found: Found) -> Scored:
-    """Score the places of a clip in frames that were looked at.
+    """Score the places of a clip in frames that were processed.
 
     A place is that of the target whose true box its box is; without boxes, that of the target nearest to it. Degrees
     are compared where both sides have them, for each may count its metres from an origin of its own. The error
     relative to the team is what is left without the mean error of the landmarks' own reports, where the truth knows
     where they were.
-    Raises InputError where the truth has no places, or none of a frame that was looked at.
+    Raises InputError where the truth has no places, or none of a processed frame.
     """
     truth = clip.truth
     if truth is None or truth.positions is None:
@@ -168,16 +168,18 @@ def score_places(clip: Clip, found: Found) -> Scored:
     place_m = found.east_north_m if origin is None else geometry.east_north(found.more["lonlat_deg"], origin)
     seen = np.isin(truth.positions.frame, found.looked)
     if not seen.any():
-        raise InputError(f"{clip.name}: no frame that was looked at has a true place")
+        raise InputError(f"{clip.name}: no processed frame has a true place")
     rows = np.flatnonzero(np.isfinite(place_m).all(axis=1))
     frame, box_px, notes = found.frame[rows], found.box_px[rows], []
-    whose, shown = whose_places(truth, truth.positions, true_m, frame, box_px, place_m[rows])
-    if shown is None:
+    owner, visible = whose_places(truth, truth.positions, true_m, frame, box_px, place_m[rows])
+    if visible is None:
         wanted = np.flatnonzero(seen)
-        notes.append(f"{clip.name}: no boxes to tell targets by; the nearest within {metres.FARTHEST_M:g} m is taken")
+        notes.append(
+            f"{clip.name}: no boxes assign places to targets; the nearest target within {metres.FARTHEST_M:g} m is used"
+        )
     else:
-        wanted = shown[seen[shown]]  # what a picture shows; others nobody can locate
-    mine, true_row = rows[whose >= 0], whose[whose >= 0]
+        wanted = visible[seen[visible]]  # targets that no picture shows cannot be located
+    mine, true_row = rows[owner >= 0], owner[owner >= 0]
     off = place_m[mine] - true_m[true_row]
     relative, ellipse = np.full_like(off, np.nan), np.full((len(mine), 2, 2), np.nan)
     at, shift = _shared(clip, truth.fleet, origin)
@@ -188,7 +190,7 @@ def score_places(clip: Clip, found: Found) -> Scored:
     each = {
         "targets": _per_frame(frames, truth.positions.frame[wanted]),
         "told": _per_frame(frames, found.frame[mine]),
-        "strays": _per_frame(frames, frame[whose == _NOBODY]),
+        "strays": _per_frame(frames, frame[owner == _NOBODY]),
     }
     samples = {
         "frame": found.frame[mine],
@@ -200,7 +202,7 @@ def score_places(clip: Clip, found: Found) -> Scored:
         "east_m": off[:, 0],
         "north_m": off[:, 1],
     }
-    counts = GroundLocations(len(wanted), len(mine), int((whose == _NOBODY).sum()))
+    counts = GroundLocations(len(wanted), len(mine), int((owner == _NOBODY).sum()))
     return Scored(frames, {"location": counts}, {"location": each}, {}, samples, tuple(notes))
 
 

@@ -38,7 +38,7 @@ from torchvision_dddas.types import (
     TrackedFrame,
 )
 
-Tick = Callable[[], object]
+OnFrame = Callable[[], object]
 
 _MOTION = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
 _TRACKING = ("track", "paper")
@@ -61,7 +61,7 @@ _FILES: Mapping[Task, tuple[str, ...]] = {
 }
 """The files of a clip that each stage reads."""
 
-_SHUFFLE_SEED = 7  # the order of true boxes within their frames must not tell their identities
+_SHUFFLE_SEED = 7  # the order of true boxes within their frames must not reveal their identities
 
 
 def find(
@@ -71,20 +71,20 @@ def find(
     backend: str = "auto",
     interval: int = 1,
     before: Found | None = None,
-    tick: Tick = lambda: None,
+    on_frame: OnFrame = lambda: None,
 ) -> Found:
-    """Run a stage on a clip. before: the result of `upstream_task`. tick: called once per frame.
+    """Run a stage on a clip. before: the result of `upstream_task`. on_frame: called once per frame.
 
     Raises InputError if the clip's files are unusable.
     """
     peak, start = _PeakMemory(), time.perf_counter()
-    rows = STAGES[task](_Job(clip, narrow_settings(settings, task), backend, interval, before, tick))
+    rows = STAGES[task](_Job(clip, narrow_settings(settings, task), backend, interval, before, on_frame))
     rows.seconds["other"] = time.perf_counter() - start - sum(rows.seconds.values())
     return rows.found(peak.read_mb())
 
 
 def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
-    """The tasks that a clip's pictures and truth allow, each after those that it builds upon."""
+    """The tasks that a clip's pictures and truth allow, each after those that it depends on."""
     truth, pictures, moves = clip.truth, bool(clip.pictures), "movers" in clip.shows
     tasks: list[Task] = []
     if pictures and moves and (clip.still or truth is not None):
@@ -104,7 +104,7 @@ def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
 
 
 def upstream_task(clip: Clip, task: Task) -> Task | None:
-    """The task whose result another one builds upon; None if it needs none."""
+    """The task whose result a task depends on; None if there is none."""
     return "motion" if task == "tracking" and bool(clip.pictures) and "movers" in clip.shows else None
 
 
@@ -173,7 +173,7 @@ def replay_scenes(clip: Clip, found: Found) -> Iterator[Scene]:
 
 @dataclass
 class Rows:
-    """What a stage has found so far, frame by frame; the fields of `Found`."""
+    """The results of a stage so far, frame by frame; the fields of `Found`."""
 
     looked: list[int] = field(default_factory=list)
     columns: dict[str, list[np.ndarray]] = field(default_factory=dict)
@@ -198,7 +198,7 @@ class Rows:
             self.columns.setdefault(name, []).append(column)
 
     def found(self, peak_mb: float) -> Found:
-        """All of it."""
+        """The result of all frames."""
         shapes = {"frame": (0,), "box_px": (0, 4), "score": (0,), "identity": (0,)}
         shapes |= {"east_north_m": (0, 2), "covariance_m2": (0, 2, 2)}
         columns = {name: np.zeros(shape) for name, shape in shapes.items()}
@@ -219,14 +219,14 @@ class Rows:
 
 @dataclass(frozen=True)
 class _Job:
-    """What a stage is given; see `find`."""
+    """The input of a stage; see `find`."""
 
     clip: Clip
     settings: Settings
     backend: str
     interval: int
     before: Found | None
-    tick: Tick
+    on_frame: OnFrame
 
 
 def _find_motion(job: _Job) -> Rows:
@@ -245,7 +245,7 @@ def _find_motion(job: _Job) -> Rows:
             rows.steps[number] = scene.step.later_from_earlier
         if not scene.reliable:
             causes[number] = scene.cause
-        job.tick()
+        job.on_frame()
     if causes:
         first = min(causes)
         rows.notes.append(f"{len(causes)} frames with unreliable registration, first {first}: {causes[first]}")
@@ -256,9 +256,9 @@ def _find_motion(job: _Job) -> Rows:
 def _find_tracks(job: _Job) -> Rows:
     """Identities: `dddas track CLIP`, or of the data set's own detections."""
     if upstream_task(job.clip, "tracking") is not None:
-        assert job.before is not None, "tracks build upon motion"
+        assert job.before is not None, "tracking needs the result of motion"
         scenes, size = replay_scenes(job.clip, job.before), open_clip(job.clip).size
-        return _rows_of_tracks(track_scenes(scenes, job.settings, job.interval, size, False), job.tick)
+        return _rows_of_tracks(track_scenes(scenes, job.settings, job.interval, size, False), job.on_frame)
     assert job.clip.given is not None, "allowed_tasks() asks for detections"
     return _track_table(job, read_detections(job.clip.given))
 
@@ -274,7 +274,7 @@ def _find_people(job: _Job) -> Rows:
     for here in detect_in_clip(source, load_scorer(job.settings.people, job.backend), job.settings):
         people = here.people
         rows.add(here.frame.number, here.seconds, box_px=round_as_written(people.box_px), score=people.score)
-        job.tick()
+        job.on_frame()
     rows.notes += map(str, source.problems)
     return rows
 
@@ -302,23 +302,23 @@ def _track_table(job: _Job, table: DetectionTable) -> Rows:
     """Track the boxes of a table, with the clip's pictures where it has any."""
     if not job.clip.pictures:
         notes = check_table(table, job.interval)
-        rows = _rows_of_tracks(track_table(table, job.settings, job.interval), job.tick)
+        rows = _rows_of_tracks(track_table(table, job.settings, job.interval), job.on_frame)
     else:
         source = open_clip(job.clip)
         notes = check_table(table, job.interval, source)
         engine = load_engine(job.backend, job.settings)
-        rows = _rows_of_tracks(track_clip(source, table, engine, job.settings, job.interval), job.tick)
+        rows = _rows_of_tracks(track_clip(source, table, engine, job.settings, job.interval), job.on_frame)
         notes += map(str, source.problems)
     rows.notes += notes
     return rows
 
 
-def _rows_of_tracks(frames: Iterable[TrackedFrame], tick: Tick) -> Rows:
+def _rows_of_tracks(frames: Iterable[TrackedFrame], on_frame: OnFrame) -> Rows:
     rows = Rows()
     for here in frames:
         tracks, box_px = here.tracks, round_as_written(here.tracks.box_px)
         rows.add(here.number, here.seconds, box_px=box_px, score=tracks.score, identity=tracks.identity)
-        tick()
+        on_frame()
     return rows
 
 
@@ -334,7 +334,7 @@ def _locate_along(job: _Job, files: AerialInput) -> Rows:
         columns = {"box_px": tracks.box_px[seen], "identity": tracks.identity[seen], "score": tracks.score[seen]}
         seconds = result.tracked.seconds if located is None else located.seconds
         rows.add(result.tracked.number, seconds, **_with_places(columns, located))
-        job.tick()
+        job.on_frame()
     rows.notes += [*ready.notes, *map(str, source.problems)]
     return rows
 
@@ -353,7 +353,7 @@ def _locate_table(job: _Job, files: AerialInput) -> Rows:
         identity = np.full(here.stop - here.start, -1) if table.identity is None else table.identity[here]
         columns = {"box_px": located.box_px, "identity": identity, "score": table.score[here].clip(0, 1)}
         rows.add(located.frame, located.seconds, **_with_places(columns, located))
-        job.tick()
+        job.on_frame()
     rows.notes += notes
     return rows
 
@@ -369,7 +369,7 @@ def _locate_from_ground(job: _Job) -> Rows:
         identity = np.full(count, -1) if table.identity is None else table.identity[table.rows(found.frame)]
         columns = {"box_px": round_as_written(found.box_px), "score": found.score.clip(0, 1), "identity": identity}
         rows.add(found.frame, {}, **columns, **_place_columns(count, np.flatnonzero(here), found.positions))
-        job.tick()
+        job.on_frame()
     return rows
 
 
@@ -395,14 +395,14 @@ def _place_columns(count: int, row: np.ndarray, found: Positions) -> dict[str, n
 
 
 class _PeakMemory:
-    """The most memory that this process has held since this object was made, or since its start on some systems."""
+    """The peak memory of this process since this object was made, or since its start on some systems."""
 
     def __init__(self) -> None:
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
     def read_mb(self) -> float:
-        """The peak in units of 2**20 bytes; NaN where the system does not tell."""
+        """The peak in units of 2**20 bytes; NaN where the system does not report it."""
         with suppress(OSError, ValueError, StopIteration):
             lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
             return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024

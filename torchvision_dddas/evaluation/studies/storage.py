@@ -155,7 +155,7 @@ class Cache:
             content = path.read_bytes()
         except OSError:
             return None
-        with suppress(OSError):  # a cache of somebody else may be read only
+        with suppress(OSError):  # the cache may be read only
             path.touch()
         return content
 
@@ -173,7 +173,7 @@ class Cache:
             raise InputError(str(cannot_write(path, error)).replace("another --out", "another --cache")) from None
 
     def prune(self, days: float) -> tuple[int, int]:
-        """Remove entries that nobody has used for so many days; how many, and how many bytes they took."""
+        """Remove entries that were not used for so many days; returns their number and bytes."""
         count = size = 0
         for path in self.folder.rglob("*"):
             with suppress(OSError):  # another process may prune too

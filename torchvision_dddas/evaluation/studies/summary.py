@@ -56,7 +56,7 @@ def summarize(results: Results) -> dict[str, Any]:
     "mean": {group: {measure: value}}, "worst": {group: {measure: {"clip": name, "value": value}}}, "notes": [...]}},
     "left_out": [...]}. Groups, measures and n_ counts are those of `dddas evaluate`, and ranking, still, location and
     metres beside. Intervals of a clip are over blocks of its frames; of all together over clips, where there are
-    enough, else over blocks of frames, which says nothing of other clips.
+    enough, else over blocks of frames, which holds for these clips alone.
     """
     tasks = {}
     for task in TASKS:

@@ -1,7 +1,7 @@
 """Sweeps: the same study with other parameters, on a grid or as Optuna proposes, and which of them measure best.
 
-Nothing random is left open, and every study takes from the cache what was computed before: a sweep that was interrupted
-and is started again takes the same way, and soon is where it was.
+Everything random has a seed, and every study takes from the cache what was computed before: an interrupted sweep
+measures the same points when it is started again, and soon continues where it was.
 """
 
 import glob
@@ -56,7 +56,7 @@ def search_grid(
 ) -> Iterator[Trial]:
     """Measure the settings as they are, then every point of a grid, the last axis the quickest.
 
-    prepare: is given the next points before they are measured. A point whose values are impossible together has a cause
+    prepare: called with the next points before they are measured. A point whose values are impossible together has a cause
     and no value. Raises InputError if no point is possible.
     """
     points: list[tuple[dict[str, object], str]] = [({}, "")]
@@ -126,14 +126,14 @@ def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
 
 @dataclass
 class StudyMeasure:
-    """Runs the studies of a sweep. tell: is given how many of how many clips are done."""
+    """Runs the studies of a sweep. on_progress: called with the number of clips that are done, and of all."""
 
     spec: Spec
     base: Path
     goal: Goal
     workers: Workers = field(default_factory=lambda: Workers(1))
     cache: Path | None = None
-    tell: Callable[[int, int], object] = lambda done, of: None
+    on_progress: Callable[[int, int], object] = lambda done, of: None
 
     def measure(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
         """The goal's value over clips of these names; if it has none, why."""
@@ -157,12 +157,12 @@ class StudyMeasure:
     def _counter(self, total: int) -> Callable[[Event], None]:
         done = 0
 
-        def tell(event: Event) -> None:
+        def count(event: Event) -> None:
             nonlocal done
             done += event.done is not None
-            self.tell(done, total)
+            self.on_progress(done, total)
 
-        return tell
+        return count
 
 
 def split_clips(

@@ -10,7 +10,6 @@ import queue
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from importlib.util import find_spec
 from itertools import chain, islice
 from typing import Any
@@ -18,8 +17,17 @@ from typing import Any
 import cv2
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.jobs import Done, Event, FrameCounter, Job, Keys, Tell, code_identity, work
-from torchvision_dddas.evaluation.studies.storage import Cache, CarriedRecords
+from torchvision_dddas.evaluation.studies.jobs import (
+    Done,
+    Event,
+    FrameCounter,
+    Job,
+    Keys,
+    OnEvent,
+    code_identity,
+    do_job,
+)
+from torchvision_dddas.evaluation.studies.storage import Cache, CarriedRecords, Store
 from torchvision_dddas.runtime import VERSION
 
 MAX_DEATHS = 3
@@ -69,24 +77,24 @@ class Workers:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, tell: Tell) -> None:
-        """Do jobs in the order given; tell each one's outcome and progress. Results are in the cache afterwards.
+    def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
+        """Do jobs in the order given; report each one's progress and outcome. Results are in the cache afterwards.
 
         Results do not depend on the number of workers. Raises InputError if no worker can do them.
         """
         if self._scheduler is None and self._jobs == 1:
             for job, keys in jobs:
-                counter = FrameCounter(partial(_tell_frames, tell, job))
+                counter = FrameCounter(lambda frames, job=job: on_event(Event(job, frames=frames)))
                 with _one_thread(job.backend):
-                    done = work(job, keys, cache, counter)
+                    done = do_job(job, keys, cache, counter)
                 counter.flush()
-                tell(Event(job, done, note=_taken(cache.notes)))
+                on_event(Event(job, done, note=_take_notes(cache)))
             return
         iterator = iter(jobs)
-        if (first := next(iterator, None)) is not None:  # else all is in the cache: no worker has to start
-            self._share(chain([first], iterator), cache, tell)
+        if (first := next(iterator, None)) is not None:  # otherwise no worker has to start
+            self._share(chain([first], iterator), cache, on_event)
 
-    def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, tell: Tell) -> None:
+    def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
         if self._client is None:
             self._client = _start_local(self._jobs, self._stack)
         client, running, news = self._client, dict[Any, Job](), queue.SimpleQueue[Any]()
@@ -94,7 +102,7 @@ class Workers:
         alone_since = time.monotonic()
         try:
             while True:
-                # No more jobs than threads: a job that waits on a worker would be blamed for its death, too.
+                # No more jobs than threads: Dask blames a worker's death on the jobs that wait there, too.
                 threads = sum(client.nthreads().values())
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
                     store = cache if self._scheduler is None else _carried(keys, cache)
@@ -107,15 +115,17 @@ class Workers:
                 if threads:
                     alone_since = time.monotonic()
                 elif time.monotonic() - alone_since > NO_WORKER_S:
-                    raise InputError(f"{self._scheduler} has had no worker for {NO_WORKER_S:g} s; {self._advice()}")
+                    raise InputError(
+                        f"the scheduler {self._scheduler} has had no worker for {NO_WORKER_S:g} s; {self._advice()}"
+                    )
                 with suppress(queue.Empty):
                     new = news.get(timeout=_POLL_S)
                     if new in running:
-                        tell(self._outcome(running.pop(new), new, cache))
+                        on_event(self._outcome(running.pop(new), new, cache))
                     elif isinstance(new, tuple):
                         for job in running.values():
                             if job.number == new[0]:
-                                tell(Event(job, frames=new[1]))
+                                on_event(Event(job, frames=new[1]))
         except OSError as error:
             raise InputError(f"the Dask scheduler is gone ({error})") from None
         finally:
@@ -133,7 +143,7 @@ class Workers:
             return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
         except InputError:
             raise
-        except Exception as error:  # `work` lets none out: the worker cannot even begin
+        except Exception as error:  # `do_job` raises none: the worker cannot even start it
             raise InputError(f"a worker cannot do jobs ({type(error).__name__}: {error}); {self._advice()}") from None
         for key, content in made.items():
             cache.write(key, content)
@@ -162,20 +172,16 @@ def _remote(
     worker = get_worker()
     counter = FrameCounter(lambda frames: worker.log_event(_TOPIC, (job.number, frames)))
     with _one_thread(job.backend):
-        done = work(job, keys, store, counter)
+        done = do_job(job, keys, store, counter)
     counter.flush()
-    return done, _taken(store.notes), store.made
+    return done, _take_notes(store), store.made
 
 
-def _taken(notes: list[str]) -> str:
-    """The notes as one line; the list is empty afterwards."""
-    line = "; ".join(notes)
-    notes.clear()
+def _take_notes(store: Store) -> str:
+    """The notes of a store as one line; it has none afterwards."""
+    line = "; ".join(store.notes)
+    store.notes.clear()
     return line
-
-
-def _tell_frames(tell: Tell, job: Job, frames: int) -> None:
-    tell(Event(job, frames=frames))
 
 
 @contextmanager
@@ -229,7 +235,9 @@ def _connect(scheduler: str) -> Any:
     from distributed.comm.addressing import parse_address, parse_host_port
     from distributed.comm.registry import get_backend
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it tells of each worker that goes; so do we
+    logging.getLogger("distributed").setLevel(
+        logging.CRITICAL
+    )  # it logs each lost worker, which is reported here anyway
     try:
         # Checked before there is a client, which would complain about a bad address again as it ends.
         scheme, host = parse_address(scheduler)
