@@ -56,7 +56,7 @@ def search_grid(
 ) -> Iterator[Trial]:
     """Measure the settings as they are, then every point of a grid, the last axis the quickest.
 
-    prepare: called with the next points before they are measured. A point whose values are impossible together has a cause
+    prepare: called with the next points before they are measured. A point whose values exclude each other has a cause
     and no value. Raises InputError if no point is possible.
     """
     points: list[tuple[dict[str, object], str]] = [({}, "")]

@@ -10,6 +10,7 @@ import queue
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
 from itertools import chain, islice
 from typing import Any
@@ -84,7 +85,7 @@ class Workers:
         """
         if self._scheduler is None and self._jobs == 1:
             for job, keys in jobs:
-                counter = FrameCounter(lambda frames, job=job: on_event(Event(job, frames=frames)))
+                counter = FrameCounter(partial(_report_frames, on_event, job))
                 with _one_thread(job.backend):
                     done = do_job(job, keys, cache, counter)
                 counter.flush()
@@ -175,6 +176,10 @@ def _remote(
         done = do_job(job, keys, store, counter)
     counter.flush()
     return done, _take_notes(store), store.made
+
+
+def _report_frames(on_event: OnEvent, job: Job, frames: int) -> None:
+    on_event(Event(job, frames=frames))
 
 
 def _take_notes(store: Store) -> str:
