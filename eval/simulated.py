@@ -393,7 +393,7 @@ def fly_loop(case: Case) -> Case:
     scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
     stages, judging, timed.spent_s, start = Counter[str](), 0.0, 0.0, bench.now()[1]
     for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(started):
-        stages.update(result.grounded.seconds if result.grounded is not None else result.followed.seconds)
+        stages.update(result.locations.seconds if result.locations is not None else result.tracked.seconds)
         before = bench.now()[1]
         for truth in source.truths():
             scorer.feed(truth)

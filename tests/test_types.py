@@ -1,5 +1,6 @@
 """Records: rows, columns, and the boxes of other libraries."""
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -39,5 +40,12 @@ def test_arrays_of_several_columns_are_split_by_name():
     assert list(columns) == ["identity", "x_px", "y_px", "width_px", "height_px", "score", "row"]
     assert columns["width_px"].tolist() == [3] and tracks.id.tolist() == [7] and tracks.xyxy.tolist() == [[1, 2, 4, 6]]
     assert {"east_m", "north_m", "var_north_m2"} <= set(Positions().to_columns())
-    frame = pytest.importorskip("pandas").DataFrame(columns)
-    assert tracks.to_pandas().equals(frame)
+
+
+def test_a_table_becomes_a_pandas_frame_of_its_columns(monkeypatch):
+    tracks = Tracks(3, np.array([7]), np.array([[1.0, 2, 3, 4]]), np.array([0.5]), np.array([0]))
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=dict))
+    assert tracks.to_pandas().keys() == tracks.to_columns().keys()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="to_pandas needs pandas: pip install pandas"):
+        tracks.to_pandas()

@@ -4,6 +4,7 @@ A reader may accept a file or refuse it by an InputError of one line. Anything e
 """
 
 import random
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
@@ -16,7 +17,38 @@ import numpy as np
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from tests.fuzz.layouts import LAYOUTS, ROOT
+from torchvision_dddas.cli.colours import _box, _names
+from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError
+from torchvision_dddas.evaluation.datasets import kinds
+from torchvision_dddas.evaluation.evaluate import evaluate
+from torchvision_dddas.evaluation.metrics import clip, truth
+from torchvision_dddas.evaluation.studies.spec import Source, read_spec
+from torchvision_dddas.geo.site import looks_swapped
+from torchvision_dddas.geometry import poses_at
+from torchvision_dddas.io.camera_files import (
+    describe_missing,
+    has_measurements,
+    read_camera,
+    read_measurements,
+    read_poses,
+)
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.io.detection_tables import check_table, read_detections, read_header, read_rows
+from torchvision_dddas.io.elevation import read_elevation, read_ortho
+from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
+from torchvision_dddas.io.images import natural_order
+from torchvision_dddas.io.output.run_record import read_run_record
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.streams import About, open_stream
+from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.io.video import stream_target, without_secrets
+from torchvision_dddas.live.server import parse_address
+from torchvision_dddas.people.classifiers import read_classifier
+from torchvision_dddas.people.onnx_scorer import find_graphs
+from torchvision_dddas.runtime import MANIFEST, SHIPPED
+from torchvision_dddas.simulation import load_scenario, scenario_toml
+from torchvision_dddas.types import Camera
 
 
 @dataclass(frozen=True)
@@ -77,14 +109,26 @@ class Parser:
 
 # -- What is done with each --------------------------------------------------------------------------------------------
 
+_CAMERA = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)
+_CORNERS = np.array([[0.0, 0.0], [10.0, 10.0]])
+_CLIP = {
+    "true/gt.txt": seeds.TEXT["mot"][0].encode(),
+    "true/seqinfo.ini": seeds.TEXT["seqinfo"][0].encode(),
+    "found/tracks.txt": seeds.TEXT["mot"][0].encode(),
+    "found/detections.txt": seeds.TEXT["mot"][1].encode(),
+    "found/run.json": seeds.TEXT["record"][0].encode(),
+}
+
 
 def _finite(*arrays: np.ndarray) -> None:
     assert all(np.isfinite(array).all() for array in arrays), "what was read holds numbers that are none"
 
 
-def _detections(path: Path) -> None:
-    from torchvision_dddas.io.detection_tables import check_table, read_detections, read_header, read_rows
+def _words(path: Path) -> str:
+    return path.read_bytes().decode("utf-8", "surrogateescape")
 
+
+def _detections(path: Path) -> None:
     table = read_detections(path)
     _finite(table.box_px, table.score)
     assert (np.diff(table.frame) >= 0).all()
@@ -97,27 +141,13 @@ def _detections(path: Path) -> None:
 
 
 def _truth(path: Path) -> None:
-    from torchvision_dddas.evaluation.metrics import clip, truth
-
-    found = truth.load(path)
-    _ = found.frames
+    _ = truth.load(path).frames
     clip.load(path)
 
 
 def _evaluated(path: Path) -> None:
     """The input is the truth, the result or the record of a clip that is scored."""
-    from torchvision_dddas.evaluation.evaluate import evaluate
-
     evaluate(path.parents[1] / "true", path.parents[1] / "found")
-
-
-_CLIP = {
-    "true/gt.txt": seeds.TEXT["mot"][0].encode(),
-    "true/seqinfo.ini": seeds.TEXT["seqinfo"][0].encode(),
-    "found/tracks.txt": seeds.TEXT["mot"][0].encode(),
-    "found/detections.txt": seeds.TEXT["mot"][1].encode(),
-    "found/run.json": seeds.TEXT["record"][0].encode(),
-}
 
 
 def _clip(without: str) -> Mapping[str, bytes]:
@@ -125,86 +155,47 @@ def _clip(without: str) -> Mapping[str, bytes]:
 
 
 def _record(path: Path) -> None:
-    from torchvision_dddas.evaluation.metrics import clip
-    from torchvision_dddas.io.output import run_record as journal
-
-    journal.read_run_record(path.parent)
+    read_run_record(path.parent)
     clip.load(path.parent)
 
 
 def _positions(path: Path) -> None:
-    from torchvision_dddas.io.ground_tables import read_positions
-
-    found = read_positions(path)
-    _finite(found.east_north_m)
+    _finite(read_positions(path).east_north_m)
 
 
 def _landmarks(path: Path) -> None:
-    from torchvision_dddas.geo.site import looks_swapped
-    from torchvision_dddas.io.ground_tables import read_landmarks
-
     found = read_landmarks(path, 10.0, 0.5)
     _finite(found.frame)
     looks_swapped(found, (-110.95, 32.23))
 
 
 def _measurements(path: Path) -> None:
-    from torchvision_dddas.io.camera_files import has_measurements, read_measurements
-
     has_measurements(path)
     _finite(*read_measurements(path))
 
 
 def _camera(path: Path) -> None:
-    from torchvision_dddas.io.camera_files import describe_missing, read_camera
-
     describe_missing(path)
     read_camera(path)
 
 
 def _poses(path: Path) -> None:
-    from torchvision_dddas.geometry import poses_at
-    from torchvision_dddas.io.camera_files import read_poses
-    from torchvision_dddas.types import Camera
-
-    camera = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)
-    table = read_poses(path)
-    _, poses = poses_at(camera, table, np.array([1, 3, 5]), 10.0)
+    _, poses = poses_at(_CAMERA, read_poses(path), np.array([1, 3, 5]), 10.0)
     _finite(*(np.asarray(values) for values in vars(poses).values()))
 
 
-def _colours(path: Path) -> None:
-    from torchvision_dddas.io.colour_files import read_colours
-
-    read_colours(path)
-
-
-def _settings(path: Path) -> None:
-    from torchvision_dddas.config import changes, load_config
-
-    changes(load_config(path))
-
-
 def _overrides(path: Path) -> None:
-    from torchvision_dddas.config import load_config
-    from torchvision_dddas.simulation import load_scenario as load_scenario
-
-    words = path.read_bytes().decode("utf-8", "surrogateescape")
-    load_scenario("four", [f"settings.{words}"])
-    load_config(None, [words])
+    load_scenario("four", [f"settings.{_words(path)}"])
+    load_config(None, [_words(path)])
 
 
 def _scenario(path: Path) -> None:
-    from torchvision_dddas.simulation import load_scenario, scenario_toml
-
     found = load_scenario(path)
     path.write_text(scenario_toml(found), encoding="utf-8")
     assert load_scenario(path) == found, "a scenario that is written is read as another one"
 
 
 def _telemetry(path: Path) -> None:
-    from torchvision_dddas.io.telemetry import read_telemetry
-
     found = read_telemetry(path)
     rising = bool((np.diff(found.time_s) > 0).all()) and bool(np.isfinite(found.time_s).all())
     assert rising, "times that do not rise"
@@ -216,132 +207,67 @@ def _telemetry(path: Path) -> None:
 
 
 def _classifier(path: Path) -> None:
-    from torchvision_dddas.config import PeopleParameters
-    from torchvision_dddas.people.classifiers import read_classifier
-
-    svm = read_classifier(path, seeds.FEATURES, PeopleParameters().descriptor)
-    _finite(svm.weights)
-
-
-def _manifest(path: Path) -> None:
-    from torchvision_dddas.config import PeopleParameters
-    from torchvision_dddas.people.onnx_scorer import find_graphs
-
-    find_graphs(PeopleParameters(graphs=str(path.parent)))
+    _finite(read_classifier(path, seeds.FEATURES, PeopleParameters().descriptor).weights)
 
 
 def _folder(path: Path) -> None:
-    from torchvision_dddas.io.sources import open_source
-
     for frame in open_source(path.parent):
         assert frame.image.dtype == np.uint8
 
 
 def _names_of_images(path: Path) -> None:
-    from torchvision_dddas.io.images import natural_order
-
-    names = path.read_bytes().decode("utf-8", "surrogateescape").splitlines()
-    sorted((name[:4096] for name in names), key=natural_order)  # no path is longer
-
-
-def _mask(path: Path) -> None:
-    from torchvision_dddas.evaluation.metrics.truth import read_mask
-
-    read_mask(path)
+    sorted((name[:4096] for name in _words(path).splitlines()), key=natural_order)  # no path is longer
 
 
 def _video(path: Path) -> None:
-    from torchvision_dddas.io.sources import open_source
-
-    source = open_source(path)
-    numbers = [frame.number for frame in source.every(2)]
+    numbers = [frame.number for frame in open_source(path).every(2)]
     assert numbers == sorted(set(numbers))
 
 
 def _input_name(path: Path) -> None:
-    """A device or an address is not tried: what may be behind it is not this test's."""
-    from torchvision_dddas.io.sources import open_source
-    from torchvision_dddas.simulation import load_scenario
-
-    words = path.read_bytes().decode("utf-8", "surrogateescape")
-    if words.startswith("sim:"):  # without its world, which takes seconds to be made
+    """Devices and addresses are not tried."""
+    words = _words(path)
+    if words.startswith("sim:"):  # without its world, which takes seconds to build
         load_scenario(words[4:])
-        return
-    if (
-        not (words.startswith("camera:") and words[7:].isdigit())
-        and "://" not in words
-        and not words.startswith("/dev")
-    ):
+    elif not re.match(r"camera:\d+$|/dev", words) and "://" not in words:
         open_source(words)
 
 
-def _elevation(path: Path) -> None:
-    from torchvision_dddas.io.elevation import read_elevation
-
-    read_elevation(path, np.array([[0.0, 0.0], [10.0, 10.0]]), None, 30.0)
-
-
-def _ortho(path: Path) -> None:
-    from torchvision_dddas.io.elevation import read_ortho
-
-    read_ortho(path, np.array([[0.0, 0.0], [10.0, 10.0]]), None, 30.0)
-
-
 def _address(path: Path) -> None:
-    from torchvision_dddas.live.server import parse_address
-
-    _, port = parse_address(path.read_bytes().decode("utf-8", "surrogateescape"))
-    assert 0 <= port <= 65535
+    assert 0 <= parse_address(_words(path))[1] <= 65535
 
 
 def _camera_word(path: Path) -> None:
-    from torchvision_dddas.io.video import stream_target, without_secrets
-
-    words = path.read_bytes().decode("utf-8", "surrogateescape")
-    without_secrets(words)
-    stream_target(words)
+    without_secrets(_words(path))
+    stream_target(_words(path))
 
 
 def _stream_word(path: Path) -> None:
-    """Files alone: of an address its host would be asked for."""
-    from torchvision_dddas.io.streams import About, open_stream
-
-    words = path.read_bytes().decode("utf-8", "surrogateescape")
+    """Files alone: an address would be resolved."""
+    words = _words(path)
     if "udp" not in words.lower() and not words.endswith("-"):
         with chdir(path.parent):
             open_stream(words, About(0.0), lambda kind, text: None).close()
 
 
 def _boxes_of_colours(path: Path) -> None:
-    from torchvision_dddas.cli.colours import _box, _names
-
-    words = path.read_bytes().decode("utf-8", "surrogateescape")
-    _names(words)
-    _box(words)
+    _names(_words(path))
+    _box(_words(path))
 
 
 def _dataset(kind: str, path: Path) -> None:
     """What is wrong with a clip is told, and the clip left out; where none is left that counts as a refusal."""
-    from torchvision_dddas.evaluation.datasets import kinds
-    from torchvision_dddas.evaluation.studies.spec import Source
-
     folder = next(place for place in path.parents if place.name == ROOT)
     found = kinds.read(Source(kind, folder), folder.parent)
     for line in found.missing:
         assert line.isprintable() and 0 < len(line) <= LONGEST, f"a line that is none: {line[:200]!r}"
     if not found.clips:
         raise InputError(found.missing[0])
-    for truth in (clip.truth for clip in found.clips if clip.truth is not None):
-        for table in (truth.tracks, truth.ignored, truth.others, truth.regions):
+    for true in (one.truth for one in found.clips if one.truth is not None):
+        for table in (true.tracks, true.ignored, true.others, true.regions):
             _finite(*(table or ()))
-        _finite(*([] if truth.positions is None else [truth.positions.east_north_m]))
-        assert truth.frames and truth.frames[0] >= 1
-
-
-def _study(path: Path) -> None:
-    from torchvision_dddas.evaluation.studies.spec import read_spec
-
-    read_spec(path)
+        _finite(*([] if true.positions is None else [true.positions.east_north_m]))
+        assert true.frames and true.frames[0] >= 1
 
 
 def _text(kind: str) -> Callable[[], Sequence[bytes]]:
@@ -350,34 +276,13 @@ def _text(kind: str) -> Callable[[], Sequence[bytes]]:
 
 _PLACES = ("east_m", "north_m", "longitude_deg", "latitude_deg", "frame", "time_s", "score", "1", "10000001")
 _TOML = (
-    "[[",
-    "]]",
-    "[a]",
-    "low",
-    "high",
-    "{}",
-    "[]",
-    "[[]]",
-    "1.0",
-    "inf",
-    "nan",
-    '"x"',
-    "'",
-    "0x7fffffffffffffffff",
+    "[[", "]]", "[a]", "low", "high", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "0x7fffffffffffffffff",
     "1e400",
-)
+)  # fmt: skip
 
 
 def _graphs() -> Mapping[str, bytes]:
-    from torchvision_dddas.runtime import SHIPPED
-
     return {name: (SHIPPED / name).read_bytes() for name in ("people_histograms.onnx", "people_scores.onnx")}
-
-
-def _manifests() -> Sequence[bytes]:
-    from torchvision_dddas.runtime import MANIFEST, SHIPPED
-
-    return [(SHIPPED / MANIFEST).read_bytes()]
 
 
 PARSERS: tuple[Parser, ...] = (
@@ -401,8 +306,8 @@ PARSERS: tuple[Parser, ...] = (
     Parser("measurements CSV", "measured.csv", _text("measurements"), _measurements, share=0.5),
     Parser("poses CSV", "poses.csv", _text("poses"), _poses, words=_PLACES),
     Parser("camera TOML", "camera.toml", _text("camera"), _camera, words=_TOML),
-    Parser("colours TOML", "colours.toml", _text("colours"), _colours, words=_TOML),
-    Parser("settings TOML", "knobs.toml", _text("settings"), _settings, words=_TOML),
+    Parser("colours TOML", "colours.toml", _text("colours"), read_colours, words=_TOML),
+    Parser("settings TOML", "knobs.toml", _text("settings"), lambda path: changes(load_config(path)), words=_TOML),
     Parser(
         "overrides", "override.txt", _text("overrides"), _overrides, words=("=", ".", "world.side_m=1",
         "crowd.1.people=2"),
@@ -431,7 +336,8 @@ PARSERS: tuple[Parser, ...] = (
     Parser("classifier .yml", "a.yml", partial(seeds.classifiers, ".yml"), _classifier, share=0.3),
     Parser("classifier .xml", "a.xml", partial(seeds.classifiers, ".xml"), _classifier, share=0.3),
     Parser("classifier .json", "a.json", partial(seeds.classifiers, ".json"), _classifier, share=0.3),
-    Parser("manifest of graphs", "manifest.json", _manifests, _manifest, beside=_graphs),
+    Parser("manifest of graphs", "manifest.json", lambda: [(SHIPPED / MANIFEST).read_bytes()],
+        lambda path: find_graphs(PeopleParameters(graphs=str(path.parent))), beside=_graphs),
     Parser("addresses to serve at", "address.txt", _text("addresses"), _address, share=0.3),
     Parser("names of cameras", "camera.txt", _text("cameras"), _camera_word, words=("camera:", "://", "@"), share=0.3),
     Parser("names of streams", "stream.txt", _text("streams"), _stream_word, words=("json:", "cot:"), share=0.3),
@@ -447,18 +353,20 @@ PARSERS: tuple[Parser, ...] = (
     Parser("folder of other images", "clip/a.ppm", partial(seeds.pictures, ".ppm"), _folder, share=0.5),
     Parser("folder of BMPs", "clip/a.bmp", partial(seeds.pictures, ".bmp"), _folder, text=False, share=0.5),
     Parser("names of images", "names.txt", _text("names of images"), _names_of_images, share=0.5),
-    Parser("masks", "000001.png", partial(seeds.pictures, ".png", True), _mask, text=False, share=0.5),
+    Parser("masks", "000001.png", partial(seeds.pictures, ".png", True), truth.read_mask, text=False, share=0.5),
     Parser("video .avi", "a.avi", partial(seeds.videos, ".avi", "MJPG"), _video, text=False, share=0.15),
     Parser("video .mp4", "a.mp4", partial(seeds.videos, ".mp4", "mp4v"), _video, text=False, share=0.15),
     Parser("video H.264", "a.mp4", seeds.h264, _video, text=False, needs="av", share=0.15),
     Parser("names of inputs", "input.txt", _text("input names"), _input_name, share=0.5),
     Parser("colours by boxes", "box.txt", _text("boxes of colours"), _boxes_of_colours, share=0.3),
-    Parser("studies", "study.toml", _text("studies"), _study, words=(*_TOML, "[[dataset]]", "kind = ", "folder = ")),
+    Parser("studies", "study.toml", _text("studies"), read_spec, words=(*_TOML, "[[dataset]]", "kind = ", "folder = ")),
     *(
         Parser(one.name, f"{ROOT}/{one.file}", one.seeds, partial(_dataset, one.kind), words=one.words,
         beside=one.others, share=0.5)
         for one in LAYOUTS
     ),
-    Parser("elevation GeoTIFF", "a.tif", partial(seeds.raster, 1), _elevation, text=False, needs="rasterio", share=0.3),
-    Parser("photo GeoTIFF", "a.tif", partial(seeds.raster, 3), _ortho, text=False, needs="rasterio", share=0.3),
+    Parser("elevation GeoTIFF", "a.tif", partial(seeds.raster, 1),
+        lambda path: read_elevation(path, _CORNERS, None, 30.0), text=False, needs="rasterio", share=0.3),
+    Parser("photo GeoTIFF", "a.tif", partial(seeds.raster, 3),
+        lambda path: read_ortho(path, _CORNERS, None, 30.0), text=False, needs="rasterio", share=0.3),
 )  # fmt: skip

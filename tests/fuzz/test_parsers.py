@@ -51,10 +51,10 @@ def test_the_same_number_gives_the_same_input_and_another_gives_another() -> Non
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_no_input_is_larger_than_it_may_be(text: bool) -> None:
+def test_no_input_is_larger_than_the_limit(text: bool) -> None:
     rng = random.Random(0)
-    sizes = [len(damaged([b"1,2,3\n" * 9000], rng, text)) for _ in range(60)]
-    assert max(sizes) <= LARGEST and len(set(sizes)) > 10
+    sizes = [len(damaged([b"1,2,3\n" * 9000], rng, text)) for _ in range(20)]
+    assert max(sizes) <= LARGEST and len(set(sizes)) > 5
 
 
 def test_a_reader_that_raises_anything_else_is_noticed(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_px4_log_whose_last_message_says_it_is_longer_than_the_file_comes_to_a
 
 
 def test_a_table_with_a_quote_about_several_cells_is_refused(tmp_path: Path) -> None:
-    content = BY_NAME["detections as CSV"].case(2, 492)
+    content = b'frame,x_px,y_px,width_px,height_px\n1,"2,3\n2,3,4,5,6\n'
     assert BY_NAME["detections as CSV"].try_on(tmp_path / "a.csv", content) is not None
 
 
@@ -159,7 +159,7 @@ def columns_of(name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["detections as CSV", "positions CSV", "landmarks CSV", "poses CSV", "telemetry CSV"])
-@settings(derandomize=True, max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(derandomize=True, max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_table_of_any_cells_is_taken_or_refused(tmp_path_factory: pytest.TempPathFactory, name: str, data) -> None:
     parser = BY_NAME[name]

@@ -100,11 +100,6 @@ def test_a_mistake_in_a_camera_is_named(toml, text, words):
     assert "north.toml" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_camera_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"camera .*gone\.toml cannot be read: No such file"):
-        read_camera(tmp_path / "gone.toml")
-
-
 def test_the_keys_of_a_camera_without_a_focal_length_can_be_read(toml):
     assert read_camera_keys(toml("width_px = 640")) == {"width_px": 640}
     with pytest.raises(InputError, match="heading_deg is 500; wanted a number"):

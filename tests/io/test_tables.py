@@ -14,7 +14,6 @@ from torchvision_dddas.io.tables import (
     compass_deg,
     detection_tables,
     parse_numbers,
-    read_csv,
     read_table,
 )
 
@@ -80,14 +79,6 @@ def test_ragged_lines_are_read_as_far_as_the_wanted_columns_go(tmp_path):
     path.write_text("frame,east_m\n1,2\n3\n")
     with pytest.raises(InputError, match="line 3: east_m is missing: the line ends before it"):
         read_table(path, PLACES, is_ragged=True)
-
-
-@pytest.mark.parametrize(("content", "message"), [(None, "No such file"), (b"a,b\n\xff\xfe\n", "is no CSV text")])
-def test_a_file_that_cannot_be_read_is_said(tmp_path, content, message):
-    if content is not None:
-        (tmp_path / "t.csv").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_csv(tmp_path / "t.csv", "places")
 
 
 def test_numbers_are_told_from_what_is_none():

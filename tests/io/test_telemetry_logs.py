@@ -247,3 +247,42 @@ def test_a_px4_log_of_no_use_is_refused_in_one_line(tmp_path: Path, content: byt
     with pytest.raises(InputError, match=says) as error:
         read_telemetry(written(tmp_path, content, "flight.ulg"))
     assert "\n" not in str(error.value)
+
+
+# -- Damaged times and other files -------------------------------------------------------------------------------------
+
+
+def test_a_single_time_that_is_damaged_does_not_spoil_a_mavlink_log(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    whole = flown(20)
+    path.write_bytes(tlog(whole))
+    expected = read_telemetry(path)
+    damaged_time = (10**18).to_bytes(8, "big")  # the year 33658
+    path.write_bytes(tlog(whole[:10]) + damaged_time + tlog(whole[10:])[8:])
+    found = read_telemetry(path)
+    np.testing.assert_allclose(found.time_s, expected.time_s, atol=0.02)
+    np.testing.assert_array_equal(found.altitude_m, expected.altitude_m)
+
+
+def test_a_single_time_that_is_damaged_is_left_out_of_a_log_with_one_clock(tmp_path: Path) -> None:
+    path = tmp_path / "flight.ulg"
+    rows = list(GLOBAL[1])
+    rows[20] = (10**15, *rows[20][1:])
+    path.write_bytes(ulog({"vehicle_global_position": (GLOBAL[0], rows)}))
+    found = read_telemetry(path)
+    assert len(found) == 49 and np.ptp(found.time_s) == pytest.approx(4.9)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"\x00\x00\x00\x20ftypisom" + bytes(90), "is a video"),
+        (b"\xa3\x95\x80\x80" + bytes(90), "DataFlash"),
+        (np.random.default_rng(0).bytes(500), "none of the kinds"),
+    ],
+)
+def test_other_binary_files_are_refused_with_what_is_wanted(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "flight.bin"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        read_telemetry(path)
