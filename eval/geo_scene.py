@@ -10,7 +10,7 @@ measurements has a smaller covariance, that of the pose with the priors counted 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ellipe
@@ -119,65 +119,6 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
         case, true_axes, true_place, true_focal, true_marks, true_targets, axes, place, marks, sigma_m, common,
         marks_px, targets_px,
     )  # fmt: skip
-
-
-def swapped(batch: Scenes, seed: int = 0) -> Scenes:
-    """The same scenes with the identities of two landmarks swapped, that of the first and of any other."""
-    other = np.random.default_rng([seed, 6]).integers(1, batch.case.landmarks, len(batch))
-    every, seen = np.arange(len(batch)), batch.marks_px.copy()
-    seen[every, 0], seen[every, other] = batch.marks_px[every, other], batch.marks_px[every, 0]
-    return replace(batch, marks_px=seen)
-
-
-def outlying(batch: Scenes, away_m: float, seed: int = 0) -> Scenes:
-    """The same scenes with the first landmark's GPS so far off, in any direction."""
-    turn = np.random.default_rng([seed, 4]).uniform(-np.pi, np.pi, len(batch))
-    marks = batch.marks.copy()
-    marks[:, 0] += away_m * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return replace(batch, marks=marks)
-
-
-def flights(
-    case: Case, count: int, frames: int, step_s: float, correlation_s: tuple[float, float], seed: int = 0
-) -> list[Scenes]:
-    """Batches of frames that follow each other: frame f of flight s is row s of batch f.
-
-    The errors of telemetry and of receivers have time constants `correlation_s`, that of the focal
-    length never changes, and pixels are independent. The team
-    drives about the middle at 1 m/s, the camera drifts at 1 m/s and sways by a degree.
-    """
-    rng, first = np.random.default_rng([seed, 5]), scenes(case, count, 2, seed)
-    keep, keep_team = np.exp(-step_s / np.array(correlation_s))
-    shape = first.marks.shape
-    sigma = np.array(
-        [TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m]
-    )
-    flight, team = rng.normal(0, 1, (count, 6)), rng.normal(0, 1, shape)
-    drift = rng.uniform(-np.pi, np.pi, count)
-    found = []
-    for f in range(frames):
-        angle, t = f * step_s / RADIUS_M, f * step_s
-        sway = turned(np.radians(1.0) * np.sin(t / 3) * np.stack([np.cos(drift), np.sin(drift), 0 * drift], axis=1))
-        axes = sway @ first.true_axes
-        way = np.stack([np.cos(drift), np.sin(drift), 0 * drift], axis=1)
-        place = first.true_place + (t - frames * step_s / 2) * way
-        c, s = np.cos(angle), np.sin(angle)
-        marks = first.true_marks @ np.array([[c, s], [-s, c]])
-        inner = 10
-        targets = np.concatenate([disc(rng, (count, inner), CROWD_M), disc(rng, (count, inner))], axis=1)
-        seen = [pixels(x, axes, place, first.true_focal) for x in (marks, targets)]
-        if f:
-            flight = keep * flight + np.sqrt(1 - keep**2) * rng.normal(0, 1, flight.shape)
-            team = keep_team * team + np.sqrt(1 - keep_team**2) * rng.normal(0, 1, shape)
-        found.append(
-            Scenes(
-                case, axes, place, first.true_focal, marks, targets,
-                turned((flight * sigma)[:, :3]) @ axes, place + (flight * sigma)[:, 3:],
-                marks + team * first.sigma_m[..., None], first.sigma_m, np.zeros((count, 2)),
-                *(x + rng.normal(0, case.pixel_sigma, x.shape) for x in seen),
-            )
-        )  # fmt: skip
-    return found
 
 
 def disc(rng: np.random.Generator, shape: tuple[int, ...], radius_m: float = RADIUS_M) -> np.ndarray:

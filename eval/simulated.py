@@ -1,7 +1,6 @@
 """Studies on rendered video with known truth; no data needed.
 
 python eval/simulated.py altitude     errors of crowds from video to metres by altitude (appendix A, Fig. 7)
-python eval/simulated.py landmarks    centres of landmarks by colour or motion, four or six (A, Fig. 8, 9)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
 python eval/simulated.py whole        whole scenarios in the closed loop
 
@@ -11,10 +10,9 @@ Figures are mean ± standard error (range) over seeds. --cache FILE keeps finish
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +36,7 @@ from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.simulation.drawing import view_from_pose
 from torchvision_dddas.simulation.sensor_errors import SIGMAS_95, Receivers
-from torchvision_dddas.types import Colours, Command, Frame, FrameResult, Landmarks, Scene, TrackedFrame, Tracks, Truth
+from torchvision_dddas.types import Command, Frame, FrameResult, Landmarks, Scene, TrackedFrame, Tracks, Truth
 
 CONFIG = "patrol"
 """The shipped configuration of a team that watches crowds."""
@@ -48,33 +46,20 @@ Case = dict[str, Any]
 # -- one clip, located in several ways ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Way:
-    """A way to locate the same pictures.
+def usual(source: SimulatorSource) -> Settings:
+    """The settings of `dddas run sim:`."""
+    return fit_settings(load_config(CONFIG, (), scenario_settings(source.scenario)), source)
 
-    landmarks: rows of the team's that are used; empty: all. gps95_m: error of their receivers in 95 %, added to the
-    reports. settings: parameters beside the usual.
+
+class ClipLocator:
+    """Locates the scenes of a clip, and scores that. Targets are those of single frames, without tracks.
+
+    gps95_m: error of the landmarks' receivers in 95 %, added to the reports.
     """
 
-    name: str
-    landmarks: tuple[int, ...] = ()
-    gps95_m: float = 0.0
-    settings: dict[str, object] = field(default_factory=dict)
-
-
-def usual(source: SimulatorSource, more: Mapping[str, object] | None = None) -> Settings:
-    """The settings of `dddas run sim:`, and more."""
-    settings = fit_settings(load_config(CONFIG, (), scenario_settings(source.scenario)), source)
-    return with_parameters(settings, more or {})
-
-
-class WayLocator:
-    """Locates the scenes of a clip in one way, and scores that. Targets are those of single frames, without tracks."""
-
-    def __init__(self, source: SimulatorSource, way: Way) -> None:
-        self._source, self._way, self._settings = source, way, usual(source, way.settings)
-        self._kept = np.array(way.landmarks or range(len(source.names)))
-        self._error_m = receiver_errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
+    def __init__(self, source: SimulatorSource, gps95_m: float) -> None:
+        self._source, self._gps95_m, self._settings = source, gps95_m, usual(source)
+        self._error_m = receiver_errors(source.scenario, gps95_m, len(source.names), source.count or 0)
         self._local = partial(geometry.east_north, origin_deg=source.scenario.world.origin_deg)
         self._watch: LandmarkWatch | None = None
 
@@ -94,9 +79,7 @@ class WayLocator:
                 site, self._source.camera, self._settings, load_solver("onboard"), self._source.rate_hz,
                 focal_known=True,
             )  # fmt: skip
-            colours, rows = self._source.colours, self._kept
-            some = Colours(tuple(colours.names[k] for k in rows), colours.low[rows], colours.high[rows])
-            self._watch = LandmarkWatch(locator, some, load_colours("onboard"))
+            self._watch = LandmarkWatch(locator, self._source.colours, load_colours("onboard"))
         else:
             self._watch.locator.set_site(site)
         locator = self._watch.locator
@@ -136,17 +119,17 @@ class WayLocator:
         return replace(site, landmarks=local[0], telemetry=local[1])
 
     def _reports(self) -> Landmarks:
-        """Those of the landmarks in use, with the receivers' errors; without planned waypoints."""
+        """The landmarks' reports with the receivers' errors; without planned waypoints."""
         table = self._source.landmarks()
-        kept = np.isin(table.landmark, self._kept) & ~table.planned
+        kept = ~table.planned
         frame, which, place, sigma = table.frame[kept], table.landmark[kept], table.place[kept], table.sigma_m[kept]
-        if self._way.gps95_m:
+        if self._gps95_m:
             metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
             place = geometry.lonlat(metres, self._source.scenario.world.origin_deg)
-            sigma = np.hypot(np.nan_to_num(sigma), self._way.gps95_m / SIGMAS_95)
+            sigma = np.hypot(np.nan_to_num(sigma), self._gps95_m / SIGMAS_95)
         return Landmarks(
-            tuple(table.names[k] for k in self._kept), frame, np.searchsorted(self._kept, which),
-            table.image_px[kept], place, sigma, table.planned[kept], table.line[kept], True, table.path,
+            table.names, frame, which, table.image_px[kept], place, sigma, table.planned[kept], table.line[kept], True,
+            table.path,
         )  # fmt: skip
 
 
@@ -162,33 +145,28 @@ def receiver_errors(scenario: Scenario, gps95_m: float, count: int, frames: int)
     return np.array(errors).reshape(frames, count, 2)
 
 
-def locate_clip(scenario: Scenario, ways: Sequence[Way], edges_s: Sequence[float] = ()) -> dict[str, list[Case]]:
-    """The scores of each way, one for each part of the clip. edges_s: where later parts begin."""
+def locate_clip(scenario: Scenario, gps95_m: Mapping[str, float]) -> Case:
+    """The scores with each error of the receivers, in the same detections."""
     source = SimulatorSource(scenario)
-    locators, edges = {way.name: WayLocator(source, way) for way in ways}, [*edges_s, np.inf]
-    scorers = {name: [one.scorer() for _ in edges] for name, one in locators.items()}
-    errors: dict[str, list[list[float]]] = {name: [[] for _ in edges] for name in locators}
+    locators = {name: ClipLocator(source, error) for name, error in gps95_m.items()}
+    scorers, errors = {name: one.scorer() for name, one in locators.items()}, {name: [] for name in locators}
     truths, settings, started = {}, usual(source), StartedSource(source)
     # As many frames are left out as the closed loop leaves out before anything is found.
-    least = every_least(
-        pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0]), source.rate_hz, settings.steering
-    )
+    scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
+    least = every_least(scale, source.rate_hz, settings.steering)
     source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
     for scene in detect_motion(started, settings, "onboard"):
         truths |= {truth.frame: truth for truth in source.truths()}
         truth = truths.pop(scene.frame.number, None)
         if truth is None:
             continue
-        true, part = shown(truth), int(np.searchsorted(edges, scene.frame.time_s, side="right"))
+        true = shown(truth)
         for name, one in locators.items():
-            scorers[name][part].feed(true)
-            errors[name][part].append(one.locate(scene, scorers[name][part], truth))
+            scorers[name].feed(true)
+            errors[name].append(one.locate(scene, scorers[name], truth))
     return {
-        name: [
-            scorer.score().by_name() | {"picture_m": float(np.nanmean(off)) if np.isfinite(off).any() else None}
-            for scorer, off in zip(parts, errors[name], strict=True)
-        ]
-        for name, parts in scorers.items()
+        name: scorer.score().by_name() | {"picture_m": float(np.nanmean(errors[name]))}
+        for name, scorer in scorers.items()
     }
 
 
@@ -247,14 +225,14 @@ def measure_altitude(options: bench.Options) -> tuple[str, Any]:
     for altitude in options.altitudes:
         here = [r for c, r in zip(cases, results, strict=True) if c["altitude_m"] == altitude]
         for gps in GPS:
-            of = [result[gps][0] for result in here]
+            of = [result[gps] for result in here]
             target = [Spread(r["target_error_m"][key] for r in of) for key in ("mean", "median", "p95")]
             cells = [target[0].text(), *(one.text(spread=False) for one in target[1:])]
             cells += [Spread(r["inside"] for r in of).text(0, 100, spread=False)]
             cells += [Spread(r["crowd_error_m"]["mean"] for r in of).text(), Spread(r["picture_m"] for r in of).text()]
             source = f"{SOURCE_M[altitude]:g}" if altitude in SOURCE_M and gps == "exact" else "–"
             errors.append([f"{altitude:g}", gps, *cells, source])
-        of = [result["exact"][0] for result in here]
+        of = [result["exact"] for result in here]
         cells = [Spread(r[key] for r in of).text(1, 100) for key in ("recall", "recall_moving", "detected")]
         cells += [Spread(r[key] for r in of).text() for key in ("false_blobs", "landmark_blobs")]
         seen.append([f"{altitude:g}", *cells])
@@ -271,46 +249,7 @@ def fly_altitude(case: Case) -> Case:
         case["seed"], case["seconds"], uav={"altitude_m": case["altitude_m"]},
         camera={"width_px": width, "height_px": height},
     )  # fmt: skip
-    return locate_clip(scenario, [Way(name, gps95_m=error) for name, error in GPS.items()])
-
-
-FOUR = (0, 1, 3, 4)
-"""Of six landmarks in a ring: a rectangle."""
-SLOW_S = 15.0
-"""When the vehicles slow down."""
-LANDMARK_WAYS = [
-    Way(f"{mode}, {centre}, {count}, {gps}", FOUR if count == 4 else (), error,
-        {"aerial.mode": mode, "landmarks.centre": centre})
-    for gps, error in GPS.items()
-    for mode, centre, count in product(("pose", "homography"), ("colour", "motion"), (4, 6))
-]  # fmt: skip
-
-
-def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
-    """Centres by colour or motion, four landmarks or six, by pose or homography, in the same detections.
-
-    Six ground vehicles gather about two crowds, fast until t = 15 s, then slow. picture: error of the picture on the
-    ground where the crowds are; targets: of those found, from the people in their boxes.
-    """
-    cases = [{"seed": seed, "seconds": options.seconds} for seed in range(options.seeds)]
-    results = bench.run_cases(cases, fly_landmarks, options.jobs, options.cache)
-    rows = []
-    for way in LANDMARK_WAYS:
-        parts = [[result[way.name][part] for result in results] for part in (0, 1)]
-        picture = [Spread(r["picture_m"] for r in part).text() for part in parts]
-        targets = [Spread(r["target_error_m"]["mean"] for r in part).text() for part in parts]
-        rows.append([way.name, *picture, *targets])
-    head = ["by, centres, landmarks, GPS", *(f"{k}, {p}: m" for k in ("picture", "targets") for p in ("fast", "slow"))]
-    return f"{bench.format_table(head, rows)}\n\n{about(options)}", results
-
-
-def fly_landmarks(case: Case) -> Case:
-    """One clip, located in all ways, in two parts."""
-    scenario = walking(
-        case["seed"], case["seconds"], uav={"altitude_m": 50.0},
-        team={"ugvs": 6, "patrol": "gather", "ring_m": 18.0},
-    )  # fmt: skip
-    return locate_clip(scenario, LANDMARK_WAYS, (SLOW_S,))
+    return locate_clip(scenario, GPS)
 
 
 # -- the loop --------------------------------------------------------------------------------------------------------
@@ -441,7 +380,6 @@ if __name__ == "__main__":
     loop = {"--seconds": 0.0, "--seeds": 10, "--scenarios": ["leaving"], "--plot": None}
     studies = {
         "altitude": (measure_altitude, common | altitudes),
-        "landmarks": (measure_landmarks, common | {"--seconds": 19.0}),
         "loop": (measure_loop, common | loop),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
     }

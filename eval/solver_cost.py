@@ -4,12 +4,10 @@ python eval/solver_cost.py [--windows 20]
 
 Sparse: people who walk, half of them in groups, 0.2 to a square of their height; tracks with and without a velocity,
 one in twenty missed, false boxes. Links within a gate score as a log-likelihood; columns (i, j, k) are what is left.
-"HiGHS alone" is the same problem as one integer programme. Dense: the source's tensors: generalised Jaccard of box
-centres in pixels and of histograms, dummies gated at 0.4, the weight of location 1, 0.7, 0.5 and 0.3 in turn.
+"HiGHS alone" is the same problem as one integer programme.
 Milliseconds of processor time a window: median (90th percentile).
 """
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,11 +17,8 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
 from torchvision_dddas.tracking.assignment import choose_triplets
-from torchvision_dddas.tracking.dual_ascent import assign_triplets
 
 INTERVAL = 5
-THRESHOLD = 0.4
-WEIGHTS = (1.0, 0.7, 0.5, 0.3)
 Window = tuple[np.ndarray, np.ndarray]
 """Columns (N, 3) of rows in three frames, -1 where there is none, and their scores."""
 
@@ -34,9 +29,6 @@ def measure_cost(options: bench.Options) -> tuple[str, Any]:
     found: list[dict[str, Any]] = []
     for targets in options.sparse:
         found += time_sparse("simulated", targets, [sparse_window(targets, k) for k in range(options.windows)])
-    for targets in options.dense:
-        tensors = [dense_window(targets, seed) for seed in range(options.windows)]
-        found += time_dense("simulated dense", targets, tensors, options.gap)
     rows = []
     for row in found:
         gap = f"{row['gap_percent']:.2f} ({row['worst_gap_percent']:.2f})" if "gap_percent" in row else "–"
@@ -64,17 +56,6 @@ def time_sparse(kind: str, targets: int, windows: list[Window]) -> list[dict[str
         difference = max(difference, abs(best - window[1][chosen].sum()))
     about = {"windows": kind, "targets": targets, "largest_difference": difference}
     return [about | {"solver": "columns", **summary(ours)}, about | {"solver": "HiGHS alone", **summary(theirs)}]
-
-
-def time_dense(kind: str, targets: int, windows: list[np.ndarray], gap: float) -> list[dict[str, Any]]:
-    """Dual ascent on dense tensors, and its certified gap."""
-    times, gaps = [], []
-    for window in windows:
-        spent, solved = timed(lambda w=window: assign_triplets(w, gap=gap))
-        times.append(spent)
-        gaps.append(100 * solved.gap)
-    about = {"windows": kind, "targets": targets, "solver": f"gap {100 * gap:g} %"}
-    return [about | summary(times) | {"gap_percent": float(np.median(gaps)), "worst_gap_percent": max(gaps)}]
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
@@ -163,47 +144,7 @@ def sparse_window(targets: int, seed: int, density: float = 0.2) -> Window:
     return columns_of(place[known], believed[known], settled[known], *seen)
 
 
-def dense_affinity(features: list[np.ndarray]) -> np.ndarray:
-    """The source's tensor of three frames (appendix C, eq. 4, 5), with its gated dummies."""
-    (low1, high1), (low2, high2) = (
-        (np.minimum(a[:, None], b).sum(axis=-1), np.maximum(a[:, None], b).sum(axis=-1))
-        for a, b in itertools.pairwise(features)
-    )
-    real = (low1[:, :, None] + low2) / (high1[:, :, None] + high2)
-    tensor = np.pad(real, ((1, 0),) * 3)
-    for axis in range(3):
-        face = [slice(1, None)] * 3
-        face[axis] = 0
-        tensor[tuple(face)] = np.where(real.max(axis=axis, initial=0.0) < 1 - THRESHOLD, 1 - THRESHOLD, 0.0)
-    return tensor
-
-
-def dense_window(targets: int, seed: int) -> np.ndarray:
-    """A tensor of people who walk 15 px an interval in 768×576; Jaccard of true histograms 0.7, of others 0.4."""
-    random = np.random.default_rng(seed)
-    size = (768, 576)
-    place, velocity = random.uniform((40, 60), (728, 566), (targets, 2)), random.normal(0, 15, (targets, 2))
-    common = random.dirichlet(np.full(256, 0.5), 3)
-
-    def histogram() -> np.ndarray:
-        return 0.35 * random.dirichlet(np.full(256, 0.1), 3) + 0.65 * common
-
-    own = [histogram() for _ in range(targets)]
-    places, histograms = [], []
-    for look in range(3):
-        at = np.clip(place + look * velocity + random.normal(0, 2, (targets, 2)), 1, size)
-        kept = np.flatnonzero(random.random(targets) < 0.95)
-        false = random.poisson(0.03 * targets)
-        drawn = [own[i] for i in kept] + [histogram() for _ in range(false)]
-        bins = [np.stack([random.multinomial(1600, row / row.sum()) for row in rows]).ravel() for rows in drawn]
-        mixed = random.permutation(len(drawn))
-        places.append(np.concatenate([at[kept], random.uniform((1, 1), size, (false, 2))])[mixed])
-        histograms.append(np.array(bins, float).reshape(-1, 768)[mixed])
-    weight = WEIGHTS[seed % len(WEIGHTS)]
-    return weight * dense_affinity(places) + (1 - weight) * dense_affinity(histograms)
-
-
 if __name__ == "__main__":
-    options = {"--sparse": [3, 10, 30, 50, 100, 200, 350, 500], "--dense": [3, 10, 20, 30, 50, 70, 100]}
+    options = {"--sparse": [3, 10, 30, 50, 100, 200, 350, 500]}
     options |= {"--windows": 20, "--gap": 0.005, "--plot": None}
     bench.main(__doc__, {"": (measure_cost, options)})

@@ -1,7 +1,6 @@
 """Time and memory, always beside a reference in the same turns: ratios are medians over turns, with quartiles.
 
 python eval/speed.py detection [DATA]   a frame by stage and resolution, beside the plain OpenCV chain; onboard, torch
-python eval/speed.py targets            a frame against the number of moving targets
 python eval/speed.py memory             peak memory of processes that run one chain, and `dddas detect`
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
@@ -143,7 +142,6 @@ def time_chains(clips: Mapping[str, Sequence[np.ndarray]], names: Sequence[str],
         own, plain = (spent[f"{clip}|{one}"] / TURN_FRAMES for one in (name, "plain"))
         found[clip][name] = bench.compare_turns(own, plain) | {
             "stages_ms": stage_times(chain.stages[WARM_UP:], own),
-            "targets": float(np.median(chain.targets)) if chain.targets else 0.0,
         }
     return found
 
@@ -204,43 +202,6 @@ def _films(data: Path | None, size: Size) -> Iterable[tuple[str, list[np.ndarray
         return
     for place in clips_in(data):
         yield place.name, read_frames(place / "frames", 40)
-
-
-def measure_targets(options: bench.Options) -> tuple[str, Any]:
-    """Time of a frame of 640×480 with so many movers added to the scene."""
-    chains, frames, load = available_chains(options.chains), scene((640, 480), 24), bench.OtherLoad()
-    found = time_chains({f"+{count}": add_movers(frames, count) for count in options.counts}, chains, options.rounds)
-    rows = [
-        [name, *(f"{by[name]['processor_ms']:.1f} ({by[name]['targets']:.0f})" for by in found.values())]
-        for name in ("plain", *chains)
-    ]
-    text = f"Processor milliseconds a frame, and in brackets the targets found ({load.words()}):"
-    return f"{text}\n\n{bench.format_table(['chain', *found], rows)}", found
-
-
-def add_movers(frames: Sequence[np.ndarray], count: int, seed: int = 0) -> list[np.ndarray]:
-    """The clip with textured patches that go to and fro, each in its own cell of the picture, so that none touch."""
-    if not count:
-        return list(frames)
-    rng = np.random.default_rng([seed, count])
-    height, width = frames[0].shape[:2]
-    columns = int(np.ceil(np.sqrt(count * width / height)))
-    cell = np.array([width / columns, height / np.ceil(count / columns)])
-    side = np.minimum([width / 20, height / 15], 0.45 * cell).astype(int).clip(4)
-    spots = rng.integers(30, 226, (count, -(-side[1] // 4), -(-side[0] // 4), 3), np.uint8)
-    patches = spots.repeat(4, axis=1).repeat(4, axis=2)[:, : side[1], : side[0]]
-    phases = rng.uniform(0, 2, count)
-    drawn = []
-    for number, frame in enumerate(frames):
-        picture = frame.copy()
-        for k, (patch, phase) in enumerate(zip(patches, phases, strict=True)):
-            room = cell - side - 2
-            travelled = phase + number * max(side[0] / 4, 2) / max(room[0], 1)
-            corner = cell * (k % columns, k // columns) + 1 + room * (abs((travelled + 1) % 2 - 1), 0.5)
-            x, y = corner.astype(int)
-            picture[y : y + side[1], x : x + side[0]] = patch
-        drawn.append(picture)
-    return drawn
 
 
 def measure_memory(options: bench.Options) -> tuple[str, Any]:
@@ -390,7 +351,6 @@ if __name__ == "__main__":
             measure_detection,
             {"data": None, "--chains": CHAINS, "--sizes": sizes, "--rounds": 12, "--plot": None},
         ),
-        "targets": (measure_targets, {"--chains": CHAINS[:3], "--counts": [0, 10, 30, 60], "--rounds": 12}),
         "memory": (measure_memory, {"--chains": CHAINS[:4], "--size": "1280x720", "--frames": [60, 240]}),
         "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
         "geo": (measure_geo, {"--rounds": 15}),
