@@ -1,4 +1,4 @@
-"""Damaged inputs for every reader: does one crash or hang? `python eval/fuzz.py run [--inputs 100000] [--workers 2]`
+"""Damaged inputs for every reader: does one crash or hang? `python eval/fuzz.py run [--inputs 100000] [--workers 2]`.
 
 Each input is a whole file with something wrong with it, made from the reader, the seed and a number, so that it can be
 made again. Readers run in processes of their own, a few hundred inputs each: where one dies (a crash of a decoder) or
