@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.io.output.run_log import MARK, PROBLEM, WORLD, Clock, RunLog, format_log
+from torchvision_dddas.io.output.run_log import LANDMARK, PROBLEM, WORLD, Clock, RunLog, format_log
 from torchvision_dddas.types import Adjustment
 
 FRAME = np.arange(1, 101)
@@ -46,7 +46,7 @@ def test_what_lasts_is_one_line_that_says_how_long_though_its_numbers_differ():
 def test_what_comes_and_goes_is_one_line_that_says_how_often():
     log = RunLog()
     for frame in range(10, 31, 4):
-        log.add_lasting(frame, 1, MARK, "blue is not seen", key="blue")
+        log.add_lasting(frame, 1, LANDMARK, "blue is not seen", key="blue")
     (line,) = text(log)
     assert "(to frame 30, in 6 of 21 frames)" in line
 

@@ -10,7 +10,7 @@ import pytest
 from tests.io.streamed import ABOUT, Told, surveyed
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams import open_stream
-from torchvision_dddas.io.streams.datagrams import MOST_BYTES, Address, DatagramOutlet, address
+from torchvision_dddas.io.streams.datagrams import MOST_BYTES, Address, DatagramOutlet, parse_address
 
 
 @pytest.fixture
@@ -109,11 +109,11 @@ def test_an_address_of_version_6_works_too():
 
 
 def test_all_who_listen_to_a_multicast_get_it_and_no_router_passes_it_on_unasked():
-    outlet = DatagramOutlet(address("udp://239.2.3.1:6969?interface=lo", ""))
+    outlet = DatagramOutlet(parse_address("udp://239.2.3.1:6969?interface=lo", ""))
     assert outlet._socket is not None
     assert outlet._socket.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 1
     outlet.close()
-    outlet = DatagramOutlet(address("udp://239.2.3.1:6969?ttl=4&interface=lo", ""))
+    outlet = DatagramOutlet(parse_address("udp://239.2.3.1:6969?ttl=4&interface=lo", ""))
     assert outlet._socket is not None
     assert outlet._socket.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 4
     group = socket.inet_aton("239.2.3.1") + socket.inet_aton("127.0.0.1")

@@ -150,6 +150,6 @@ def looks(table: "DetectionTable | None", source: "Source | None", interval: int
 def summary(journal: "TrackRecord", folder: Path, save: Sequence[str]) -> list[str]:
     """What to tell the user at the end."""
     made = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in save), "run.json"]
-    found = f"{journal.frames} frames, {journal.targets} detections, {journal.identities} identities"
-    first = f"{found}, {journal.untracked} detections without one"
+    found = f"{journal.frames} frames, {journal.targets} detections, {journal.tracked.identities} identities"
+    first = f"{found}, {journal.tracked.untracked} detections without one"
     return last_lines(first, journal, folder, made, journal.notes)

@@ -97,13 +97,13 @@ class _Renumbering:
         self._before, self._highest = [0, 0], [0, 0]
 
     def __call__(self, result: Result) -> Result:
-        surveyed, people = result
-        tracked, locations = self._shifted(0, surveyed.tracked), surveyed.locations
-        if locations is not None and self._before[0]:
-            places = locations.positions
-            locations = replace(locations, positions=replace(places, target=places.target + self._before[0]))
-        surveyed = replace(surveyed, tracked=tracked, locations=locations)
-        return surveyed, None if people is None else self._shifted(1, people)
+        located, people = result
+        followed, grounded = self._shifted(0, located.tracked), located.locations
+        if grounded is not None and self._before[0]:
+            places = grounded.positions
+            grounded = replace(grounded, positions=replace(places, target=places.target + self._before[0]))
+        located = replace(located, tracked=followed, locations=grounded)
+        return located, None if people is None else self._shifted(1, people)
 
     def restart(self) -> None:
         self._before = list(self._highest)
@@ -156,18 +156,18 @@ def send_result(result: Result, streams: Iterable[Stream], health: Health) -> No
 
 def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float) -> None:
     """Record the latency of a result that was sent, and what it holds, in the health."""
-    surveyed, people = result
-    now_s, frame = time.monotonic(), surveyed.tracked.frame
+    located, people = result
+    now_s, frame = time.monotonic(), located.tracked.frame
     if feed.newest is not None and isfinite(feed.newest.taken_s):
         latency_s = now_s - feed.newest.taken_s
         health.took("latency", latency_s)
         health.count("late", int(1000 * latency_s > deadline_ms))
     if frame is not None and isfinite(frame.taken_s):
         health.took("age", now_s - frame.taken_s)
-    health.gauge("targets", len(surveyed.tracked.tracks))
+    health.gauge("targets", len(located.tracked.tracks))
     if people is not None:
         health.gauge("people", len(people.tracks))
-    health.count("unreliable", int(bool(surveyed.tracked.cause)))
+    health.count("unreliable", int(bool(located.tracked.cause)))
     health.result()
 
 

@@ -12,18 +12,17 @@ UNKNOWN = "9999999.0"
 """A height or an error that is not known."""
 
 KIND = "a-u-G"
-"""An atom of unknown affiliation on the ground: nothing here tells friend from foe."""
+"""An atom on the ground of unknown affiliation."""
 
 STALE_S = 10.0
-"""For how long an event is to be believed."""
+"""How long an event is valid."""
 
 
 def cot(tracks: GroundTracks, source: str = "dddas") -> str:
-    """`<events>` of one event a target and second at most, a line an event, in the order of their times.
+    """`<events>` in the order of time, a line each, at most one per target and second.
 
-    ce is one standard deviation along the ellipse's longer axis, as CoT's schema wants errors; m-f: a machine told it,
-    from several sources. uid: the source, the start of the clip, the target.
-    Raises ValueError where there is no geographic origin or no clock: an event must say when and where.
+    ce is one standard deviation along the ellipse's longer axis; how="m-f" is fused from several machine sources.
+    uid: the source, the start of the clip, the target. Raises ValueError without a geographic origin or a clock.
     Source: MITRE, Event-PUBLIC.xsd, version 2.0.
     """
     if tracks.lonlat_deg is None or tracks.times_utc is None:
@@ -54,7 +53,7 @@ def event(
     sigma_m: float,
     velocity_m_s: np.ndarray,
 ) -> str:
-    """One event, a line. when: its time, and until when it is to be believed; sigma_m: what is told as ce."""
+    """One event, a line. when: its time, and the time until which it is valid. sigma_m: becomes ce."""
     longitude, latitude = lonlat_deg
     time, stale = when
     return (
@@ -65,7 +64,7 @@ def event(
 
 
 def _each_second(tracks: GroundTracks, rows: slice) -> list[int]:
-    """At most one row a second, unlike `spaced` without the last where it comes sooner."""
+    """At most one row per second; unlike `spaced` without a last row that comes sooner."""
     chosen = tracks.spaced(1.0, rows)
     if len(chosen) > 1 and tracks.time_s[chosen[-1]] - tracks.time_s[chosen[-2]] < 1.0 - 1e-6:
         chosen.pop()

@@ -36,14 +36,13 @@ def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.
 
 
 def rounded(lonlat_deg: np.ndarray) -> list[Place]:
-    """Places to 1e-8 of a degree, which is a millimetre."""
-    found: list[Place] = np.round(lonlat_deg, 8).tolist()
-    return found
+    """Places rounded to 1e-8 degrees, a millimetre."""
+    return [*np.round(lonlat_deg, 8).tolist()]
 
 
 def cut_line(places: list[Place]) -> list[list[Place]]:
-    """The line as lines of which none goes over 180 degrees; their ends there are no places of the line."""
-    # Most lines go nowhere near, and are long.
+    """Cut a line where it crosses 180 degrees of longitude; the cut ends lie on that meridian."""
+    # Most lines are long and do not come near.
     if len(places) < 2 or np.abs(np.diff([place[0] for place in places])).max() <= 180:
         return [places]
     lines = [places[:1]]

@@ -1,4 +1,4 @@
-"""The places of all targets over time, kept while frames go by; maps are made of them at the end."""
+"""The places of all targets over time, from which maps are made at the end of a run."""
 
 import math
 from dataclasses import dataclass
@@ -66,12 +66,12 @@ class GroundTracks:
         return iso_utc(self.start_utc_s + self.time_s)
 
     def spaced(self, seconds: float, rows: slice) -> list[int]:
-        """Rows of a target about so far apart in time, its last among them; that alone where no time is known."""
+        """Rows of a target about so far apart in time, and its last; only the last if times are unknown."""
         last = rows.stop - 1
         due = -math.inf
         chosen: list[int] = []
         for row, at in enumerate(self.time_s[rows].tolist(), rows.start):
-            # A hair less, so that the rounding of time stamps costs no row.
+            # Rounded time stamps must not skip a row.
             if at >= due - 1e-6:
                 chosen.append(row)
                 due = at + seconds
@@ -85,7 +85,7 @@ def iso_utc(utc_s: np.ndarray) -> list[str]:
 
 
 class Gathered:
-    """Rows of GroundTracks as they come: 104 bytes each, up to three times that while the space for them grows."""
+    """Collects rows of GroundTracks, 104 bytes each, and up to three times that while the array grows."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(256, _ROW)

@@ -1,4 +1,4 @@
-"""What a map picture is drawn with: its frame with grid and scale, lines, signs, and labels that do not overlap."""
+"""The parts of a map picture: frame, grid and scale, lines, signs, and labels that do not overlap."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from torchvision_dddas.io.overlay import Colour
 from torchvision_dddas.io.overlay.layers import LETTERS
 
 FINE = 2
-"""The map is drawn so many times larger, and then reduced: so thin lines and small letters come out clean."""
+"""The map is drawn so many times larger and then reduced, for clean thin lines and small letters."""
 
 WIDTH = 1400
 LEFT, RIGHT, TOP, BOTTOM = 86, 24, 46, 106
@@ -103,7 +103,7 @@ def draw_grid(picture: np.ndarray, frame: MapFrame, over_photo: bool) -> None:
 
 
 def draw_scale(picture: np.ndarray, frame: MapFrame) -> None:
-    """A bar of a round length and an arrow to the north, outside the plot: they hide nothing."""
+    """A bar of a round length and an arrow to the north, outside the plot."""
     length = round_step(frame.width * frame.metres_a_pixel, LINES_ACROSS)
     text = f"{length:g} m"
     wide = length / frame.metres_a_pixel
@@ -152,7 +152,7 @@ def dashes(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, 
 
 def line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, halo: bool = False) -> None:
     """A line through (N, 2) pixels of the enlarged picture, so thick in the finished one."""
-    # A long way jitters within a pixel from frame to frame: what nobody can see costs most of the time.
+    # A long track jitters within a pixel from frame to frame: drawing that would take most of the time.
     simple = (
         cv2.approxPolyDP(points.astype(np.float32)[:, None], 0.4 * FINE, False)[:, 0] if len(points) > 99 else points
     )
@@ -163,7 +163,7 @@ def line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, ha
 
 
 def fixed(points: np.ndarray) -> np.ndarray:
-    """Pixels with their fractions as OpenCV takes them; far outside is as good as farther."""
+    """Fixed-point pixels for OpenCV; those far outside are clipped."""
     return np.round(np.clip(np.nan_to_num(points), -30_000, 30_000) * 2**_SUB).astype(np.int32)
 
 
@@ -186,14 +186,14 @@ def draw_landmark(plot: np.ndarray, at: np.ndarray) -> None:
 
 
 class Labels:
-    """Names beside their places, where there is room: a label that would lie on others moves around its place."""
+    """Labels beside their places; one that would cover others moves around its place."""
 
     def __init__(self, frame: MapFrame) -> None:
         self._frame = frame
         self._taken: list[tuple[float, float, float, float]] = []
 
     def keep_free(self, east_north_m: np.ndarray) -> None:
-        """Let no label lie on the sign at a place."""
+        """Let no label cover the sign at a place."""
         x, y = (self._frame.pixels(east_north_m) / FINE + (LEFT, TOP)).tolist()
         self._taken.append((x - 6, y - 6, x + 6, y + 6))
 
@@ -245,7 +245,7 @@ def draw_look(plot: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray, long: fl
 
 
 def draw_verdict(plot: np.ndarray, at: np.ndarray, kind: str) -> None:
-    """A disc with a letter: H for human, N for not human."""
+    """A disc with H for human or N for not human."""
     x, y = (round(float(v)) for v in np.clip(np.nan_to_num(at), -30_000, 30_000))
     cv2.circle(plot, (x, y), 10 * FINE, PAPER, -1, cv2.LINE_AA)
     cv2.circle(plot, (x, y), 9 * FINE, VERDICTS.get(kind, INK), -1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""A map of a run: tracks with their numbers and 95 % ellipses, landmarks, and where the camera was and looked."""
+"""A map of a run: tracks with their numbers and 95 % ellipses, landmarks, the camera's path and last view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,6 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from torchvision_dddas.geo.projection import rays, undistort_pixels
 from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks
 from torchvision_dddas.io.maps.map_drawing import (
@@ -39,14 +40,13 @@ from torchvision_dddas.types import Camera, Fix, Ortho
 _MOST_SIGNS = 400
 _LOOKS_APART_M = 2.0
 VIEW = (0, 130, 240)
-LOWEST = float(np.sin(np.radians(3)))
-"""Nothing is seen farther than where a ray comes down at 3 degrees: the horizon is no place."""
+_LOWEST = float(np.sin(np.radians(3)))  # flatter rays end where one at 3 degrees reaches the ground
 
 
 class Signs:
-    """Signs of what ground vehicles did: where a target was told human or not, and from where they looked.
+    """Map signs of what ground vehicles did: where a target was found human or not, and from where they looked.
 
-    A look every two metres of each vehicle, and a fixed number of all.
+    Each vehicle has a look every 2 m; there are at most 400 looks and 400 verdicts.
     """
 
     def __init__(self) -> None:
@@ -54,13 +54,13 @@ class Signs:
         self.looks: list[tuple[np.ndarray, np.ndarray]] = []
         self._last: dict[str, np.ndarray] = {}
 
-    def told(self, target: int, kind: str, east_north_m: np.ndarray) -> None:
-        """A target was told human or not_human, here for the first time or otherwise than before."""
+    def add_verdict(self, target: int, kind: str, east_north_m: np.ndarray) -> None:
+        """Add the place where a target was first found human or not_human, or otherwise than before."""
         if len(self.verdicts) < _MOST_SIGNS:
             self.verdicts.append((target, kind, np.array(east_north_m, float)))
 
-    def look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
-        """A vehicle saw a target."""
+    def add_look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
+        """Add the places of a vehicle and of a target that it saw."""
         last = self._last.get(vehicle)
         if not np.isfinite(from_m).all() or (last is not None and np.linalg.norm(from_m - last) < _LOOKS_APART_M):
             return
@@ -71,7 +71,7 @@ class Signs:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Where the camera was, (M, 2) east and north in m, and the outline of what it saw last, (K, 2), empty unknown."""
+    """The camera's places (M, 2), and the outline of its last view (K, 2), east and north in m; empty if unknown."""
 
     east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     view_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -136,31 +136,20 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
     share = np.linspace(0, 1, 8, endpoint=False)[:, None]
     border = np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     if fix.pose is not None and fix.pose.place_m[2] > 0:
-        return _seen(border, fix, camera)
+        directions = rays(border, fix.pose, camera)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        reach_m = fix.pose.place_m[2] / np.maximum(-directions[:, 2], _LOWEST)
+        view = fix.pose.place_m[:2] + directions[:, :2] * reach_m[:, None]
+        return view[np.isfinite(view).all(axis=1)]
     if fix.image_from_ground is None or not np.isfinite(np.linalg.cond(fix.image_from_ground)):
         return np.zeros((0, 2))
     if fix.by != "paper":
-        border = _straight(border, camera) * camera.focal_px + camera.centre_px
+        border = undistort_pixels(border, camera)
+        border = border[np.isfinite(border).all(axis=1)]
     ground = np.c_[border, np.ones(len(border))] @ np.linalg.inv(fix.image_from_ground).T
     # Pixels on both sides of the horizon have scales of both signs.
-    same = (ground[:, 2] > 0).all() or (ground[:, 2] < 0).all()
-    return ground[:, :2] / ground[:, 2:] if same else np.zeros((0, 2))
-
-
-def _seen(border: np.ndarray, fix: Fix, camera: Camera) -> np.ndarray:
-    assert fix.pose is not None
-    straight = _straight(border, camera, fix.pose.focal)
-    rays = np.c_[straight, np.ones(len(straight))] @ fix.pose.axes.T
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    reach = fix.pose.place_m[2] / np.maximum(-rays[:, 2], LOWEST)
-    return fix.pose.place_m[:2] + rays[:, :2] * reach[:, None]
-
-
-def _straight(pixels: np.ndarray, camera: Camera, focal: float = 1.0) -> np.ndarray:
-    """Pixels to right and down per depth, without the lens's distortion; focal: as a share of the camera's."""
-    (fu, fv), (cu, cv) = np.array(camera.focal_px) * focal, camera.centre_px
-    lens = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, 1]])
-    return cv2.undistortPoints(pixels[:, None], lens, np.array([camera.k1, camera.k2, 0, 0]))[:, 0]
+    has_one_sign = (ground[:, 2] > 0).all() or (ground[:, 2] < 0).all()
+    return ground[:, :2] / ground[:, 2:] if has_one_sign else np.zeros((0, 2))
 
 
 def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> np.ndarray:
@@ -205,8 +194,8 @@ def _draw_photo(plot: np.ndarray, frame: MapFrame, photo: Ortho) -> None:
             [[share[0], 0, (share[0] - 1) / 2], [0, share[1], (share[1] - 1) / 2], [0, 0, 1]]
         )
     size = plot.shape[1], plot.shape[0]
-    laid = cv2.warpAffine(image, plot_from_pixel[:2], size, flags=cv2.INTER_LINEAR, borderValue=PAPER)
-    plot[:] = (0.75 * laid + 0.25 * 255).astype(np.uint8)
+    warped = cv2.warpAffine(image, plot_from_pixel[:2], size, flags=cv2.INTER_LINEAR, borderValue=PAPER)
+    plot[:] = (0.75 * warped + 0.25 * 255).astype(np.uint8)
 
 
 def _draw_way(plot: np.ndarray, frame: MapFrame, camera: CameraPath) -> None:
@@ -261,6 +250,6 @@ def _legend(
 
 
 def _dark(target: int) -> Colour:
-    """A target's colour as in the overlay, but to be seen on white."""
+    """A target's colour as in the overlay, darker for white paper."""
     blue, green, red = (round(0.72 * c) for c in identity_colour(target))
     return blue, green, red

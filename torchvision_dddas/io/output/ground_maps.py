@@ -1,7 +1,7 @@
 """Maps of located targets, written at the end of a run: GeoJSON, KML, Cursor-on-Target, a picture, and the report."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from torchvision_dddas.io.maps import (
     semi_axes,
     view_of,
 )
-from torchvision_dddas.io.output.run_record import AerialRecord
+from torchvision_dddas.io.output.run_record import AerialRecord, Spans
 from torchvision_dddas.io.output.run_report import REPORT, RunSummary, Table, format_span, run_report
 from torchvision_dddas.io.output.run_story import RunStory
 from torchvision_dddas.io.output.timelines import LocationTimeline
@@ -31,15 +31,16 @@ from torchvision_dddas.types import AerialLocations, Camera, Fix, GroundLocation
 
 GEOJSON, KML, COT, MAP = "tracks.geojson", "tracks.kml", "tracks.cot.xml", "map.png"
 _LARGE_BYTES = 400_000
+_LANDMARK_COLUMNS = ("name", "frames seen", "used", "reassigned in frames", "excluded in frames")
 
 
 @dataclass(frozen=True)
 class Site:
-    """What maps need to know of the ground.
+    """The ground that maps show, and what is known of the run.
 
     names: of the landmarks. origin_deg: longitude and latitude of the local metres, None where there are none.
     start_utc_s: as in Telemetry. rate_hz: of the frames, for run.json. background: an ortho-photo under the map.
-    camera: so that the map shows what it saw. to_degrees: (N, 2) local metres to longitudes and latitudes.
+    camera: if given, the map shows its view. to_degrees: (N, 2) local metres to longitudes and latitudes.
     """
 
     names: Sequence[str]
@@ -57,11 +58,35 @@ class Site:
         return {"origin_deg": self.origin_deg, "start_utc": begun, "rate_hz": self.rate_hz}
 
 
-class AerialMaps:
+class _MapFiles:
+    """Files that are written at the end of a run. files: all that a run may write."""
+
+    files: tuple[str, ...] = ()
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._written: set[str] = set()
+
+    def _put(self, name: str, content: bytes) -> None:
+        write_whole(self._folder / name, content)
+        self._written.add(name)
+
+    def _remove_old(self) -> None:
+        """Remove files of an earlier run that this one did not write."""
+        for name in set(self.files) - self._written:
+            remove(self._folder / name)
+
+    def discard(self) -> None:
+        """Remove what was begun."""
+        for name in self.files:
+            remove(temporary(self._folder / name))
+
+
+class AerialMaps(_MapFiles):
     """tracks.geojson, tracks.kml, tracks.cot.xml, map.png and report.html of targets located from the air.
 
-    Memory grows with the places shown: a place of a target or a landmark takes 104 bytes, three times that while more
-    space is made, and about 800 while the files are written; a frame takes 200.
+    Memory: 104 bytes per place of a target or landmark, three times that while the array grows, and about 800 while
+    the files are written; 200 bytes per frame.
     """
 
     files = (GEOJSON, KML, COT, MAP, REPORT)
@@ -69,16 +94,16 @@ class AerialMaps:
     def __init__(
         self, folder: Path, record: AerialRecord, save: Sequence[str], site: Site, story: RunStory | None = None
     ) -> None:
-        """story: what else the report tells of the run."""
-        self._folder, self._record, self._save, self._site, self._story = folder, record, save, site, story
+        """story: adds events, key frames and timelines to the report."""
+        super().__init__(folder)
+        self._record, self._save, self._site, self._story = record, save, site, story
         self._name = Path(str(record.facts.get("input", ""))).name
         self._targets, self._landmarks, self._timeline = Gathered(), Gathered(), LocationTimeline()
         self._camera_path: list[tuple[float, float]] = []
         self._last: Fix | None = None
-        self._written: set[str] = set()
 
     def write(self, grounded: AerialLocations) -> None:
-        """Keep what the maps will show of a frame."""
+        """Keep a frame's places for the maps."""
         self._targets.add(grounded.positions, grounded.time_s, grounded.velocity_m_s)
         self._timeline.add(grounded)
         marks, fix = grounded.marks, grounded.fix
@@ -114,17 +139,7 @@ class AerialMaps:
                 if self._story is not None:
                     summary = self._story.extend(summary)
                 self._put(REPORT, run_report(summary, self._timeline).encode())
-        for name in set(self.files) - self._written:
-            remove(self._folder / name)
-
-    def discard(self) -> None:
-        """Remove what was begun."""
-        for name in self.files:
-            remove(temporary(self._folder / name))
-
-    def _put(self, name: str, content: bytes) -> None:
-        write_whole(self._folder / name, content)
-        self._written.add(name)
+        self._remove_old()
 
     def _draw(self, targets: GroundTracks, landmarks: GroundTracks) -> bytes:
         last, camera = self._last, self._site.camera
@@ -136,29 +151,28 @@ class AerialMaps:
         return cv2.imencode(".png", picture)[1].tobytes()
 
 
-class GroundMaps:
-    """tracks.geojson and tracks.kml of people located from the ground."""
+class GroundMaps(_MapFiles):
+    """tracks.geojson and tracks.kml of people located from the ground, if their longitudes and latitudes are known."""
 
     files = (GEOJSON, KML)
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, has_degrees: bool) -> None:
+        super().__init__(folder)
+        self._has_degrees = has_degrees
         self._gathered = Gathered()
 
     def write(self, located: GroundLocations) -> None:
         """Keep the people of a frame."""
-        self._gathered.add(located.positions)
+        if self._has_degrees:
+            self._gathered.add(located.positions)
 
     def close(self, complete: bool) -> None:
         """Write the maps. Raises OSError if they cannot be written."""
-        tracks = self._gathered.tracks(geographic=True)
-        write_whole(self._folder / GEOJSON, encode_geojson(geojson(tracks)))
-        write_whole(self._folder / KML, kml(tracks).encode())
-
-    def discard(self) -> None:
-        """Remove what was begun."""
-        for name in self.files:
-            remove(temporary(self._folder / name))
+        if self._has_degrees:
+            tracks = self._gathered.tracks(geographic=True)
+            self._put(GEOJSON, encode_geojson(geojson(tracks)))
+            self._put(KML, kml(tracks).encode())
+        self._remove_old()
 
 
 def _compressed(map_png: bytes) -> bytes:
@@ -191,25 +205,15 @@ def _summary(record: AerialRecord, targets: GroundTracks, complete: bool) -> Run
     adjustments = [tuple(m[key] for key in ("frame", "knob", "old", "new", "cause")) for m in record.adjustments]
     tables: list[Table] = [
         ("Frames that could not be located", ("frames", "cause"), _rows(record.unreliable, "cause"), "none"),
-        (
-            "Frames located with something amiss",
-            ("frames", "by", "cause"),
-            _rows(record.weak.rows, "by", "cause"),
-            "none",
-        ),
-        ("Repairs and exclusions", ("frames", "what and why"), _rows(record.repairs.rows, "cause"), "none"),
+        ("Frames located with something amiss", ("frames", "by", "cause"), _rows(record.weak, "by", "cause"), "none"),
+        ("Repairs and exclusions", ("frames", "what and why"), _rows(record.repairs, "cause"), "none"),
         ("Adjustments of the feedback loop", ("frame", "parameter", "from", "to", "cause"), adjustments, "none"),
-        (
-            "Landmarks",
-            ("name", "frames seen", "used", "reassigned in frames", "excluded in frames"),
-            landmarks,
-            "none",
-        ),
+        ("Landmarks", _LANDMARK_COLUMNS, landmarks, "none"),
     ]
     name = Path(str(record.facts.get("input", ""))).name
     title = f"Located from the air: {name}" if name else "Located from the air"
     return RunSummary.of(record, title, complete, figures, tables)
 
 
-def _rows(spans: Sequence[Mapping[str, Any]], *keys: str) -> list[tuple[Any, ...]]:
-    return [(format_span(span["first"], span["last"]), *(span[key] for key in keys)) for span in spans]
+def _rows(spans: Spans, *keys: str) -> list[tuple[Any, ...]]:
+    return [(format_span(span["first"], span["last"]), *(span[key] for key in keys)) for span in spans.rows]

@@ -20,6 +20,7 @@ from torchvision_dddas.io.output.run_record import (
     IdentityCounts,
     PeopleRecord,
     RunRecord,
+    Spans,
     TrackRecord,
 )
 from torchvision_dddas.io.output.run_report import REPORT
@@ -108,17 +109,9 @@ class GroundRecorder(RunRecorder[GroundLocations]):
     def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> GroundRecord:
         """Start the run. cameras: their names. has_degrees: whether longitudes and latitudes are known."""
         record = GroundRecord(self.folder, facts)
-        self._has_degrees = has_degrees
-        parts: list[Part[GroundLocations]] = [record, ground_tables(self.folder, cameras, has_degrees)]
-        self.add_parts(record, [*parts, GroundMaps(self.folder)] if has_degrees else parts)
+        tables = ground_tables(self.folder, cameras, has_degrees)
+        self.add_parts(record, [record, tables, GroundMaps(self.folder, has_degrees)])
         return record
-
-    def close(self, complete: bool) -> None:
-        """Put everything in its place; maps of an earlier run are removed if this one makes none."""
-        super().close(complete)
-        if not self._has_degrees:
-            for name in GroundMaps.files:
-                remove(self.folder / name)
 
 
 class ConfirmationRecorder(RunRecorder[Confirmation]):
@@ -193,7 +186,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
                 PartOf(aerial, _grounded),
                 PartOf(AerialMaps(folder, aerial, save, site, self.story), _grounded),
                 PartOf(aerial_tables(folder, has_degrees), _grounded),
-                IdentityCounts(record),
+                _IdentityCounter(record),
                 landmark_table(folder, names, has_degrees),
                 ConfirmedPositions(folder, has_degrees),
             ]
@@ -213,6 +206,20 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             made = set(self.found_files) - (set() if has_report else {REPORT})
             for name in set(PipelineRecorder.files) - made:
                 remove(self.folder / name)
+
+
+class _IdentityCounter(Part[FrameResult]):
+    """Adds the counts of identities, and the frames in which nothing was found, to the record of a run that locates."""
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record, self._counts, self._not_found = record, IdentityCounts(), Spans(is_exact=True)
+
+    def write(self, result: FrameResult) -> None:
+        followed = result.tracked
+        self._counts.add(followed)
+        if followed.cause:
+            self._not_found.add(followed.number, followed.number - 1, followed.cause)
+        self._record.counts |= {**vars(self._counts), "nothing_found": self._not_found.rows}
 
 
 def _aerial_record(folder: Path, facts: Mapping[str, Any], site: Site, save: Sequence[str]) -> AerialRecord:

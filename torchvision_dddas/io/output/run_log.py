@@ -1,4 +1,4 @@
-"""log.txt: what happened in a run and why, a line each, in the order of the frames."""
+"""log.txt: the events of a run with their causes, a line each, in the order of the frames."""
 
 import math
 import re
@@ -12,33 +12,25 @@ from torchvision_dddas.types import Adjustment, FrameResult, Order
 
 LOG_TXT = "log.txt"
 
-ADJUSTED = "adjusted"
-"""Kind of an entry: a parameter that the feedback moved."""
-WORLD = "world"
-"""An event of a simulated world."""
-PROBLEM = "problem"
-"""Something that went wrong."""
-NOTICED = "noticed"
-"""An instrument that the run noticed to be silent or frozen."""
-TOLD = "told"
-"""What ground vehicles say of a target."""
-ORDERED = "ordered"
-"""What vehicles were asked to do."""
-REPAIRED = "repaired"
-"""What was repaired or excluded."""
-MARK = "landmark"
-"""A landmark that the picture does not show."""
+# Kinds of entries, as log.txt names them.
+ADJUSTED = "adjusted"  # a parameter that the feedback moved
+WORLD = "world"  # an event of a simulated world
+PROBLEM = "problem"  # something that went wrong
+NOTICED = "noticed"  # an instrument that is silent or frozen
+VERDICT = "told"  # a target's confirmation by ground vehicles
+ORDERED = "ordered"  # an order to a vehicle
+REPAIRED = "repaired"  # a landmark that was reassigned or excluded
+LANDMARK = "landmark"  # a landmark that the picture does not show
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 _CLOSE_FRAMES = 10
-_FAR_M = 15.0
-"""A goal that moved by less is the same: it goes with a crowd."""
+_FAR_M = 15.0  # a goal that moved by less counts as the same: it follows a crowd
 _UAV = "uav"
 
 
 @dataclass
 class Entry:
-    """What happened at a frame, or in `count` frames from `first` to `last`.
+    """An event at a frame, or in `count` frames from `first` to `last`.
 
     time_s: None where it follows from the frame. short: a few words for a picture's caption.
     """
@@ -57,7 +49,7 @@ class Entry:
 
 @dataclass
 class RunLog:
-    """The entries of a run as they come, about 300 bytes each."""
+    """The entries of a run in the order of their logging, about 300 bytes each."""
 
     entries: list[Entry] = field(default_factory=list)
     _open: dict[str, Entry] = field(default_factory=dict)
@@ -68,14 +60,14 @@ class RunLog:
         self.entries.append(Entry(frame, kind, text, time_s=time_s, short=short or text))
 
     def adjusted(self, moved: Adjustment) -> None:
-        """Add a parameter that was moved, and why."""
+        """Add the adjustment of a parameter."""
         change = f"{moved.parameter} {_number(moved.old)} -> {_number(moved.new)}"
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
     def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
-        """Add something that may last: repeated within a few frames it stays one entry, also where its numbers differ.
+        """Add an event that may last: repeated within a few frames it stays one entry, also if its numbers differ.
 
-        step: frames since the last one processed. key: what makes it the same, by default its text without numbers.
+        step: frames since the last one processed. key: identifies the event, by default its text without numbers.
         """
         key = f"{kind} {key or _NUMBER.sub('0', text)}"
         entry = self._open.get(key)
@@ -86,7 +78,7 @@ class RunLog:
         self._open[key] = self.entries[-1]
 
     def ordered(self) -> list[Entry]:
-        """All entries by frame, those of one frame as they came."""
+        """All entries by frame, those of one frame in the order of their logging."""
         return sorted(self.entries, key=lambda entry: entry.first)
 
 
@@ -95,7 +87,7 @@ def _number(value: float) -> str:
 
 
 class Clock:
-    """The times of frames, from those that were processed."""
+    """The times of frames, interpolated between those that were processed."""
 
     def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
         """frame, time_s: (N,) of the processed frames, growing; NaN where a time is not known."""
@@ -119,7 +111,7 @@ class Clock:
         return self.at(entry.first) if entry.time_s is None else entry.time_s
 
     def occurrence(self, entry: Entry) -> str:
-        """In how many of the processed frames from first to last it occurred, in words; empty if in all."""
+        """`in 3 of 8 frames`: the processed frames in which it occurred; empty if in all."""
         if entry.last == entry.first:
             return ""
         since = np.searchsorted(self._processed, entry.first)
@@ -128,7 +120,7 @@ class Clock:
 
 
 def format_log(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -> str:
-    """The text of log.txt. heading: lines that go before."""
+    """The text of log.txt. heading: its first lines."""
     out = [*(f"# {line}" for line in heading), "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
     for entry in entries:
         at, occurrence = clock.of(entry), clock.occurrence(entry)
@@ -139,17 +131,17 @@ def format_log(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -
 
 
 class CommandLog:
-    """Logs what vehicles are asked to do, where it is new."""
+    """Logs new orders to vehicles."""
 
     def __init__(self) -> None:
         self._goal: dict[str, np.ndarray] = {}
 
-    def add(self, surveyed: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
+    def add(self, result: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
         """Log the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
-        command, frame = surveyed.command, surveyed.tracked.number
+        command, frame = result.command, result.tracked.number
         if command is None:
             return
-        scale = command_metres(surveyed)
+        scale = command_metres(result)
         if command.look_at is not None and _UAV not in explained and self._new(_UAV, command.look_at, scale):
             height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
             log.add(frame, ORDERED, f"the UAV keeps {_place(command.look_at, scale)} in view{height}", short="UAV sent")

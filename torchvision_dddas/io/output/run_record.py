@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
     Confirmation,
-    FrameResult,
     GroundLocations,
     PeopleFrame,
     Scene,
@@ -27,6 +27,8 @@ from torchvision_dddas.types import (
 )
 
 RUN_JSON = "run.json"
+NO_POSE = "nothing told where the camera was"
+"""The cause of a frame that is not located and says nothing of why."""
 _STEP = math.log(1.01)
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -54,6 +56,28 @@ class Durations:
         return 0.0
 
 
+class Spans:
+    """Remarks on frames. The same remark on successive frames is one row, with the first and the last of them.
+
+    is_exact: whether remarks with different numbers are different remarks.
+    """
+
+    def __init__(self, is_exact: bool = False) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._is_exact = is_exact
+        self._open: dict[str, dict[str, Any]] = {}
+
+    def add(self, frame: int, before: int, text: str, **more: Any) -> None:
+        """Add a remark on a frame. before: the number of the frame that came before it. more: further cells."""
+        key = text if self._is_exact else _NUMBER.sub("0", f"{text} {more}")
+        row = self._open.get(key)
+        if row is not None and row["last"] in (before, frame):
+            row["last"] = frame
+        else:
+            self._open[key] = row = {"first": frame, "last": frame, **more, "cause": text}
+            self.rows.append(row)
+
+
 class RunRecord:
     """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
 
@@ -68,7 +92,7 @@ class RunRecord:
         self._stages: dict[str, Durations] = {}
         self.frames = self.targets = self.unreliable_frames = 0
         self.adjustments: list[dict[str, Any]] = []
-        self.unreliable: list[dict[str, Any]] = []
+        self.unreliable = Spans(is_exact=True)
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
@@ -94,11 +118,7 @@ class RunRecord:
         ]
         if cause is not None:
             self.unreliable_frames += 1
-            last = self.unreliable[-1] if self.unreliable else None
-            if last and last["last"] == self._last and last["cause"] == cause:
-                last["last"] = number
-            else:
-                self.unreliable.append({"first": number, "last": number, "cause": cause})
+            self.unreliable.add(number, self._last, cause)
         self._last = number
 
     def close(self, complete: bool) -> None:
@@ -123,7 +143,7 @@ class RunRecord:
             **self.counts,
             "notes": list(self.notes),
             "problems": list(self.problems),
-            "unreliable": self.unreliable,
+            "unreliable": self.unreliable.rows,
             "adjustments": self.adjustments,
             "seconds": {
                 "wall": round(seconds, 3),
@@ -180,26 +200,41 @@ class DetectionRecord(RunRecord):
         self.note(scene.frame.number, len(scene.detections), scene.seconds, scene.adjustments, cause)
 
 
-class TrackRecord(RunRecord):
-    """The record of a run that gives identities, numbered from 1 without gaps."""
+@dataclass
+class IdentityCounts:
+    """Identities so far, numbered from 1 without gaps; boxes between detections, and detections without identity."""
 
-    identities = bridges = untracked = first = 0
+    identities: int = 0
+    bridges: int = 0
+    untracked: int = 0
+
+    def add(self, followed: TrackedFrame) -> None:
+        """Count a frame."""
+        self.identities = int(followed.tracks.identity.max(initial=self.identities))
+        self.bridges += int((followed.tracks.row < 0).sum())
+        self.untracked += len(followed.untracked)
+
+
+class TrackRecord(RunRecord):
+    """The record of a run that gives identities."""
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
+        super().__init__(folder, facts)
+        self.tracked = IdentityCounts()
+        self._first = 0
 
     def write(self, followed: TrackedFrame) -> None:
         """Count a frame."""
-        tracks, targets = followed.tracks, len(followed.detections)
-        seen = int((tracks.row >= 0).sum())
-        self.identities = int(tracks.identity.max(initial=self.identities))
-        self.first = self.first or followed.number
-        self.bridges += len(tracks) - seen
-        self.untracked += targets - seen
+        self.tracked.add(followed)
+        targets, tracked = len(followed.detections), self.tracked
+        self._first = self._first or followed.number
         self.counts |= {
-            "first_frame": self.first,
+            "first_frame": self._first,
             "last_frame": followed.number,
-            "identities": self.identities,
-            "tracked": self.targets + targets - self.untracked,
-            "untracked": self.untracked,
-            "bridges": self.bridges,
+            "identities": tracked.identities,
+            "tracked": self.targets + targets - tracked.untracked,
+            "untracked": tracked.untracked,
+            "bridges": tracked.bridges,
         }
         self.note(followed.number, targets, followed.seconds, followed.adjustments, followed.cause or None)
 
@@ -321,57 +356,5 @@ class AerialRecord(RunRecord):
             "weak": self.weak.rows,
             "repairs": self.repairs.rows,
         }
-        cause = None if fix.by else fix.cause or "nothing told where the camera was"
+        cause = None if fix.by else fix.cause or NO_POSE
         self.note(frame, len(grounded.box_px), grounded.seconds, grounded.adjustments, cause)
-
-
-class Spans:
-    """Remarks on frames; the same remark on successive frames is one row, also where its numbers differ."""
-
-    def __init__(self) -> None:
-        self.rows: list[dict[str, Any]] = []
-        self._open: dict[str, dict[str, Any]] = {}
-
-    def add(self, frame: int, before: int, text: str, **more: Any) -> None:
-        """Add a remark on a frame. before: the number of the frame that came before it."""
-        key = _NUMBER.sub("0", f"{text} {more}")
-        row = self._open.get(key)
-        if row is not None and row["last"] in (before, frame):
-            row["last"] = frame
-        else:
-            self._open[key] = row = {"first": frame, "last": frame, **more, "cause": text}
-            self.rows.append(row)
-
-
-class IdentityCounts:
-    """Adds counts of identities, and the spans of frames in which nothing could be found, to an aerial record."""
-
-    def __init__(self, record: RunRecord) -> None:
-        self._record = record
-        self._identities = self._bridges = self._untracked = 0
-        self._not_found: list[dict[str, Any]] = []
-
-    def write(self, result: FrameResult) -> None:
-        """Count a frame."""
-        followed = result.tracked
-        self._identities = int(followed.tracks.identity.max(initial=self._identities))
-        self._bridges += int((followed.tracks.row < 0).sum())
-        self._untracked += len(followed.untracked)
-        if followed.cause:
-            last = self._not_found[-1] if self._not_found else None
-            if last and last["cause"] == followed.cause and last["last"] == followed.number - 1:
-                last["last"] = followed.number
-            else:
-                self._not_found.append({"first": followed.number, "last": followed.number, "cause": followed.cause})
-        self._record.counts |= {
-            "identities": self._identities,
-            "bridges": self._bridges,
-            "untracked": self._untracked,
-            "nothing_found": self._not_found,
-        }
-
-    def close(self, complete: bool) -> None:
-        """Nothing to do."""
-
-    def discard(self) -> None:
-        """Nothing to do."""

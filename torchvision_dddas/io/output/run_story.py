@@ -1,4 +1,4 @@
-"""The story of a run: its log, and what its report and map tell beside what was located."""
+"""The story of a run: its log, and the events, key frames and timelines of its report and map."""
 
 import re
 from collections import Counter
@@ -14,13 +14,13 @@ from torchvision_dddas.io.maps import Signs
 from torchvision_dddas.io.output.key_frames import KeyFrames
 from torchvision_dddas.io.output.run_log import (
     ADJUSTED,
+    LANDMARK,
     LOG_TXT,
-    MARK,
     NOTICED,
     ORDERED,
     PROBLEM,
     REPAIRED,
-    TOLD,
+    VERDICT,
     WORLD,
     Clock,
     CommandLog,
@@ -28,13 +28,13 @@ from torchvision_dddas.io.output.run_log import (
     RunLog,
     format_log,
 )
-from torchvision_dddas.io.output.run_record import RunRecord
+from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, RunSummary, Table, format_span, run_report
 from torchvision_dddas.io.output.timelines import RunTimeline
 from torchvision_dddas.io.overlay import RunPictures
 from torchvision_dddas.types import FrameResult
 
-WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, TOLD: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
+WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, VERDICT: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
 """Weights of entries for the choice of key frames."""
 _LEAST_UNSEEN = 3
 """A landmark that is unseen in fewer frames is not worth a line."""
@@ -43,12 +43,12 @@ _DIGITS = re.compile(r"\d+")
 
 
 class RunStory:
-    """A part that writes log.txt, and collects what report.html tells of a run: events, timeline, key frames, signs."""
+    """A part that writes log.txt, and collects events, timeline, key frames and map signs for report.html."""
 
     def __init__(
         self, folder: Path, name: str, record: RunRecord, names: Sequence[str], pictures: RunPictures | None
     ) -> None:
-        """name: of the clip. names: of the landmarks. pictures: draws the frames, None if no key frames are wanted."""
+        """name: of the clip. names: of the landmarks. pictures: draws key frames, None for a report without them."""
         self.record = record
         self.log, self.signs = RunLog(), Signs()
         self._folder, self._name, self._names, self._pictures = folder, name, tuple(names), pictures
@@ -64,7 +64,7 @@ class RunStory:
         self._looks = 0
 
     def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
-        """Log something that the frames do not show themselves, best before its frame is written.
+        """Log an event that the results do not hold, best before its frame is written.
 
         time_s: None where it follows from the frame. kind: one of run_log's.
         """
@@ -140,7 +140,7 @@ class RunStory:
     def report(self, complete: bool) -> None:
         """Write report.html of a run that locates nothing. Raises OSError if it cannot be written."""
         record = self.record
-        identities = getattr(record, "identities", 0)
+        identities = record.counts.get("identities", 0)
         counts = (("frames", record.frames), ("detections", record.targets), ("identities", identities))
         figures = [(name, f"{count}") for name, count in counts]
         summary = self.extend(RunSummary.of(record, f"Found and followed: {self._name}", complete, figures))
@@ -148,7 +148,7 @@ class RunStory:
         write_whole(self._folder / REPORT, text.encode())
 
     def _entries(self) -> list[Entry]:
-        return [e for e in self.log.ordered() if e.kind != MARK or e.count >= _LEAST_UNSEEN]
+        return [e for e in self.log.ordered() if e.kind != LANDMARK or e.count >= _LEAST_UNSEEN]
 
     def _clock(self) -> Clock:
         return Clock(self._timeline.rows["frame"], self._timeline.rows["time_s"])
@@ -157,13 +157,13 @@ class RunStory:
         self.log.add_lasting(frame, frame - self._before, kind, text, key)
 
     def _log_location(self, result: FrameResult) -> None:
-        """Log how the picture was located, and the landmarks that it does not show."""
+        """Log why a frame was not located or only partly, repairs, and unseen landmarks."""
         grounded = result.locations
         if grounded is None:
             return
         frame, fix, marks = grounded.frame, grounded.fix, grounded.marks
         if not fix.by:
-            self._lasting(frame, PROBLEM, f"not located: {fix.cause or 'nothing told where the camera was'}")
+            self._lasting(frame, PROBLEM, f"not located: {fix.cause or NO_POSE}")
         elif fix.cause:
             self._lasting(frame, PROBLEM, f"located by {fix.by}, but {fix.cause}")
         for change in fix.changes:
@@ -171,10 +171,10 @@ class RunStory:
         shown = set(marks.landmark[np.isfinite(marks.image_px).all(axis=1)].tolist())
         for which, name in enumerate(self._names):
             if which not in shown:
-                self._lasting(frame, MARK, f"{name} is not seen in the picture", key=name)
+                self._lasting(frame, LANDMARK, f"{name} is not seen in the picture", key=name)
 
     def _log_confirmations(self, result: FrameResult) -> None:
-        """Log what ground vehicles say of targets, where it is new."""
+        """Log a target's confirmation by ground vehicles if it is new."""
         confirmed, grounded = result.confirmed, result.locations
         if confirmed is None or grounded is None:
             return
@@ -186,7 +186,7 @@ class RunStory:
             self._looks += bool(by)
             for name in by:
                 if name in vehicle_m:
-                    self.signs.look(name, vehicle_m[name], at.east_north_m[row])
+                    self.signs.add_look(name, vehicle_m[name], at.east_north_m[row])
             before = self._kind_of.get(target)
             if kind in ("unseen", before):
                 continue
@@ -195,15 +195,15 @@ class RunStory:
             text = f"{short} (probability of being human {confirmed.probability[i]:.2f})"
             text += f", seen by {' and '.join(by)}" if by else ""
             text += f"; it was told {before.replace('_', ' ')} before" if before else ""
-            self.log.add(grounded.frame, TOLD, text, short=short)
-            self.signs.told(target, kind, at.east_north_m[row])
+            self.log.add(grounded.frame, VERDICT, text, short=short)
+            self.signs.add_verdict(target, kind, at.east_north_m[row])
 
     def _add_picture(self, result: FrameResult, time_s: float, pictures: RunPictures) -> None:
         pictures.show(result)
         number = result.tracked.number
         self._waiting += self.log.entries[self._read :]
         self._read = len(self.log.entries)
-        due = [e for e in self._waiting if self._before < e.first <= number and e.kind != MARK]
+        due = [e for e in self._waiting if self._before < e.first <= number and e.kind != LANDMARK]
         self._waiting = [e for e in self._waiting if e.first > number]
         text = "; ".join(dict.fromkeys(e.short for e in due))
         if len(text) >= _MOST_CAPTION:
@@ -214,7 +214,7 @@ class RunStory:
 
 def _event_kind(entry: Entry) -> str:
     """World events and targets each are a kind; adjustments and problems are grouped by parameter and first word."""
-    if entry.kind in (WORLD, TOLD):
+    if entry.kind in (WORLD, VERDICT):
         return entry.short
     return f"{entry.kind} {_DIGITS.sub('', entry.short.split(' ')[0])}"
 

@@ -1,4 +1,4 @@
-"""What a run measured frame by frame, kept in arrays, and the panels that show it over time."""
+"""Timelines of a run: figures of each frame, kept in arrays, and the panels that show them."""
 
 import math
 from array import array
@@ -8,16 +8,16 @@ from itertools import cycle
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, TOLD, WORLD, Entry
+from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Entry
 from torchvision_dddas.io.report import Events, Line, Panel, time_chart
 from torchvision_dddas.types import Adjustment, AerialLocations, Confirmation, FrameResult
 
 KINDS = ("human", "not_human", "unseen")
-"""What ground vehicles can say of a target, as in Confirmation."""
+"""Kinds of a target in a Confirmation."""
 
 _MOST_PARAMETERS, _MOST_STAGES = 12, 7
 _STAGE_COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)
-_EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, TOLD: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2}
+_EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2}
 
 
 class Timeline:
@@ -98,7 +98,7 @@ class LocationTimeline(Timeline):
 
 
 class RunTimeline(Timeline):
-    """Targets found and followed, what ground vehicles say, adjusted parameters, events, time spent by stage."""
+    """Targets detected and tracked, confirmations, adjusted parameters, events, and the time spent by stage."""
 
     columns = ("frame", "time_s", "found", "tracked", "placed", *KINDS, "located")
 
@@ -111,9 +111,9 @@ class RunTimeline(Timeline):
         self.entries: Sequence[Entry] = ()
         """The entries of the log that are shown as events."""
 
-    def add(self, surveyed: FrameResult, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
+    def add(self, result: FrameResult, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
         """Add a frame, the time spent on it, and what was adjusted."""
-        followed, grounded = surveyed.tracked, surveyed.locations
+        followed, grounded = result.tracked, result.locations
         time_s = math.nan if followed.frame is None else followed.frame.time_s
         for stage in seconds:
             if stage not in self._seconds:
@@ -129,13 +129,13 @@ class RunTimeline(Timeline):
                 len(followed.detections),
                 int((followed.tracks.row >= 0).sum()),
                 math.nan if grounded is None else len(grounded.positions),
-                *_counts(surveyed.confirmed),
+                *_counts(result.confirmed),
                 bool(grounded.fix.by) if grounded is not None else not followed.cause,
             )
         )
 
     def values(self, parameter: str) -> np.ndarray:
-        """(N,) values of a parameter: its first until it is moved, then the last it was moved to; NaN if not finite."""
+        """(N,) values of a parameter in each frame; NaN where it is not finite."""
         moves = sorted(self._moves[parameter], key=lambda move: move[0])
         levels = np.array([moves[0][1], *(new for _, _, new in moves)], float)
         since = np.array([frame for frame, _, _ in moves])
@@ -143,7 +143,7 @@ class RunTimeline(Timeline):
         return np.where(np.isfinite(found), found, np.nan)
 
     def panels(self) -> list[Panel]:
-        """Events, targets, what ground vehicles say of them, parameters that were moved, time spent."""
+        """Events, targets, confirmations, adjusted parameters, and the time spent."""
         targets = self._lines({"found": ("found", 6), "tracked": ("with an identity", 1), "placed": ("located", 2)})
         kinds = {kind: (kind.replace("_", " "), colour) for kind, colour in zip(KINDS, (3, 2, 6), strict=True)}
         return [
@@ -165,7 +165,7 @@ class RunTimeline(Timeline):
         return found
 
     def _parameters(self) -> list[Panel]:
-        """The panels of the parameters moved most often; one that was set at the first frame and stayed has none."""
+        """The panels of the parameters moved most often, without those that never changed."""
         at, _ = self.axis()
         values = {parameter: self.values(parameter) for parameter in self._moves}
         panels: dict[str, list[str]] = {}
@@ -182,7 +182,7 @@ class RunTimeline(Timeline):
         return found
 
     def _time_spent(self) -> list[Panel]:
-        """The stages that took most, each stacked on those below; the highest first, so that none is hidden."""
+        """The slowest stages, each stacked on those below; the highest is drawn first, so that none is hidden."""
         at, _ = self.axis()
         spent_ms = {stage: 1000 * np.asarray(times, float) for stage, times in self._seconds.items()}
         by_time = sorted(spent_ms, key=lambda stage: -float(spent_ms[stage].sum()))

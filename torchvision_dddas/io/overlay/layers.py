@@ -63,14 +63,14 @@ def draw_scene(scene: Scene) -> np.ndarray:
     return picture
 
 
-def draw_people(recognized: PeopleFrame) -> np.ndarray:
+def draw_people(found: PeopleFrame) -> np.ndarray:
     """The frame with its people, (H, W, 3) uint8 BGR.
 
     A person whom the border cuts has another colour and a `?`. People below LIKELY have thin grey boxes underneath.
     """
-    picture, people = colour_picture(recognized.frame.image), recognized.people
+    picture, people = colour_picture(found.frame.image), found.people
     thick = line_width(picture)
-    for region in recognized.regions_px if recognized.regions_px is not None else ():
+    for region in found.regions_px if found.regions_px is not None else ():
         rectangle(picture, region, SEARCHED, 1)
     worst_first = np.argsort(people.score, kind="stable")
     likely = worst_first[people.score[worst_first] >= LIKELY]
@@ -85,9 +85,9 @@ def draw_people(recognized: PeopleFrame) -> np.ndarray:
     for i in likely:  # above all boxes
         cut = people.cut[i]
         label(picture, people.box_px[i], f"{people.score[i]:.2f}{'?' if cut else ''}", _colour(cut))
-    lines = [(_words(recognized), TEXT)]
-    if recognized.cause:
-        lines.append((recognized.cause, WARNING))
+    lines = [(_words(found), TEXT)]
+    if found.cause:
+        lines.append((found.cause, WARNING))
     caption(picture, lines)
     return picture
 
@@ -96,12 +96,12 @@ def _colour(cut: bool) -> Colour:
     return CUT if cut else PERSON
 
 
-def _words(recognized: PeopleFrame) -> str:
-    searched = "everywhere" if recognized.regions_px is None else f"in {recognized.share:.0%} of the windows"
-    likely = int((recognized.people.score >= LIKELY).sum())
-    unlikely = len(recognized.people) - likely
+def _words(found: PeopleFrame) -> str:
+    searched = "everywhere" if found.regions_px is None else f"in {found.share:.0%} of the windows"
+    likely = int((found.people.score >= LIKELY).sum())
+    unlikely = len(found.people) - likely
     people = f"people {likely}" + (f" + {unlikely} unlikely" if unlikely else "")
-    return f"frame {recognized.frame.number}  {people}  searched {searched}"
+    return f"frame {found.frame.number}  {people}  searched {searched}"
 
 
 class Trails:
@@ -192,28 +192,28 @@ class RunPictures:
         self._shown: FrameResult | None = None
         self._picture: np.ndarray | None = None
 
-    def show(self, surveyed: FrameResult) -> None:
+    def show(self, result: FrameResult) -> None:
         """Go on to the next frame, if it is not the same."""
-        if surveyed is self._shown:
+        if result is self._shown:
             return
         if self._shown is not None and self._picture is None:
             self._tracks.skip(self._shown.tracked)
-        self._shown, self._picture = surveyed, None
+        self._shown, self._picture = result, None
 
-    def __call__(self, surveyed: FrameResult) -> np.ndarray:
+    def __call__(self, result: FrameResult) -> np.ndarray:
         """The picture of a frame, (H, W, 3) uint8 BGR. The caller must not draw on it."""
-        self.show(surveyed)
+        self.show(result)
         if self._picture is None:
-            self._picture = self._draw(surveyed)
+            self._picture = self._draw(result)
         return self._picture
 
-    def _draw(self, surveyed: FrameResult) -> np.ndarray:
-        grounded, command = surveyed.locations, surveyed.command
+    def _draw(self, result: FrameResult) -> np.ndarray:
+        grounded, command = result.locations, result.command
         commanded = "" if command is None else summarize_command(command)
         lines = [(commanded, TEXT)] if commanded else []
         if grounded is None:
-            return self._tracks(surveyed.tracked, lines)
-        picture = self._tracks(surveyed.tracked, [_location_line(grounded), *lines], _letters(surveyed))
+            return self._tracks(result.tracked, lines)
+        picture = self._tracks(result.tracked, [_location_line(grounded), *lines], _letters(result))
         state = dict(zip(grounded.fix.landmark.tolist(), grounded.fix.state, strict=True))
         arm = 6 * line_width(picture)
         for which, place in zip(grounded.marks.landmark.tolist(), grounded.marks.image_px, strict=True):
@@ -226,12 +226,12 @@ class RunPictures:
             cv2.drawMarker(picture, middle, colour, cv2.MARKER_CROSS, arm, line_width(picture))
             name = self._names[which] + ("" if became == "used" else f" {became}")
             label(picture, np.array([place[0] + 2 * arm, place[1] - arm, 0, 0]), name, colour)
-        self._draw_orders(picture, surveyed)
+        self._draw_orders(picture, result)
         return picture
 
-    def _draw_orders(self, picture: np.ndarray, surveyed: FrameResult) -> None:
+    def _draw_orders(self, picture: np.ndarray, result: FrameResult) -> None:
         """Draw an arrow from each vehicle towards its goal, at most a tenth of the picture long."""
-        grounded, command, scale = surveyed.locations, surveyed.command, command_metres(surveyed)
+        grounded, command, scale = result.locations, result.command, command_metres(result)
         if grounded is None or command is None or scale is None or not command.orders:
             return
         turned = pixels_per_metre(grounded)
@@ -252,9 +252,9 @@ class RunPictures:
             cv2.arrowedLine(picture, ends[0], ends[1], ORDER, line_width(picture) + 1, cv2.LINE_AA, tipLength=0.3)
 
 
-def _letters(surveyed: FrameResult) -> dict[int, str]:
+def _letters(result: FrameResult) -> dict[int, str]:
     """The letter of each identity that ground vehicles were asked about."""
-    confirmed, grounded = surveyed.confirmed, surveyed.locations
+    confirmed, grounded = result.confirmed, result.locations
     if confirmed is None or grounded is None:
         return {}
     targets = grounded.positions.target[confirmed.row].tolist()
@@ -279,12 +279,12 @@ ToMetres = Callable[[np.ndarray], np.ndarray]
 """(2,) local metres of a place in a command."""
 
 
-def command_metres(surveyed: FrameResult) -> ToMetres | None:
+def command_metres(result: FrameResult) -> ToMetres | None:
     """A function from the places of a frame's commands to local metres; None where the frame does not tell enough.
 
     Commands are in degrees where landmarks have degrees, else in local metres. The scale follows from the landmarks.
     """
-    grounded, degrees = surveyed.locations, surveyed.mark_lonlat_deg
+    grounded, degrees = result.locations, result.mark_lonlat_deg
     if grounded is None:
         return None
     if degrees is None:

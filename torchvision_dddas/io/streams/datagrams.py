@@ -1,4 +1,4 @@
-"""Messages as UDP datagrams, to one host or to all that listen to a multicast address."""
+"""Sends messages as UDP datagrams to a host or a multicast address."""
 
 import errno
 import socket
@@ -12,10 +12,10 @@ from urllib.parse import parse_qsl, urlsplit
 from torchvision_dddas.errors import InputError
 
 MOST_BYTES = 65_507
-"""Of a datagram's content over IPv4: 65535 without the heads of IP and UDP."""
+"""The longest content of a datagram over IPv4: 65535 less the headers of IP and UDP."""
 
 LEAST_BYTES = 512
-"""Less would not hold one target."""
+"""The least limit of a datagram, which holds one target."""
 
 WANTED = "wanted udp://HOST:PORT, or udp://[IPV6]:PORT, with ?ttl=1 to 255, bytes=512 to 65507 or interface=NAME, by &"
 
@@ -38,8 +38,8 @@ class Address:
     interface: str = ""
 
 
-def address(text: str, asked: str) -> Address:
-    """What `udp://HOST:PORT?ttl=4` says. asked: the whole option, for the line of an InputError."""
+def parse_address(text: str, asked: str) -> Address:
+    """Parse `udp://HOST:PORT?ttl=4`. asked: the whole option, for the message of an InputError."""
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port
@@ -58,7 +58,7 @@ def address(text: str, asked: str) -> Address:
 
 
 class DatagramOutlet:
-    """An Outlet of datagrams, a message each. What cannot be sent now is lost: nobody wants old places later."""
+    """An Outlet of datagrams, one per message. What cannot be sent at once is lost: old places are of no use later."""
 
     def __init__(self, to: Address) -> None:
         """Raises OSError if the host's name is not known or there is no way to it."""
@@ -66,7 +66,7 @@ class DatagramOutlet:
         self.most_bytes = to.most_bytes
         self._to = to
         self._kept: list[bytes] = []
-        # Listeners mostly know IPv4 only. The name is asked for once: an answer may take many seconds.
+        # IPv4 first, as most listeners know no other. The name is resolved once: that may take many seconds.
         found = socket.getaddrinfo(to.host, to.port, type=socket.SOCK_DGRAM)
         self._ways = sorted({(family, place) for family, _, _, _, place in found}, key=lambda w: w[0] != socket.AF_INET)
         self._socket: socket.socket | None = None
@@ -131,7 +131,7 @@ class DatagramOutlet:
         try:
             self._socket.send(message)
         except ConnectionRefusedError:
-            # It is told at the next sending what became of an earlier one; this one was not sent yet.
+            # The error belongs to an earlier datagram; this one was not sent yet.
             self._lose(1, f"nobody listens at port {self._to.port} of {self._to.host}")
             with suppress(ConnectionRefusedError):
                 self._socket.send(message)
@@ -143,7 +143,7 @@ class DatagramOutlet:
 
 
 def _prepared(opened: socket.socket, family: int, place: Place, to: Address) -> Place:
-    """What the address asks for beside the place is set; returns the place, with the interface where it names one."""
+    """Set the socket's options; return the place, with the interface if one is given."""
     four = family == socket.AF_INET
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
     if to.ttl is not None and four:
@@ -160,4 +160,4 @@ def _prepared(opened: socket.socket, family: int, place: Place, to: Address) -> 
         opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, request)
         return place
     opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, number)
-    return (*place[:3], number)  # an address that is good on one link only says which by the interface
+    return (*place[:3], number)  # a link-local address names its link

@@ -1,4 +1,4 @@
-"""One frame as a line of JSON: what moves, who is who, where on the ground. docs/stream.md has the table of fields."""
+"""A frame as a line of JSON: targets, people and places. docs/stream.md has the table of fields."""
 
 import json
 import math
@@ -16,7 +16,7 @@ _LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four
 
 
 def json_lines(
-    surveyed: FrameResult | None,
+    result: FrameResult | None,
     people: TrackedFrame | None,
     about: About,
     age_s: float = math.nan,
@@ -24,13 +24,12 @@ def json_lines(
 ) -> list[bytes]:
     """The lines of a frame, ASCII and with their line ends: one, or one each where the two are of different frames.
 
-    surveyed, people: as in Stream.write. age_s: from the capture of the frame to now. most_bytes: a longer line is told
-    in parts, each with some of the targets and people, its number `part` from 1 and their count `parts`; 0: it is not.
-    A line of one target that is still longer is left as it is.
-    Numbers that are not finite are null: NaN is no JSON.
+    result, people: as in Stream.write. age_s: from the capture of the frame to now. most_bytes: a longer line is split
+    into parts, each with some of the targets and people, its number `part` from 1 and their count `parts`; 0: never.
+    A line of one target is never split. Numbers that are not finite are null.
     """
-    apart = surveyed is not None and people is not None and surveyed.tracked.number != people.number
-    frames = [(surveyed, None), (None, people)] if apart else [(surveyed, people)]
+    apart = result is not None and people is not None and result.tracked.number != people.number
+    frames = [(result, None), (None, people)] if apart else [(result, people)]
     lines = []
     for of, seen in frames:
         fields = _frame(of, seen, about, age_s)
@@ -39,10 +38,10 @@ def json_lines(
     return lines
 
 
-def _frame(surveyed: FrameResult | None, people: TrackedFrame | None, about: About, age_s: float) -> dict[str, Any]:
-    followed = surveyed.tracked if surveyed is not None else people
+def _frame(result: FrameResult | None, people: TrackedFrame | None, about: About, age_s: float) -> dict[str, Any]:
+    followed = result.tracked if result is not None else people
     assert followed is not None
-    grounded = surveyed.locations if surveyed is not None else None
+    grounded = result.locations if result is not None else None
     time_s = math.nan
     if followed.frame is not None:
         time_s = followed.frame.time_s
@@ -55,16 +54,16 @@ def _frame(surveyed: FrameResult | None, people: TrackedFrame | None, about: Abo
         "utc": utc(about.start_utc_s + time_s),
         "age_s": _number(age_s, 4),
         "cause": followed.cause,
-        "targets": None if surveyed is None else _targets(surveyed),
+        "targets": None if result is None else _targets(result),
         "people": None if people is None else list(_boxes(people)),
-        "ground": None if grounded is None else _ground(grounded, surveyed, about),
+        "ground": None if grounded is None else _ground(grounded, result, about),
         "adjustments": [_adjustment(adjustment) for adjustment in dict.fromkeys(moved)],
     }
 
 
-def _targets(surveyed: FrameResult) -> list[dict[str, Any]]:
-    targets = list(_boxes(surveyed.tracked))
-    places = {} if surveyed.locations is None else _places(surveyed)
+def _targets(result: FrameResult) -> list[dict[str, Any]]:
+    targets = list(_boxes(result.tracked))
+    places = {} if result.locations is None else _places(result)
     for target in targets:
         target |= places.get(target["id"], {})
     return targets
@@ -91,9 +90,9 @@ def _boxes(followed: TrackedFrame) -> Iterator[dict[str, Any]]:
         yield fields
 
 
-def _places(surveyed: FrameResult) -> dict[int, dict[str, Any]]:
-    """Where the targets stand, and what ground vehicles say of them, by identity."""
-    grounded, confirmed = surveyed.locations, surveyed.confirmed
+def _places(result: FrameResult) -> dict[int, dict[str, Any]]:
+    """Places and confirmations of the targets, by identity."""
+    grounded, confirmed = result.locations, result.confirmed
     assert grounded is not None
     at = grounded.positions
     places = {}
@@ -115,9 +114,9 @@ def _places(surveyed: FrameResult) -> dict[int, dict[str, Any]]:
     return places
 
 
-def _ground(grounded: AerialLocations, surveyed: FrameResult | None, about: About) -> dict[str, Any]:
+def _ground(grounded: AerialLocations, result: FrameResult | None, about: About) -> dict[str, Any]:
     fix, marks = grounded.fix, grounded.marks
-    degrees = surveyed.mark_lonlat_deg if surveyed is not None else None
+    degrees = result.mark_lonlat_deg if result is not None else None
     landmarks = []
     for row, landmark in enumerate(marks.landmark.tolist()):
         known = 0 <= landmark < len(about.landmarks)
@@ -162,17 +161,17 @@ def _number(value: float, digits: int) -> float | None:
 
 
 def _numbers(values: Sequence[float], digits: int) -> list[float] | None:
-    """None where any is unknown: half a place is none."""
+    """None if any number is unknown."""
     return [round(float(v), digits) for v in values] if all(map(math.isfinite, values)) else None
 
 
 def _encoded(fields: dict[str, Any]) -> bytes:
-    # ASCII: what is odd in a name, line ends and halves of surrogates too, is escaped and cannot cut a line.
+    # ASCII: special characters of names, also line ends, are escaped and cannot break a line.
     return (json.dumps(fields, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
 
 
 def _parts(fields: dict[str, Any], most_bytes: int) -> list[bytes]:
-    """The same in several lines. What is of the whole frame stands in the first."""
+    """The same in several lines; fields of the whole frame are in the first."""
     first = {**fields, "part": 1, "parts": 1_000_000}
     rest = {name: fields[name] for name in ("frame", "time_s", "utc", "age_s", "cause")}
     rest |= {"part": 1_000_000, "parts": 1_000_000}

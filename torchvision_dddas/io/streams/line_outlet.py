@@ -1,4 +1,4 @@
-"""Lines into a file, a pipe or standard output: whole lines only, and never waiting for a slow reader."""
+"""Writes whole lines into a file, a pipe or standard output, and never waits for a slow reader."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 KEPT_BYTES = 1 << 20
-"""Of lines that wait for a slow reader or for room on the disk; of more the oldest are lost."""
+"""Lines that wait for a slow reader or for room on the disk; beyond this the oldest are lost."""
 
 _AT_ONCE = 4096  # Linux: a pipe that is ready takes so much without waiting, and in one piece
 _LAST_S = 1.0  # how long closing may wait for a reader
@@ -29,7 +29,7 @@ class LineOutlet:
         self._path = path
         self._kept: deque[bytes] = deque()
         self._kept_bytes = 0
-        self._begun = 0  # bytes of the first line kept that are out already
+        self._begun = 0  # bytes of the first line kept that are written already
         self._file, self._regular = -1, False
         try:
             self._open()
@@ -43,7 +43,7 @@ class LineOutlet:
             self._kept.append(message)
             self._kept_bytes += len(message)
         while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
-            # A line that is half out stays: the next one must not begin in its middle.
+            # A line that is partly written stays, so that the next one does not begin in its middle.
             oldest = 1 if self._begun else 0
             self._kept_bytes -= len(self._kept[oldest])
             del self._kept[oldest]
@@ -63,7 +63,7 @@ class LineOutlet:
                 return
             except OSError as error:
                 self._take_back()
-                raise _in_words(error) from error
+                raise _explained(error) from error
             if self._begun >= len(line):
                 self._kept.popleft()
                 self._kept_bytes -= len(line)
@@ -106,7 +106,7 @@ class LineOutlet:
             try:
                 self._file = os.open(self._path, flags, 0o666)
             except OSError as error:
-                raise _in_words(error) from error
+                raise _explained(error) from error
         self._regular = stat.S_ISREG(os.fstat(self._file).st_mode)
         self._begun = 0
         if self._regular and self._path is not None and _ends_within_a_line(self._path):
@@ -121,7 +121,7 @@ class LineOutlet:
         return bool(poll.poll(max(wait_s, 0.0) * 1000))
 
     def _take_back(self) -> None:
-        """Take the beginning of a line that a full disk broke off out of the file again, if it is the file's end."""
+        """Truncate the beginning of a line that a full disk cut off, if it is at the file's end."""
         if not (self._regular and self._begun):
             return
         with suppress(OSError):
@@ -132,7 +132,7 @@ class LineOutlet:
                 self._begun = 0
 
     def _follow_path(self) -> None:
-        """Open the file anew where its name was given to another, as is done to keep logs short."""
+        """Open the file anew if it was renamed, as log rotation does."""
         if self._path is None or not self._regular or self._begun:
             return
         try:
@@ -161,6 +161,5 @@ def _ends_within_a_line(path: Path) -> bool:
         return False
 
 
-def _in_words(error: OSError) -> OSError:
-    """The same with words for a person."""
+def _explained(error: OSError) -> OSError:
     return OSError(error.errno, _WORDS.get(error.errno or 0, error.strerror or str(error)))

@@ -1,4 +1,4 @@
-"""What a user asks for in one word, `json:-` or `cot:udp://239.2.3.1:6969`, as a stream."""
+"""Opens the streams of `--emit`, such as `json:-` or `cot:udp://239.2.3.1:6969`."""
 
 import os
 import sys
@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.streams.stream import About, Encoder, Outlet, Stream, Tell
+from torchvision_dddas.io.streams.stream import About, Encoder, Notify, Outlet, Stream
 
 WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
 
@@ -16,13 +16,12 @@ _MOST_WAIT_S = 2.0  # a datagram costs nothing to try
 
 
 def open_stream(
-    text: str, about: About, tell: Tell, retry_s: float = 0.5, retry_most_s: float = 30.0, option: str = "--emit"
+    text: str, about: About, notify: Notify, retry_s: float = 0.5, retry_most_s: float = 30.0, option: str = "--emit"
 ) -> Stream:
-    """The stream that a user asks for. tell: called with `sink` and words when something is wrong, and when it is well.
+    """Open a stream. notify: called when it breaks and when it works again. retry_s, retry_most_s: as in Stream.
 
-    retry_s, retry_most_s: a broken outlet is tried again after the first, then twice that, up to the second.
-    Raises InputError with one line: not such a word, a file that cannot be written or holds something else, a host that
-    is not known, events for which there are no places or no clock.
+    Raises InputError: an unknown kind, a file that cannot be written or holds something else, an unknown host, or
+    events without places or a clock.
     """
     kind, colon, place = text.partition(":")
     datagrams = _is_address(place)
@@ -33,18 +32,18 @@ def open_stream(
         outlet = _datagrams(place, f"{option} {text}") if datagrams else _lines(place, kind, f"{option} {text}")
     except OSError as error:
         raise InputError(f"{option} {text}: {error.strerror or error}; choose another place") from None
-    return Stream(text, encode, outlet, tell, retry_s, min(retry_most_s, _MOST_WAIT_S) if datagrams else retry_most_s)
+    return Stream(text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if datagrams else retry_most_s)
 
 
 def open_streams(
     texts: Sequence[str],
     about: About,
-    tell: Tell,
+    notify: Notify,
     retry_s: float = 0.5,
     retry_most_s: float = 30.0,
     option: str = "--emit",
 ) -> list[Stream]:
-    """Several, all or none. Raises InputError as open_stream does, and where two would write to one file."""
+    """Open all streams or none. Raises InputError as open_stream does, and if two would write to one file."""
     places: dict[str, str] = {}
     for text in texts:
         place = text.partition(":")[2]
@@ -59,7 +58,7 @@ def open_streams(
     with ExitStack() as opened:
         streams = []
         for text in texts:
-            streams.append(open_stream(text, about, tell, retry_s, retry_most_s, option))
+            streams.append(open_stream(text, about, notify, retry_s, retry_most_s, option))
             opened.callback(streams[-1].close)
         opened.pop_all()
     return streams
@@ -83,11 +82,11 @@ def _encoder(kind: str, about: About, asked: str) -> Encoder:
     if kind == "json":
         from torchvision_dddas.io.streams.json_lines import json_lines
 
-        return lambda surveyed, people, age_s, most_bytes: json_lines(surveyed, people, about, age_s, most_bytes)
+        return lambda result, people, age_s, most_bytes: json_lines(result, people, about, age_s, most_bytes)
     if kind == "mot":
         from torchvision_dddas.io.streams.tool_messages import mot_rows
 
-        return lambda surveyed, people, age_s, most_bytes: mot_rows(surveyed, people, most_bytes)
+        return lambda result, people, age_s, most_bytes: mot_rows(result, people, most_bytes)
     if not about.geographic:
         raise InputError(
             f"{asked}: such events need longitudes and latitudes; give --landmarks or --telemetry in degrees, or "
@@ -98,13 +97,13 @@ def _encoder(kind: str, about: About, asked: str) -> Encoder:
     from torchvision_dddas.io.streams.tool_messages import CotEvents
 
     events = CotEvents(about)
-    return lambda surveyed, people, age_s, most_bytes: events(surveyed)
+    return lambda result, people, age_s, most_bytes: events(result)
 
 
 def _datagrams(place: str, asked: str) -> Outlet:
-    from torchvision_dddas.io.streams.datagrams import DatagramOutlet, address
+    from torchvision_dddas.io.streams.datagrams import DatagramOutlet, parse_address
 
-    return DatagramOutlet(address(place, asked))
+    return DatagramOutlet(parse_address(place, asked))
 
 
 def _lines(place: str, kind: str, asked: str) -> Outlet:

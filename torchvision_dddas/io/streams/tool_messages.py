@@ -13,19 +13,19 @@ from torchvision_dddas.io.tables import MOT_TRACKS
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
-"""Added to the identities of people, who are followed apart from targets: the text has no column for a kind."""
+"""Added to the identities of people, who are tracked apart from targets: the format has no column for a kind."""
 
 _FARTHEST_PX = 1e7
 EVERY_S = 1.0
 """Seconds between two events of a target."""
 
 
-def mot_rows(surveyed: FrameResult | None, people: TrackedFrame | None, most_bytes: int = 0) -> list[bytes]:
-    """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line a box that has an identity: targets, then people.
+def mot_rows(result: FrameResult | None, people: TrackedFrame | None, most_bytes: int = 0) -> list[bytes]:
+    """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line per box with an identity: targets, then people.
 
-    One message a frame, or where that is longer than most_bytes several of whole lines. A box without end is no row.
+    One message per frame, or several of whole lines if it is longer than most_bytes. Infinite boxes are left out.
     """
-    text = "" if surveyed is None else MOT_TRACKS.format_rows(track_rows(_with_identity(surveyed.tracked, 0)))
+    text = "" if result is None else MOT_TRACKS.format_rows(track_rows(_with_identity(result.tracked, 0)))
     text += "" if people is None else MOT_TRACKS.format_rows(track_rows(_with_identity(people, PEOPLE_FROM)))
     messages = [b""]
     for line in text.encode("ascii").splitlines(keepends=True):
@@ -56,9 +56,9 @@ class CotEvents:
         self._sent_s: dict[int, float] = {}
         self._begun_utc_s: float | None = None  # stays when the clock is set, so that targets keep their uid
 
-    def __call__(self, surveyed: FrameResult | None) -> list[bytes]:
+    def __call__(self, result: FrameResult | None) -> list[bytes]:
         """The events of a frame, a message with its line end each; none for places without longitude and latitude."""
-        grounded = None if surveyed is None else surveyed.locations
+        grounded = None if result is None else result.locations
         degrees = None if grounded is None else grounded.positions.lonlat_deg
         if grounded is None or degrees is None or utc(self._utc(grounded.time_s)) is None:
             return []
@@ -84,5 +84,5 @@ class CotEvents:
 
     def _forget(self, now_s: float) -> None:
         """Forget targets sent a second ago; all of them where time went back."""
-        # A hair less, so that the rounding of time stamps costs no event.
+        # Rounded time stamps must not skip an event.
         self._sent_s = {target: at for target, at in self._sent_s.items() if 0 <= now_s - at < EVERY_S - 1e-6}
