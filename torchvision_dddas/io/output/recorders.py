@@ -208,7 +208,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
                 remove(self.folder / name)
 
 
-class _IdentityCounter(Part[FrameResult]):
+class _IdentityCounter:
     """Adds the counts of identities, and the frames in which nothing was found, to the record of a run that locates."""
 
     def __init__(self, record: RunRecord) -> None:
@@ -220,6 +220,12 @@ class _IdentityCounter(Part[FrameResult]):
         if followed.cause:
             self._not_found.add(followed.number, followed.number - 1, followed.cause)
         self._record.counts |= {**vars(self._counts), "nothing_found": self._not_found.rows}
+
+    def close(self, complete: bool) -> None:
+        """Nothing to write."""
+
+    def discard(self) -> None:
+        """Nothing to remove."""
 
 
 def _aerial_record(folder: Path, facts: Mapping[str, Any], site: Site, save: Sequence[str]) -> AerialRecord:
