@@ -8,7 +8,6 @@ import pytest
 
 from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas import geometry
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.io.output import AerialRecorder, Site
@@ -188,29 +187,6 @@ def test_the_record_counts_by_what_frames_were_located_and_says_what_went_wrong(
     text = (tmp_path / "report.html").read_text()
     for words in ("4 to 5", "nothing in view", "2 of 4 landmarks", "swapped: chi2 81 for 8", "detected &lt;poorly&gt;"):
         assert words in text
-
-
-def test_ctrl_c_leaves_valid_files_up_to_the_last_whole_frame(tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, GOOD[:5], fail=KeyboardInterrupt())
-    assert names(tmp_path) == ALL
-    assert json.loads((tmp_path / "run.json").read_text())["state"] == "interrupted"
-    assert read_positions(tmp_path / "positions.csv").frame.max() == 5
-    assert json.loads((tmp_path / "tracks.geojson").read_text())["features"][0]["properties"]["frames"] == [
-        1,
-        2,
-        3,
-        4,
-        5,
-    ]
-    assert "interrupted" in (tmp_path / "report.html").read_text()
-
-
-def test_a_mistake_leaves_nothing_that_looks_whole(tmp_path):
-    with pytest.raises(InputError):
-        run(tmp_path, GOOD[:2], fail=InputError("frame 3 is no picture"))
-    assert names(tmp_path) == {"run.json"}
-    assert json.loads((tmp_path / "run.json").read_text())["problems"] == ["frame 3 is no picture"]
 
 
 @pytest.mark.parametrize("frames", [[], [grounded(1, by="", states=(), cause="nothing in view")]])

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.output import PROBLEM, PipelineRecorder, Site
 from torchvision_dddas.io.output.tables import landmark_table
@@ -95,19 +94,6 @@ def test_the_record_counts_identities_beside_what_was_located(tmp_path):
     assert record["landmarks"]["blue"]["used"] == 0
     assert len(rows(tmp_path / "tracks.csv")) == len(rows(tmp_path / "detections.csv")) == 2
     assert not (tmp_path / "overlay.mp4").exists()
-
-
-def test_a_run_that_fails_leaves_nothing_that_looks_whole(tmp_path):
-    def failing():
-        with PipelineRecorder(tmp_path / "out", ("overlay",)) as output:
-            output.begin({"input": "clip"}, 10.0, (200, 120), Site(NAMES))
-            output.write(surveyed(1))
-            raise InputError("the disk is full")
-
-    with pytest.raises(InputError):
-        failing()
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.json"}
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["state"] == "failed"
 
 
 def test_landmarks_are_drawn_in_the_colour_of_what_became_of_them():
@@ -241,16 +227,6 @@ def test_the_report_is_one_light_page_with_plots_of_knobs_key_frames_and_causes(
 def test_without_a_truth_there_is_no_section_of_it(tmp_path):
     record = flown(tmp_path, [surveyed(1), surveyed(2)])
     assert "Against the truth" not in (tmp_path / "report.html").read_text() and "truth_score" not in record
-
-
-def test_an_interrupted_run_has_its_log_too(tmp_path):
-    def stopped():
-        yield surveyed(1, by="", cause="dark", states=("excluded",) * 2)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        flown(tmp_path, stopped())
-    assert "interrupted" in (tmp_path / "log.txt").read_text() and "dark" in log(tmp_path)[0]
 
 
 def test_a_run_that_locates_nothing_has_a_log_and_a_report_without_a_map(tmp_path):

@@ -7,11 +7,30 @@ import signal
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
+from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.output import DetectionRecorder, parse_save
+from torchvision_dddas.io.output import (
+    AerialRecorder,
+    DetectionRecorder,
+    PeopleRecorder,
+    PipelineRecorder,
+    Site,
+    parse_save,
+)
 from torchvision_dddas.io.output.run_record import Durations, finite
+from torchvision_dddas.types import (
+    Adjustment,
+    Detections,
+    Frame,
+    FrameResult,
+    People,
+    PeopleFrame,
+    TrackedFrame,
+    Tracks,
+)
 
 
 def run_json(folder):
@@ -20,6 +39,63 @@ def run_json(folder):
 
 def visible(folder):
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+PICTURE = np.zeros((60, 80, 3), np.uint8)
+SITE = Site(NAMES, ORIGIN, START, 10.0)
+
+
+def tracked(number):
+    return TrackedFrame(number, Frame(number, number / 10, PICTURE), Detections(), Tracks(number))
+
+
+# A recorder, how it begins, and the item of a frame.
+RECORDERS = {
+    "people": (PeopleRecorder, lambda r: r.begin({}, 10), lambda n: PeopleFrame(Frame(n, 0.1, PICTURE), People())),
+    "aerial": (AerialRecorder, lambda r: r.begin({}, SITE), grounded),
+    "run": (PipelineRecorder, lambda r: r.begin({}, 10, (80, 60)), lambda n: FrameResult(tracked(n))),
+    "run, located": (
+        PipelineRecorder,
+        lambda r: r.begin({}, 10, (80, 60), SITE),
+        lambda n: FrameResult(tracked(n), grounded(n)),
+    ),
+}
+
+
+def record(kind, folder, frames=3, error=None):
+    make, begin, item = RECORDERS[kind]
+    with make(folder) as recorder:
+        begin(recorder)
+        for number in range(1, frames + 1):
+            recorder.write(item(number))
+        if error is not None:
+            raise error
+
+
+@pytest.mark.parametrize("kind", RECORDERS)
+def test_a_recorder_leaves_the_same_files_after_ctrl_c_and_only_the_record_after_an_error(tmp_path, kind):
+    record(kind, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        record(kind, tmp_path / "interrupted", error=KeyboardInterrupt())
+    with pytest.raises(InputError):
+        record(kind, tmp_path / "failed", error=InputError("frame 4 is no picture"))
+    assert visible(tmp_path / "whole") == visible(tmp_path / "interrupted")
+    assert set(visible(tmp_path / "whole")) <= set(RECORDERS[kind][0].files)
+    assert visible(tmp_path / "failed") == ["run.json"]
+    states = [run_json(tmp_path / name)["state"] for name in ("whole", "interrupted", "failed")]
+    assert states == ["complete", "interrupted", "failed"]
+    assert run_json(tmp_path / "failed")["problems"] == ["frame 4 is no picture"]
+
+
+@pytest.mark.parametrize("kind", RECORDERS)
+def test_a_recorder_replaces_no_file_of_another_program(tmp_path, kind):
+    make = RECORDERS[kind][0]
+    for name in make.files:
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(InputError, match=f"{name} was not written by dddas"):
+            make(tmp_path)
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()
 
 
 def fill(folder, scenes, save=("masks", "overlay")):
@@ -224,10 +300,59 @@ def test_median_of_durations_is_within_a_hundredth():
 
 
 def test_numbers_that_json_cannot_hold_become_null():
-    import numpy as np
-
     assert finite({"a": np.float32("nan"), "b": (np.int64(3), Path("x")), 1: True}) == {
         "a": None,
         "b": [3, "x"],
         "1": True,
     }
+
+
+def people_frame(number, share=1.0, cause="", adjustments=()):
+    box_px = np.array([[10, 20, 30, 90.0], [60, 5, 30, 80]])
+    people = People(box_px, np.array([0.9, 0.4]), np.ones(2), np.array([False, True]), box_px) if share else People()
+    frame = Frame(number, 0.1 * number, np.zeros((120, 160, 3), np.uint8))
+    return PeopleFrame(
+        frame, people, None if share == 1 else np.zeros((3, 4)), share, cause, adjustments, {"score": 0.02}
+    )
+
+
+def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(tmp_path):
+    line = Adjustment(2, "people.regions_share", 1.0, 0.2, "2 people expected")
+    with PeopleRecorder(tmp_path / "out", ()) as output:
+        output.begin({"input": "x"}, 10)
+        for one in (
+            people_frame(1),
+            people_frame(2, 0.2, adjustments=(line,)),
+            people_frame(3, 0, cause="the frame could not be read"),
+            people_frame(4, 0.4),
+            people_frame(5, 0),
+        ):
+            output.write(one)
+    kept = run_json(tmp_path / "out")
+    assert (kept["targets"], kept["unlikely"], kept["cut"], kept["frames"]) == (
+        6,
+        3,
+        3,
+        {"written": 5, "unreliable": 1},
+    )
+    assert kept["searched"] == {
+        "share_of_windows": pytest.approx(0.4),
+        "frames_everywhere": 1,
+        "frames_in_regions": 2,
+        "frames_nowhere": 1,
+    }
+    assert kept["unreliable"] == [{"first": 3, "last": 3, "cause": "the frame could not be read"}]
+    assert [a["cause"] for a in kept["adjustments"]] == ["2 people expected"]
+    assert kept["seconds"]["stages"]["score"]["total"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_a_clip_gets_a_film_and_a_picture_a_picture(tmp_path, single):
+    with PeopleRecorder(tmp_path) as output:
+        record_of_run = output.begin({}, 10, single)
+        for number in range(1, 2 if single else 4):
+            output.write(people_frame(number))
+    name, other = ("overlay.png", "overlay.mp4") if single else ("overlay.mp4", "overlay.png")
+    assert record_of_run.overlay == name
+    assert (tmp_path / name).exists() and not (tmp_path / other).exists()
+    assert single or cv2.VideoCapture(str(tmp_path / name)).get(cv2.CAP_PROP_FRAME_COUNT) == 3
