@@ -50,8 +50,12 @@ class RunSummary:
         tables: Sequence[Table] = (),
     ) -> "RunSummary":
         """Summarize a run with the facts and notes of its record."""
-        state = "complete" if complete else "interrupted: up to the last whole frame"
-        return cls(title, state, figures, record.facts, tables, [*record.notes, *record.problems])
+        return cls(title, describe_state(complete), figures, record.facts, tables, [*record.notes, *record.problems])
+
+
+def describe_state(complete: bool) -> str:
+    """How a run ended, in words."""
+    return "complete" if complete else "interrupted: up to the last whole frame"
 
 
 def run_report(summary: RunSummary, timeline: Timeline) -> str:

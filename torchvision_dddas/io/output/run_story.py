@@ -29,7 +29,7 @@ from torchvision_dddas.io.output.run_log import (
     format_log,
 )
 from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
-from torchvision_dddas.io.output.run_report import REPORT, RunSummary, Table, format_span, run_report
+from torchvision_dddas.io.output.run_report import REPORT, RunSummary, Table, describe_state, format_span, run_report
 from torchvision_dddas.io.output.timelines import RunTimeline
 from torchvision_dddas.io.overlay import RunPictures
 from torchvision_dddas.types import FrameResult
@@ -94,8 +94,8 @@ class RunStory:
     def close(self, complete: bool) -> None:
         """Write log.txt and add the run's counts to its record. Raises OSError if it cannot be written."""
         clock, rows = self._clock(), self._timeline.rows
-        state = "complete" if complete else "interrupted: up to the last whole frame"
-        heading = [f"{self._name or 'run'}: {state}, {len(rows)} frames looked at; settings and totals are in run.json"]
+        ended = f"{self._name or 'run'}: {describe_state(complete)}"
+        heading = [f"{ended}, {len(rows)} frames looked at; settings and totals are in run.json"]
         write_whole(self._folder / LOG_TXT, format_log(self._entries(), clock, heading).encode())
         counts = self.record.counts
         if events := [e for e in self.log.ordered() if e.kind == WORLD]:

@@ -7,7 +7,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.streams.datagrams import DatagramOutlet, parse_address
+from torchvision_dddas.io.streams.json_lines import json_lines
+from torchvision_dddas.io.streams.line_outlet import LineOutlet
 from torchvision_dddas.io.streams.stream import About, Encoder, Notify, Outlet, Stream
+from torchvision_dddas.io.streams.tool_messages import CotEvents, mot_rows
 
 WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
 
@@ -29,7 +33,11 @@ def open_stream(
         raise InputError(f"{option} {text!r} is no stream; {WANTED}")
     encode = _encoder(kind, about, f"{option} {text}")
     try:
-        outlet = _datagrams(place, f"{option} {text}") if datagrams else _lines(place, kind, f"{option} {text}")
+        outlet: Outlet
+        if datagrams:
+            outlet = DatagramOutlet(parse_address(place, f"{option} {text}"))
+        else:
+            outlet = _lines(place, kind, f"{option} {text}")
     except OSError as error:
         raise InputError(f"{option} {text}: {error.strerror or error}; choose another place") from None
     return Stream(text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if datagrams else retry_most_s)
@@ -78,14 +86,9 @@ def _path(place: str, asked: str) -> Path:
 
 
 def _encoder(kind: str, about: About, asked: str) -> Encoder:
-    # Each is loaded only when asked for.
     if kind == "json":
-        from torchvision_dddas.io.streams.json_lines import json_lines
-
         return lambda result, people, age_s, most_bytes: json_lines(result, people, about, age_s, most_bytes)
     if kind == "mot":
-        from torchvision_dddas.io.streams.tool_messages import mot_rows
-
         return lambda result, people, age_s, most_bytes: mot_rows(result, people, most_bytes)
     if not about.geographic:
         raise InputError(
@@ -94,21 +97,11 @@ def _encoder(kind: str, about: About, asked: str) -> Encoder:
         )
     if not about.clock:
         raise InputError(f"{asked}: such events need the time of day, and neither input nor telemetry tells it")
-    from torchvision_dddas.io.streams.tool_messages import CotEvents
-
     events = CotEvents(about)
     return lambda result, people, age_s, most_bytes: events(result)
 
 
-def _datagrams(place: str, asked: str) -> Outlet:
-    from torchvision_dddas.io.streams.datagrams import DatagramOutlet, parse_address
-
-    return DatagramOutlet(parse_address(place, asked))
-
-
 def _lines(place: str, kind: str, asked: str) -> Outlet:
-    from torchvision_dddas.io.streams.line_outlet import LineOutlet
-
     if place == "-":
         if sys.__stdout__ is None:
             raise OSError("standard output is closed")
