@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 import threading
+from typing import Any
 
 import cv2
 import numpy as np
@@ -57,7 +58,11 @@ def draw_tracked(item):
     return TrackPictures((width, height))(item)
 
 
-DRAWERS = {"scene": (scene_of, draw_scene), "tracks": (tracked, draw_tracked), "people": (people, draw_people)}
+DRAWERS: dict[str, Any] = {
+    "scene": (scene_of, draw_scene),
+    "tracks": (tracked, draw_tracked),
+    "people": (people, draw_people),
+}
 BOXES = [(-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (-1e9, -1e9, 3e9, 3e9), (3, 3, 1e-3, 1e-3)]
 
 

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ def tracked(number):
 
 
 # A recorder, how it begins, and the item of a frame.
-RECORDERS = {
+RECORDERS: dict[str, Any] = {
     "people": (PeopleRecorder, lambda r: r.begin({}, 10), lambda n: PeopleFrame(Frame(n, 0.1, PICTURE), People())),
     "aerial": (AerialRecorder, lambda r: r.begin({}, SITE), grounded),
     "run": (PipelineRecorder, lambda r: r.begin({}, 10, (80, 60)), lambda n: FrameResult(tracked(n))),
