@@ -145,6 +145,7 @@ def test_frames_left_out_on_purpose_leave_no_empty_scenes():
     assert numbers == sorted(flown.places)
 
 
+@pytest.mark.slow
 def test_without_ground_vehicles_telemetry_lays_the_pictures_on_the_ground():
     flown = fly((), 1.0, team={"ugvs": 0}, clip={"located_by": "telemetry"})
     assert {s.locations.fix.by for s in flown.surveyed if s.locations is not None} == {"telemetry"}

@@ -61,10 +61,6 @@ def test_a_plan_that_goes_on_stands_in_for_a_silent_vehicle():
     assert watched(60, rows) == [(41, "ugv2 reports no place for 2.1 s: its plan stands in for it")]
 
 
-def test_a_vehicle_that_never_spoke_is_silent():
-    assert watched(30, standing(30, (0,))) == [(22, "ugv2 reports no place for 2.1 s: nothing stands in for it")]
-
-
 def test_telemetry_that_stops_is_told():
     (said,) = watched(40, standing(40), np.arange(10) / RATE_HZ)
     assert said == (31, "the UAV says nothing of itself for 2.1 s: landmarks alone tell its place")

@@ -1,4 +1,4 @@
-"""Cleaning, labelling, gates, hulls and fragments."""
+"""Cleaning, labelling, gates, hulls and fragments; shadows and smoothing along flat regions."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 
 from torchvision_dddas.config import MorphologyParameters
 from torchvision_dddas.detection.blobs import find_blobs, find_weak_blobs, group_fragments
+from torchvision_dddas.detection.outlines import remove_shadow, smooth_along_edges
 
 SIZE = (101, 67)
 
@@ -49,24 +50,6 @@ def test_only_evidence_above_the_threshold_is_certain(painted):
     assert np.argwhere(blob.core).tolist() == [[2, 3], [2, 4]]
 
 
-def test_a_hull_fills_the_notch_of_an_l_and_only_that(painted):
-    core = painted(SIZE, (10, 10, 20, 5), (10, 10, 5, 20))
-    (blob,) = found(core, hull=True)
-    assert blob.mask[6, 6] and not blob.mask[18, 18]
-    assert blob.mask[core[blob.window] > 0].all()
-
-
-def test_a_region_inside_another_ones_hull_is_swallowed(painted):
-    core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (46, 10, 4, 40), (25, 25, 6, 6))
-    assert [b.box for b in found(core, hull=True)] == [(10, 10, 40, 40)]
-    assert len(found(core, hull=False)) == 2
-
-
-def test_a_region_in_another_ones_box_but_outside_its_hull_is_kept(painted):
-    core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (40, 40, 8, 8))
-    assert sorted(b.box for b in found(core, hull=True)) == [(10, 10, 40, 40), (40, 40, 8, 8)]
-
-
 def test_weak_blobs_are_those_of_the_wide_evidence_that_touch_none_found(painted):
     wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
     strong = found(painted(SIZE, (5, 6, 10, 10)))
@@ -106,13 +89,79 @@ def test_neighbours_that_move_differently_or_unknown_stay_apart(other):
     assert grouped([TORSO, LEGS], [(3, 0), other]) == [[0], [1]]
 
 
-@pytest.mark.parametrize("box", [(52, 75, 16, 30), (75, 20, 20, 40), (66, 64, 30, 30)])
-def test_movers_side_by_side_or_too_far_stay_apart(box):
-    assert grouped([TORSO, box], [(3, 0), (3, 0)]) == [[0], [1]]
+def step_guide(height=31, width=41, at=20):
+    guide = np.zeros((height, width, 3), np.uint8)
+    guide[:, at:] = 200
+    return guide
 
 
-def test_a_chain_of_fragments_is_one_group_whatever_their_order():
-    boxes = [(10, 10, 20, 20), (11, 33, 20, 20), (12, 56, 20, 20), (200, 10, 20, 20)]
-    velocities = [(3, 0), (3, 0), (3, 0), (3, 0)]
-    assert grouped(boxes, velocities) == [[0, 1, 2], [3]]
-    assert grouped([boxes[i] for i in (2, 0, 3, 1)], velocities) == [[0, 1, 3], [2]]
+def test_evidence_spreads_over_a_flat_region_and_stops_at_its_edge():
+    evidence = np.zeros((31, 41, 1), np.float32)
+    evidence[15, 10] = 1
+    after = smooth_along_edges(evidence, step_guide(), 30, 80)[..., 0]
+    assert after[15, 19] > 20 * after[15, 20]
+    assert after[15, 19] > 0
+
+
+def test_channels_do_not_mix_and_the_input_is_left_alone():
+    evidence = np.random.default_rng(0).random((13, 17, 2)).astype(np.float32)
+    before = evidence.copy()
+    guide = np.random.default_rng(1).integers(0, 256, (13, 17, 3)).astype(np.uint8)
+    both = smooth_along_edges(evidence, guide, 10, 80)
+    np.testing.assert_array_equal(evidence, before)
+    for k in range(2):
+        np.testing.assert_allclose(
+            both[..., k], smooth_along_edges(evidence[..., k : k + 1], guide, 10, 80)[..., 0], atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1)])
+def test_pictures_of_one_row_or_column_work(shape):
+    after = smooth_along_edges(np.ones((*shape, 1), np.float32), np.zeros(shape, np.uint8), 10, 80)
+    np.testing.assert_allclose(after, 1, atol=1e-6)
+
+
+GROUND = np.random.default_rng(3).integers(140, 180, (80, 120, 3)).astype(np.uint8)
+STILL = [np.eye(3), np.eye(3)]
+BOX = (20, 20, 60, 40)
+
+
+def scene(body: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """A body in the left half of the box, its shadow in the right half; and the mask of both."""
+    image = GROUND.copy()
+    image[20:60, 20:50] = body
+    image[20:60, 50:80] = (GROUND[20:60, 50:80] * 0.5).astype(np.uint8)
+    return image, np.ones((40, 60), bool)
+
+
+def test_the_shadow_goes_and_the_body_stays():
+    image, mask = scene((20, 200, 90))
+    left = remove_shadow(mask, BOX, image, [GROUND, GROUND], STILL)
+    assert left[:, :29].mean() > 0.97
+    assert left[:, 33:].mean() < 0.03
+
+
+def test_a_body_that_is_itself_evenly_dark_is_left_whole():
+    image = GROUND.copy()
+    image[20:60, 20:80] = (GROUND[20:60, 20:80] * 0.5).astype(np.uint8)
+    mask = np.ones((40, 60), bool)
+    assert remove_shadow(mask, BOX, image, [GROUND, GROUND], STILL).all()
+
+
+def test_the_ground_is_looked_up_through_the_registration():
+    image, mask = scene((20, 200, 90))
+    ground = np.roll(GROUND, (3, 5), axis=(0, 1))
+    there = np.array([[1.0, 0, 5], [0, 1, 3], [0, 0, 1]])
+    left = remove_shadow(mask, BOX, image, [ground, ground], [there, there])
+    assert left[:, 33:].mean() < 0.03
+
+
+@pytest.mark.parametrize("grounds", [[], [GROUND], [GROUND[..., 0], GROUND[..., 0]]])
+def test_without_two_colour_pictures_of_the_ground_the_mask_is_left_alone(grounds):
+    image, mask = scene((20, 200, 90))
+    assert remove_shadow(mask, BOX, image, grounds, STILL[: len(grounds)]) is mask
+
+
+def test_a_region_in_another_ones_box_but_outside_its_hull_is_kept(painted):
+    core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (40, 40, 8, 8))
+    assert sorted(b.box for b in found(core, hull=True)) == [(10, 10, 40, 40), (40, 40, 8, 8)]

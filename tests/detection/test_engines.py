@@ -116,27 +116,6 @@ def test_on_the_same_registrations_only_ties_of_rounding_differ_even_where_the_l
     assert onboard.core.any() and onboard.small is not None and onboard.small.any()
 
 
-def test_plain_differences_show_the_same_in_both_engines_whether_or_not_the_light_jumps() -> None:
-    size, settings = SIZES[0], parameters.load_config("fast")
-    ground = [view.image_from_ground for view in flight(1, FRAMES, size, RATE_HZ)]
-    steps = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
-    found = {}
-    for name in ("onboard", "torch"):
-        for jumps in (False, True):
-            engine = load_engine(name, settings)
-            views = [engine.prepare(image) for image in film(size, jumps)]
-            (found[name, jumps],) = engine.foreground([window(views, steps, 3, [(2, 4)], False)])
-    steady = found["onboard", False]
-    assert steady.core.any()
-    for name in ("onboard", "torch"):
-        jumped = found[name, True]
-        core, wanted = jumped.core > 0, steady.core > 0
-        assert (core & wanted).sum() / (core | wanted).sum() > 0.9
-        assert (np.abs(jumped.evidence.astype(int) - steady.evidence) > 6).mean() < 0.02
-    apart = np.abs(found["torch", True].evidence.astype(int) - found["onboard", True].evidence)
-    assert (apart > 2).mean() < 0.002
-
-
 @pytest.mark.parametrize("shape", [(96, 128), (9, 11), (1, 1)])
 def test_blank_frames_are_flagged_by_both_and_break_neither(engines, shape) -> None:
     causes = set()
@@ -176,18 +155,6 @@ def test_five_pairs_at_once_give_what_one_at_a_time_gives(torch_engine, torch_im
         assert (whole.tracked, whole.inliers) == (alone.tracked, alone.inliers)
 
 
-def test_pairs_of_several_sizes_keep_their_order(torch_engine, torch_images) -> None:
-    views = [torch_engine.prepare(image) for image in torch_images]
-    small = [torch_engine.prepare(image[:150, :200]) for image in torch_images]
-    mixed = torch_engine.register([(views[0], views[1]), (small[0], small[1]), (views[1], views[2])])
-    apart = [
-        torch_engine.register([pair])[0] for pair in ((views[0], views[1]), (small[0], small[1]), (views[1], views[2]))
-    ]
-    for one, other in zip(mixed, apart, strict=True):
-        np.testing.assert_allclose(one.later_from_earlier, other.later_from_earlier, rtol=0, atol=1e-6)
-        assert one.tracked == other.tracked
-
-
 def test_windows_at_once_give_what_one_at_a_time_gives(torch_engine, torch_images) -> None:
     views = [torch_engine.prepare(image) for image in torch_images]
     odd = Window(views[0], tuple(views[1:4]), np.stack([np.eye(3)] * 3), (1, 2, 3), ((0, 1),), (1, 2), (0, 2))
@@ -198,31 +165,6 @@ def test_windows_at_once_give_what_one_at_a_time_gives(torch_engine, torch_image
             np.testing.assert_array_equal(getattr(whole, name), getattr(alone, name))
         assert (whole.small is None) == (alone.small is None) == (one.small is None)
         assert whole.offsets == alone.offsets
-
-
-def test_a_frame_is_worked_on_once_however_many_pairs_it_is_in(torch_engine, torch_images) -> None:
-    views = [torch_engine.prepare(image) for image in torch_images[:3]]
-    torch_engine.register([(views[0], views[1])])
-    before = views[1].kept["pyramid"]
-    torch_engine.register([(views[1], views[2])])
-    assert views[1].kept["pyramid"] is before
-
-
-def test_an_image_shifted_by_whole_pixels_is_registered_as_that_shift(torch_engine, torch_images) -> None:
-    grey = torch_engine.prepare(torch_images[0]).grey
-    pair = torch_engine.prepare(grey[:180, :240].copy()), torch_engine.prepare(grey[5:185, 9:249].copy())
-    (step,) = torch_engine.register([pair])
-    assert step.reliable
-    # Points at the border follow what is mirrored there: a little is lost to them.
-    assert corner_error(step.later_from_earlier, np.array([[1, 0, -9], [0, 1, -5], [0, 0, 1]]), (240, 180)) < 0.3
-    assert step.flow_px == pytest.approx(np.hypot(9, 5), abs=0.1)
-
-
-def test_a_change_of_light_alone_shows_nothing(torch_engine, torch_images) -> None:
-    grey = (torch_images[0][..., 0] * 0.7).astype(np.uint8)
-    darker, lighter = ((grey * gain).round().astype(np.uint8) for gain in (0.8, 1.2))
-    views = [torch_engine.prepare(picture) for picture in (darker, grey, lighter)]
-    assert not torch_engine.foreground([around(views, 1)])[0].core.any()
 
 
 @pytest.mark.parametrize("shape", [(9, 200), (30, 30), (1, 1)])

@@ -1,9 +1,10 @@
-"""The interval rule, and the sizes that targets may have at an altitude, by hand."""
+"""Which frames a window looks at, the interval rule, and the sizes that targets may have at an altitude."""
 
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
+from torchvision_dddas.config import IntervalParameters, Settings, load_config, with_parameters
+from torchvision_dddas.detection import windows
 from torchvision_dddas.detection.interval import (
     AltitudeSettings,
     Gates,
@@ -11,10 +12,8 @@ from torchvision_dddas.detection.interval import (
     follow_altitude,
     interval_from_flow,
     interval_from_telemetry,
-    pixels_per_metre,
     settings_at,
 )
-from torchvision_dddas.types import Adjustment
 
 PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
 BASE = with_parameters(
@@ -68,12 +67,6 @@ def test_the_interval_is_rounded_and_bounded(wanted, interval):
     assert adjust_interval(1, 7, wanted, "", PARAMETERS)[0] == interval
 
 
-def test_a_change_is_recorded_with_its_cause_and_no_change_is_not():
-    new, (record,) = adjust_interval(7, 3, 6.1, "altitude 90 m", PARAMETERS)
-    assert new == 6 and record == Adjustment(7, "interval.frames", 3, 6, "altitude 90 m")
-    assert adjust_interval(7, 3, 3.2, "", PARAMETERS) == (3, ())
-
-
 def test_noise_around_the_middle_between_two_intervals_does_not_make_it_flutter():
     current, changes = 3, 0
     for k in range(40):
@@ -86,11 +79,6 @@ def test_gates_are_metric_bounds_times_focal_over_altitude():
     assert settings_at(50.0, 10.0, BASE).gates == Gates(min_size_px=10.0, max_size_px=200.0, max_speed_px=60.0)
     assert settings_at(50.0, 30.0, BASE).gates == Gates(10.0, 200.0, 20.0)
     assert settings_at(100.0, 10.0, BASE).gates == Gates(5.0, 100.0, 30.0)
-
-
-@pytest.mark.parametrize("altitude", [0.0, -3.0, 0.5])
-def test_on_the_ground_the_scale_stays_finite(altitude):
-    assert pixels_per_metre(altitude, 800.0) == 800.0
 
 
 @pytest.mark.parametrize(
@@ -127,12 +115,6 @@ def test_gaps_are_closed_in_metres_where_that_is_wanted_and_never_wider_than_in_
     assert settings_at(200.0, 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
 
 
-def test_nothing_else_of_the_settings_changes_with_the_altitude():
-    there = settings_at(90.0, 10, BASE).settings
-    back = {"gates.min_area_px": BASE.gates.min_area_px, "small.on": BASE.small.on}
-    assert with_parameters(there, back) == BASE
-
-
 def test_settings_move_only_when_the_altitude_has_changed_by_a_fifth_or_is_lost():
     current, first = follow_altitude(1, AltitudeSettings(BASE), 100.0, 10, BASE)
     assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
@@ -147,3 +129,44 @@ def test_settings_move_only_when_the_altitude_has_changed_by_a_fifth_or_is_lost(
     assert after == AltitudeSettings(BASE)
     assert {record.cause for record in records} == {"no telemetry for this frame"}
     assert follow_altitude(10, after, None, 10, BASE) == (after, ())
+
+
+SHIPPED = {name: load_config(name) for name in ("source", "fast")} | {"default": load_config()}
+ENDS = [(0, 40), (0, 20), (20, 40), (19, 21), (20, 22), (18, 20)]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("interval", [1, 2, 3, 4, 6, 12])
+@pytest.mark.parametrize(("first", "last"), ENDS)
+def test_every_frame_of_a_window_hangs_together_with_it_and_lies_at_most_two_intervals_ahead(
+    name, interval, first, last
+):
+    near, wide, small = windows.choose_pairs(20, interval, first, last, SHIPPED[name])
+    used = [i for pair in [*near, wide, small] if pair for i in pair]
+    assert all(first <= i <= min(last, 20 + 2 * interval) for i in used)
+    assert 20 not in used or SHIPPED[name].difference.kind == "between_later"
+    assert all(a != b for a, b in near)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("interval", [1, 2, 3, 4, 6, 12])
+def test_reach_covers_all_that_a_window_looks_at(name, interval):
+    """What comes after the reach must not matter, or a stream would give other results than a file."""
+    ahead = windows.look_ahead(interval, SHIPPED[name])
+    for first in (0, 17, 19, 20):
+        seen = windows.choose_pairs(20, interval, first, 20 + ahead, SHIPPED[name])
+        assert windows.choose_pairs(20, interval, first, 60, SHIPPED[name]) == seen
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("interval", [2, 3, 4, 6, 12])
+def test_reach_and_delay_together_are_at_most_two_intervals(name, interval):
+    settings = SHIPPED[name]
+    assert windows.look_ahead(interval, settings) + windows.settling_delay(interval, settings) <= 2 * interval
+
+
+def test_small_targets_are_looked_for_only_over_long_intervals_and_where_they_are_switched_on():
+    settings = with_parameters(load_config(), {"small.from_interval": 3, "small.gap_frames": 3})
+    assert windows.choose_pairs(20, 2, 0, 40, settings)[2] is None
+    assert windows.choose_pairs(20, 3, 0, 40, settings)[2] == (17, 23)
+    assert windows.choose_pairs(20, 3, 0, 40, with_parameters(settings, {"small.on": False}))[2] is None

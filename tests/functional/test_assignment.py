@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchvision_dddas.functional.assignment import dispersion, log_partition, shares
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking.source_affinity import clusters, normalized_entropy
 
 
 def scores(*shape: int, spread: float = 3.0, seed: int = 0) -> Tensor:
@@ -63,13 +62,6 @@ def test_shares_and_score_tend_to_the_best_assignment_as_softness_vanishes():
     assert abs(value[-1]) < 1e-6
 
 
-def test_no_target_is_shared_out_more_than_once():
-    share = shares(scores(7, 12, spread=6.0), 0.7, rounds=400)
-    assert (share >= 0).all()
-    assert (share.sum(0) <= 1 + 1e-4).all()
-    assert (share.sum(1) <= 1 + 1e-12).all()
-
-
 def test_the_slope_of_the_likelihood_is_the_shares_and_gradcheck_agrees():
     score = scores(3, 4, spread=1.0).requires_grad_()
     (slope,) = torch.autograd.grad(log_partition(score, 1.0), score)
@@ -108,21 +100,6 @@ def everybody(apart: Tensor) -> Tensor:
     return torch.ones(apart.shape[:-1], dtype=torch.bool)
 
 
-@pytest.mark.parametrize("sizes", [(1, 1, 1), (4,), (2, 1), (3, 2, 2), (5, 1, 1, 1)])
-def test_without_softness_it_is_the_entropy_of_clusters_that_lie_apart(sizes):
-    apart = grouped(*sizes)
-    wanted = normalized_entropy(clusters(apart.numpy(), 0.25))
-    assert dispersion(apart, everybody(apart), 0.25).item() == pytest.approx(wanted, abs=1e-12)
-
-
-def test_it_tends_to_that_as_softness_vanishes():
-    apart = grouped(3, 2, 2)
-    hard = dispersion(apart, everybody(apart), 0.25).item()
-    off = [abs(dispersion(apart, everybody(apart), 0.25, soft).item() - hard) for soft in (0.1, 0.05, 0.02, 0.01)]
-    assert off == sorted(off, reverse=True)
-    assert off[-1] < 1e-5
-
-
 def test_a_wider_cut_tells_fewer_targets_apart_and_the_slope_says_so():
     apart = grouped(3, 2, within=0.2, between=0.4)
     cut = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
@@ -144,9 +121,3 @@ def test_who_is_not_there_has_no_say_and_one_or_none_count_as_apart():
         assert value.item() == 1
         assert cut.grad is not None
         assert cut.grad.item() == 0
-
-
-def test_the_dispersion_of_a_batch_is_that_of_its_members():
-    many = torch.stack([grouped(2, 2), grouped(1, 3)])
-    together = dispersion(many, everybody(many), 0.25, 0.1)
-    assert together.tolist() == pytest.approx([dispersion(one, everybody(one), 0.25, 0.1).item() for one in many])

@@ -1,4 +1,4 @@
-"""What every function keeps to: the annotated shapes, double precision, and a batch that equals its members."""
+"""What every function keeps to: annotated shapes, double precision, a batch equal to its members, and gradients."""
 
 import inspect
 import typing
@@ -11,6 +11,7 @@ import torch
 from torchvision_dddas.functional import (
     affine,
     affinity,
+    assignment,
     color,
     consensus,
     difference,
@@ -50,6 +51,7 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     color.bgr_to_hsv: (HSV / 30,),
     color.within_ranges: (HSV, RANGES, RANGES),
     color.rgb_histogram: (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool), 1.0),
+    assignment.log_partition: (P[:, :4, :], 1.0),
     consensus.transfer: (EYES, P),
     consensus.transfer_error: (EYES, P, Q),
     difference.exposure: (GREY, GREY * 0.9 + 0.01, MASK),
@@ -100,12 +102,6 @@ def test_what_goes_in_and_comes_out_has_the_annotated_shapes(function):
         assert agrees(function(*CASES[function]), signature.return_annotation)
 
 
-def test_the_check_would_notice_a_wrong_shape():
-    with jaxtyping.jaxtyped("context"):
-        assert agrees(P, jaxtyping.Float[torch.Tensor, "B N 2"])
-        assert not agrees(ONES[:1], jaxtyping.Float[torch.Tensor, "B N"])
-
-
 @pytest.mark.parametrize("function", CASES, ids=label)
 def test_double_precision_goes_through(function):
     def widened(value):
@@ -134,3 +130,84 @@ def test_a_batch_is_the_same_as_its_members_one_by_one(function):
         torch.testing.assert_close(
             row(together, at), function(*(row(value, at) for value in given)), atol=1e-4, rtol=1e-4
         )
+
+
+def double(*shape: int, seed: int = 0) -> torch.Tensor:
+    return random(*shape, seed=seed).double()
+
+
+def quad(*points: tuple[float, float]) -> torch.Tensor:
+    return torch.tensor([points], dtype=torch.float64)
+
+
+FIVE, THERE = 500 * double(1, 5, 2), 500 * double(1, 5, 2) + 3 * double(1, 5, 2, seed=1)
+SIX, SEEN = 500 * double(1, 6, 2), 480 * double(1, 6, 2) + 9 * double(1, 6, 2, seed=1)
+KNOWN = [torch.ones(2, count, dtype=torch.bool) for count in (4, 3, 5)]
+KNOWN[2][1, 4] = False
+LABELS = torch.tensor([[[[0, 1, 1, 0], [0, 1, 0, 2], [0, 0, 0, 2]]]])
+INSIDE = torch.ones(1, 1, 4, 5, dtype=torch.bool)
+BOX, THERE_ARE = torch.tensor([[[0.0, 1, 3, 3], [2, 0, 9, 2]]]).double(), torch.tensor([[True, True]])
+LOW, HIGH = torch.tensor([[10.0, 80, 60], [170, 100, 0]]).double(), torch.tensor([[25.0, 255, 255], [8, 255, 255]])
+# Smooth functions of the tensors at which their gradient is compared with finite differences.
+GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] = {
+    "affine.fit": (lambda p, q: affine.fit(p, q, torch.linspace(0.5, 1, 5).double()[None])[0], (FIVE, THERE)),
+    "affinity.pairs": (lambda a, b: affinity.pairs(a, b, *KNOWN[:2]), (double(2, 4, 3), double(2, 3, 3, seed=1))),
+    "affinity.triplets": (
+        lambda a, b, c: affinity.triplets(a, b, c, *KNOWN),
+        (double(2, 4, 3), double(2, 3, 3, seed=1), double(2, 5, 3, seed=2)),
+    ),
+    "color.within_ranges": (
+        lambda picture, low, high: color.within_ranges(color.bgr_to_hsv(picture), low, high, 20.0),
+        (0.1 + 0.8 * double(1, 3, 2, 3, seed=1), LOW, HIGH.double()),
+    ),
+    **{
+        f"color.rgb_histogram {softness}": (
+            lambda x, softness=softness: color.rgb_histogram(x, BOX, THERE_ARE, softness)[0] @ double(768, seed=3),
+            (0.9 * double(1, 3, 4, 5, seed=2),),
+        )
+        for softness in (1.0, 0.5)
+    },
+    # A floor above all errors: trimming, which has no gradient, does not take part.
+    "difference.exposure": (
+        lambda a, b: torch.stack(difference.exposure(a, b, INSIDE, floor=9.0)),
+        (double(1, 1, 4, 5), double(1, 1, 4, 5, seed=1)),
+    ),
+    "filters.gaussian": (lambda x: filters.gaussian(x, 3), (double(1, 1, 5, 6),)),
+    "homography.solve_linear": (
+        lambda a, b: homography.solve_linear(a, b)[0],
+        (double(2, 4, 4) - 0.5, double(2, 4, 2, seed=1)),
+    ),
+    "homography.four_point": (
+        lambda p, q: homography.four_point(p, q)[0],
+        (quad((0, 0), (90, 10), (100, 80), (5, 70)), quad((3, 1), (95, 15), (99, 90), (1, 72))),
+    ),
+    "homography.fit": (lambda *x: homography.fit(*x)[0], (SIX, SEEN, torch.linspace(0.5, 1, 6).double()[None])),
+    **{
+        f"homography.fit_raw {count}": (
+            lambda p, q: homography.fit_raw(p, q)[0],
+            (SIX[:, :count] / 300, SEEN[:, :count] / 300),
+        )
+        for count in (4, 6)
+    },
+    "keypoints.min_eigenvalue": (keypoints.min_eigenvalue, (double(1, 1, 6, 7),)),
+    **{
+        f"morphology.{operation.__name__}": (
+            lambda x, operation=operation: operation(x, (3, 4), "ellipse", 0.3),
+            (double(1, 1, 6, 7),),
+        )
+        for operation in (morphology.dilate, morphology.erode)
+    },
+    "soft.step": (lambda x: soft.step(x, 0.2), (torch.linspace(-1, 1, 7).double(),)),
+    "soft.gate_regions": (
+        lambda m, e, a, p: soft.gate_regions(m, e, LABELS, 2, a, p, 0.3),
+        (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), torch.tensor(1.5).double(), torch.tensor(6.0).double()),
+    ),
+    "warp.resize": (lambda x: warp.resize(x, (9, 4), rounded=False), (255 * double(1, 2, 6, 7),)),
+}
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_gradients_are_those_of_finite_differences(name):
+    function, inputs = GRADIENTS[name]
+    asked = tuple(value.clone().requires_grad_() for value in inputs)
+    assert torch.autograd.gradcheck(function, asked, eps=1e-7 if "histogram" in name else 1e-6)

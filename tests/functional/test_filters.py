@@ -1,14 +1,15 @@
-"""Gaussian smoothing and reflection against OpenCV."""
+"""Smoothing, reflection, warping, resizing, differences and keypoints against OpenCV."""
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.functional import filters
+from torchvision_dddas.functional import difference, filters, keypoints, warp
 from torchvision_dddas.functional.filters import reflect_index
+from torchvision_dddas.functional.warp import resize
 
 
 @pytest.mark.parametrize(
@@ -27,34 +28,170 @@ def test_a_point_spreads_into_the_kernel():
     assert torch.equal(filters.gaussian(point, 3)[0, 0, 2:5, 2:5], torch.tensor([[1.0, 2, 1], [2, 4, 2], [1, 2, 1]]))
 
 
-def test_a_picture_smaller_than_the_kernel_is_mirrored_again_and_again():
-    picture = torch.rand(1, 1, 2, 3, generator=torch.Generator().manual_seed(0))
-    wanted = cv2.GaussianBlur(picture[0, 0].numpy(), (9, 9), 2.0)
-    torch.testing.assert_close(filters.gaussian(picture, 9, 2.0)[0, 0], torch.from_numpy(wanted), atol=1e-6, rtol=0)
-
-
-def test_gradients_are_those_of_finite_differences():
-    picture = torch.rand(1, 1, 5, 6, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: filters.gaussian(x, 3), (picture,))
-
-
 @pytest.mark.parametrize("shape", [(120, 160), (61, 87), (2, 3), (1, 1)])
-@pytest.mark.parametrize("size", [1, 3, 5, 7, 9])
-def test_smoothed_levels_are_opencvs(texture, size, shape):
+@pytest.mark.parametrize("size", [1, 3, 5, 7, 9, 11])
+def test_smoothed_levels_are_opencvs_wide_ones_to_a_level(texture, size, shape):
     picture = texture(0, 120, 160)[: shape[0], : shape[1]].copy()
     picture[: shape[0] // 2] = 255  # the largest sum there is
     smoothed = filters.gaussian_levels(torch.from_numpy(picture)[None, None], size)[0, 0].numpy()
-    np.testing.assert_array_equal(smoothed, cv2.GaussianBlur(picture, (size, size), 0))
-
-
-@pytest.mark.parametrize("size", [11, 31])
-def test_widely_smoothed_levels_are_opencvs_to_a_level(texture, size):
-    picture = texture(0, 61, 87)
-    smoothed = filters.gaussian_levels(torch.from_numpy(picture)[None, None], size)[0, 0].numpy().astype(int)
-    assert np.abs(smoothed - cv2.GaussianBlur(picture, (size, size), 0)).max() <= 1
+    apart = np.abs(smoothed.astype(int) - cv2.GaussianBlur(picture, (size, size), 0))
+    assert apart.max() <= (size > 9)
 
 
 @given(st.integers(1, 30), st.integers(-80, 80), st.integers(0, 60))
 def test_reflection_is_opencvs_101_as_often_as_it_takes(length, first, count):
     wanted = [cv2.borderInterpolate(place, length, cv2.BORDER_REFLECT_101) for place in range(first, first + count)]
     assert reflect_index(torch.arange(first, first + count), length).tolist() == wanted
+
+
+CAMERA = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
+SIZES = [(120, 160), (61, 87)]
+
+
+def levels(picture):
+    return torch.from_numpy(picture.astype(np.float32))[None, None]
+
+
+@pytest.mark.parametrize("shape", SIZES)
+def test_sampled_levels_are_opencvs_up_to_ties(texture, shape):
+    picture = texture(1, *shape)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    wanted = cv2.warpPerspective(picture, CAMERA, shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    sampled = warp.sample(levels(picture), torch.from_numpy(CAMERA)[None]).add(0.5).byte()[0, 0].numpy()
+    differs = np.abs(sampled.astype(int) - wanted)
+    assert (differs > 0).mean() < 0.01 and differs.max() <= 1
+
+
+@pytest.mark.parametrize("border", [0, 4])
+@pytest.mark.parametrize("matrix", [CAMERA, np.eye(3), np.array([[1, 0, 400.0], [0, 1, 0], [0, 0, 1]])])
+def test_the_columns_seen_are_those_of_a_warped_mask(matrix, border):
+    height, width = 61, 87
+    inset = np.zeros((height, width), np.uint8)
+    inset[border : height - border, border : width - border] = 255
+    wanted = cv2.warpPerspective(inset, matrix, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP) > 0
+    size = height, width
+    first, last = warp.seen_columns(torch.from_numpy(matrix)[None], size, size, border)
+    np.testing.assert_array_equal(warp.between(first, last, width)[0, 0].numpy(), wanted)
+
+
+def opencv(picture: np.ndarray, size: tuple[int, int]) -> torch.Tensor:
+    found = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_LINEAR_EXACT)
+    return batch(found)
+
+
+def batch(picture: np.ndarray) -> torch.Tensor:
+    """uint8 picture -> (1, C, H, W) float32 levels."""
+    return torch.from_numpy(np.atleast_3d(picture)).permute(2, 0, 1)[None].float()
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.tuples(*[st.integers(1, 40)] * 4), st.integers(0, 2**32 - 1))
+def test_any_size_from_any_size_is_opencvs_to_the_bit(sizes, seed):
+    picture = np.random.default_rng(seed).integers(0, 256, sizes[:2], np.uint8)
+    assert torch.equal(resize(batch(picture), sizes[2:]), opencv(picture, sizes[2:]))
+
+
+def test_two_pixels_into_four_by_hand():
+    # Sources at -0.25, 0.25, 0.75 and 1.25: the right one's share is 0, 1/4, 3/4 and 1; 18.75 rounds to 19.
+    found = resize(torch.tensor([[[[0.0, 75.0]]]]), (1, 4))
+    assert found.flatten().tolist() == [0, 19, 56, 75]
+
+
+def test_rounding_changes_no_gradient_and_no_level_for_having_one(texture):
+    picture = batch(texture(2, 24, 30))
+    asked, smooth = picture.clone().requires_grad_(), picture.clone().requires_grad_()
+    found = resize(asked, (17, 23))
+    assert torch.equal(found, resize(picture, (17, 23)))
+    weight = torch.rand(17, 23, generator=torch.Generator().manual_seed(0))
+    (found * weight).sum().backward()
+    (resize(smooth, (17, 23), rounded=False) * weight).sum().backward()
+    torch.testing.assert_close(asked.grad, smooth.grad)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.15, 0.0), (0.85, 0.03), (1.0, -0.05)])
+def test_exposure_recovers_a_change_of_light_despite_movers(texture, tensor, gain, offset):
+    reference = tensor(texture(0, 240, 320)) * 0.8 + 0.05
+    warped = (reference - offset) / gain
+    warped[..., 50:110, 80:160] = tensor(texture(1, 60, 80))
+    inside = torch.ones(1, 1, 240, 320, dtype=torch.bool)
+    found_gain, found_offset = difference.exposure(reference, warped, inside)
+    assert abs(found_gain.item() - gain) < 0.01
+    assert abs(found_offset.item() - offset) < 0.005
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_exposure_of_a_blank_frame_or_of_nothing_seen_keeps_the_gain(seen):
+    blank = torch.full((1, 1, 37, 53), 0.5)
+    gain, offset = difference.exposure(blank, blank * 0.8, torch.full((1, 1, 37, 53), seen))
+    assert gain.item() == 1.0
+    assert offset.item() == pytest.approx(0.1 if seen else 0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(120, 160), (61, 87)])
+def test_the_gradient_is_opencvs(texture, shape):
+    picture = texture(2, *shape)
+    across = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.5)
+    down = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.5)
+    wanted = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
+    np.testing.assert_array_equal(
+        difference.gradient(torch.from_numpy(picture.astype(np.float32))[None, None])[0, 0].numpy().astype(np.uint8),
+        wanted,
+    )
+
+
+def test_the_masked_median_is_of_the_masked_values_alone():
+    values = torch.tensor([[5.0, 1.0, 9.0, 3.0, 7.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
+    mask = torch.tensor([[True, True, False, True, True], [False] * 5])
+    assert difference.masked_median(values, mask).tolist() == [[3.0], [0.0]]
+
+
+@pytest.mark.parametrize("block", [2, 3, 5, 7])
+@pytest.mark.parametrize("shape", [(37, 53), (120, 160)])
+def test_min_eigenvalue_is_opencvs_to_a_millionth_of_its_maximum(texture, tensor, block, shape):
+    picture = texture(0, *shape)
+    wanted = torch.from_numpy(cv2.cornerMinEigenVal(picture, block))
+    found = keypoints.min_eigenvalue(tensor(picture), block)[0, 0]
+    assert (found - wanted).abs().max() < 2e-6 * wanted.max()
+
+
+@pytest.mark.parametrize("shape", [(37, 53), (3, 3), (2, 5), (1, 1)])
+def test_a_blank_picture_of_any_size_has_none(shape):
+    points, score, valid = keypoints.grid_features(torch.full((2, 1, *shape), 0.5), 16)
+    assert not valid.any()
+    assert torch.isfinite(points).all() and (score == 0).all()
+
+
+def test_only_allowed_pixels_are_chosen_and_set_the_maximum(texture, tensor):
+    picture = texture(0, 120, 160)
+    picture[:, 100:] = 0
+    picture[40:60, 120:140] = 255
+    allowed = torch.zeros(1, 1, 120, 160, dtype=torch.bool)
+    allowed[..., :90] = True
+    points, _, valid = keypoints.grid_features(tensor(picture), 16, allowed=allowed)
+    assert valid.any() and (points[valid][:, 0] < 90).all()
+
+
+def test_grid_features_are_the_best_pixel_of_every_whole_cell(texture, tensor):
+    picture = tensor(texture(2, 37, 53))
+    eigen = keypoints.min_eigenvalue(picture)[0, 0]
+    points, score, valid = keypoints.grid_features(picture, 16, quality=0.0)
+    assert points.shape == (1, 2 * 3, 2) and valid.all()
+    for number, (u, v) in enumerate(points[0].long().tolist()):
+        row, column = divmod(number, 3)
+        cell = eigen[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
+        assert eigen[v, u] == cell.max() == score[0, number]
+        assert (v // 16, u // 16) == (row, column)
+
+
+def test_a_cell_below_the_quality_yields_nothing(texture, tensor):
+    picture = texture(2, 64, 64)
+    picture[:38, :38] = picture[:38, :38] // 16 + 100
+    _, score, valid = keypoints.grid_features(tensor(picture), 32, quality=0.2)
+    assert valid.tolist() == [[False, True, True, True]]
+    assert score[0, 0] == 0
+
+
+def test_chosen_rows_and_columns_are_those_of_the_whole(texture):
+    picture = batch(texture(1, 60, 80))
+    rows, columns = torch.tensor([3, 2, 2, 40]), torch.tensor([0, 65, 7])
+    assert torch.equal(resize(picture, (50, 66), rows, columns), resize(picture, (50, 66))[..., rows, :][..., columns])

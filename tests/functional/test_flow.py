@@ -35,17 +35,6 @@ def by_opencv(first, second, corners, levels, window=21, **rest):
     return torch.from_numpy(found[:, 0]), torch.from_numpy(status[:, 0] > 0)
 
 
-@pytest.mark.parametrize("shape", [(37, 53), (200, 260), (64, 48)])
-def test_the_pyramid_is_opencvs_to_its_rounding(texture, tensor, shape):
-    picture = texture(0, *shape)
-    levels, wanted = flow.pyramid(tensor(picture), 3), [picture]
-    for _ in range(2):
-        wanted.append(cv2.pyrDown(wanted[-1]))
-    for level, picture in zip(levels, wanted, strict=True):
-        # OpenCV rounds every level to whole grey levels.
-        assert (level[0, 0] * 255 - torch.from_numpy(picture)).abs().max() < 1.01
-
-
 @pytest.mark.parametrize(("levels", "window"), [(3, 21), (3, 15), (4, 21), (2, 11)])
 def test_agrees_with_opencv_to_a_hundredth_of_a_pixel(scene, tensor, levels, window):
     first, second, corners, points = scene
@@ -75,21 +64,6 @@ def test_with_a_prediction_one_level_and_a_small_table_do(scene, tensor):
     assert (found - truth).norm(dim=-1)[ok & inner].median() < 0.1
 
 
-def test_finds_a_known_shift(two_views, tensor):
-    first, second = two_views(3, 120, 160, np.array([[1, 0, 2.5], [0, 1, -1.25], [0, 0, 1.0]]))
-    points = torch.tensor([[[40.0, 60.0], [80.5, 55.25], [120.0, 40.0]]])
-    found, ok = flow.track(points, *pyramids(tensor, first, second, 3))
-    assert ok.all()
-    torch.testing.assert_close(found - points, torch.tensor([2.5, -1.25]).expand(1, 3, 2), atol=0.1, rtol=0)
-
-
-def test_a_picture_that_did_not_change_leaves_the_points_where_they_are(scene, tensor):
-    first, _, _, points = scene
-    found, ok = flow.track(points, *pyramids(tensor, first, first, 3))
-    assert ok.all()
-    assert (found - points).abs().max() < 0.01
-
-
 def test_a_point_that_needs_more_than_one_table_is_found_in_further_rounds(two_views, tensor):
     first, second = two_views(3, 120, 160, np.array([[1, 0, 4.0], [0, 1, 0.0], [0, 0, 1.0]]))
     points = torch.tensor([[[80.0, 60.0]]])
@@ -104,14 +78,6 @@ def test_a_point_that_needs_more_than_one_table_is_found_in_further_rounds(two_v
 def test_nothing_is_found_on_a_blank_picture(shape):
     blank = flow.pyramid(torch.full((2, 1, *shape), 0.3), 2)
     found, ok = flow.track(torch.full((2, 5, 2), 4.0), blank, blank)
-    assert not ok.any()
-    assert torch.isfinite(found).all()
-
-
-def test_points_outside_the_picture_are_not_found(scene, tensor):
-    first, second, _, _ = scene
-    away = torch.tensor([[[-200.0, 50.0], [50.0, 900.0], [-1e4, -1e4]]])
-    found, ok = flow.track(away, *pyramids(tensor, first, second, 3))
     assert not ok.any()
     assert torch.isfinite(found).all()
 
@@ -131,8 +97,8 @@ def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tens
 
 
 def test_gradients_are_those_of_finite_differences(two_views, tensor):
-    first, second = two_views(5, 24, 24, np.array([[1, 0, 0.4], [0, 1, -0.3], [0, 0, 1.0]]))
-    points = torch.tensor([[[12.2, 11.7]]], dtype=torch.float64)
+    first, second = two_views(5, 18, 18, np.array([[1, 0, 0.4], [0, 1, -0.3], [0, 0, 1.0]]))
+    points = torch.tensor([[[9.2, 8.7]]], dtype=torch.float64)
     images = (tensor(first).double().requires_grad_(), tensor(second).double().requires_grad_())
 
     def moved(a, b, p):

@@ -12,13 +12,12 @@ from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, chec
 from torchvision_dddas.geo.aerial_targets import Targets, reference_points
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
-from torchvision_dddas.geo.pose_estimation import focal_prior
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.types import Camera, Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
 
 
 def hill(east_north):
@@ -74,14 +73,6 @@ def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(p
     assert np.median(known) < 0.3
 
 
-def test_the_vehicle_is_above_the_ground_below_it_not_above_the_origins(prepared):
-    flight = Overflight(pitch_deg=45, ground=hill, geographic=False)
-    locator, _ = prepared(flight, raster(hill))
-    at = locator.telemetry_at(0.0)
-    assert at is not None
-    assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
-
-
 def test_heights_above_sea_will_do_where_the_ground_is_known(prepared):
     flight = Overflight(ground=hill, geographic=False)
     locator, _ = prepared(flight, raster(hill, base=1300.0))
@@ -118,35 +109,6 @@ def test_a_landmark_where_the_raster_has_no_height_is_not_used(prepared):
     assert first.marks.landmark.tolist() == [0, 1, 3]
 
 
-def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
-    flight = Overflight(landmarks=6, geographic=False)
-    locator, table = prepared(flight, **{"landmarks.rule": "source"})
-    calm = list(locator.locate_table(table))
-    assert {len(g.marks) for g in calm} == {4}
-    locator, table = prepared(flight, **{"landmarks.rule": "source", "landmarks.poor_speed_m_s": 0.3})
-    busy = list(locator.locate_table(table))
-    assert len(busy[-1].marks) == 6
-    (moved,) = [a for g in busy for a in g.adjustments]
-    assert (moved.parameter, moved.new) == ("landmarks.used", 6)
-
-
-def test_frames_between_with_landmarks_are_located_too(prepared):
-    flight = Overflight(geographic=False)
-    locator, table = prepared(flight)
-    sparse = table.frame % 3 == 1
-    table = replace(
-        table,
-        frame=table.frame[sparse],
-        box_px=table.box_px[sparse],
-        score=table.score[sparse],
-        line=table.line[sparse],
-        identity=None if table.identity is None else table.identity[sparse],
-    )
-    found = list(locator.locate_table(table))
-    assert [g.frame for g in found] == list(range(1, 11))
-    assert [len(g.positions) for g in found] == [4, 0, 0] * 3 + [4]
-
-
 def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
     feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
     targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
@@ -172,25 +134,7 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert camera.centre_px == (499.5, 299.5)
 
 
-def test_how_well_the_focal_length_is_known_is_said_by_the_cameras_file_unless_set():
-    camera = Camera("mine", (1000, 600), (800.0, 800.0), (499.5, 299.5), focal_sigma=0.002)
-    for parameters, sigma in (({}, 0.002), ({"aerial.focal_sigma": 0.05}, 0.05)):
-        settings = with_parameters(Settings(), parameters)
-        found, known, _ = resolve_camera(camera, None, None, settings)
-        prior = focal_prior(found, settings.aerial, known)
-        assert prior.information[6, 6] == pytest.approx(sigma**-2)
-
-
-def test_places_over_the_date_line_are_near_each_other(prepared):
-    flight = Overflight()
-    locator, _ = prepared(flight)
-    marks = read_landmarks(locator.site.landmarks.path)
-    place = marks.place + np.array([-69.0500, 0.0])
-    place[:, 0] = (place[:, 0] + 180) % 360 - 180
-    moved = build_site(replace(marks, place=place), None)
-    assert np.abs(moved.landmarks.place).max() < 100
-
-
+@pytest.mark.slow
 def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path):
     flight = Overflight(frames=3, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
@@ -204,20 +148,6 @@ def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path
         # The landmark's blob is gone from the targets, and the mask counts on.
         assert len(found.scene.detections) == 1
         assert found.scene.mask.max() == 1
-
-
-def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_tells(prepared, tmp_path):
-    flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
-    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
-    locator, _ = prepared(flight, pictured=False)
-    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
-    still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
-    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
-        truth = flight.shown(frame, flight.marks(frame))
-        beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
-        found = watch.update(replace(scene(frame, picture, beside), step=still))
-        np.testing.assert_allclose(found.fixed.marks.image_px[0], truth[0], atol=1.0)
-    assert found.sighted_by[0] == "colour"
 
 
 def scene(frame, picture, landmark_px):
@@ -238,3 +168,39 @@ def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prep
         check_table(table, locator)
     helped, table = prepared(Overflight(landmarks=3, geographic=False))
     check_table(table, helped)
+
+
+def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
+    flight = Overflight(landmarks=6, geographic=False)
+    locator, table = prepared(flight, **{"landmarks.rule": "source"})
+    calm = list(locator.locate_table(table))
+    assert {len(g.marks) for g in calm} == {4}
+    locator, table = prepared(flight, **{"landmarks.rule": "source", "landmarks.poor_speed_m_s": 0.3})
+    busy = list(locator.locate_table(table))
+    assert len(busy[-1].marks) == 6
+    (moved,) = [a for g in busy for a in g.adjustments]
+    assert (moved.parameter, moved.new) == ("landmarks.used", 6)
+
+
+def test_places_over_the_date_line_are_near_each_other(prepared):
+    flight = Overflight()
+    locator, _ = prepared(flight)
+    marks = read_landmarks(locator.site.landmarks.path)
+    place = marks.place + np.array([-69.0500, 0.0])
+    place[:, 0] = (place[:, 0] + 180) % 360 - 180
+    moved = build_site(replace(marks, place=place), None)
+    assert np.abs(moved.landmarks.place).max() < 100
+
+
+def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_tells(prepared, tmp_path):
+    flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
+    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
+    locator, _ = prepared(flight, pictured=False)
+    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
+    still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
+        truth = flight.shown(frame, flight.marks(frame))
+        beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
+        found = watch.update(replace(scene(frame, picture, beside), step=still))
+        np.testing.assert_allclose(found.fixed.marks.image_px[0], truth[0], atol=1.0)
+    assert found.sighted_by[0] == "colour"

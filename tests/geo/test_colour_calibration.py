@@ -1,4 +1,4 @@
-"""Ranges of colour from painted ground: they hold the plates, not each other's, and little else."""
+"""Ranges of colour from painted ground hold the plates and little else; finders of colours agree with OpenCV."""
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from torchvision_dddas.geo.colour_calibration import (
     sample_box,
     to_hsv,
 )
+from torchvision_dddas.geo.colours import ColourFinder, load_colours
 
 PLATES = {"red": (178, 210, 200), "yellow": (28, 220, 220), "blue": (112, 200, 190), "magenta": (150, 190, 200)}
 LEAST = 12
@@ -56,25 +57,6 @@ def test_the_plates_are_found_and_each_range_marks_its_own_and_no_other(seed):
         assert inside(mask, boxes[name]) > 0.95
 
 
-def test_ranges_still_hold_in_another_light():
-    image, _ = painted(PLATES)
-    groups = pool_samples([find_samples(to_hsv(image), LEAST)], None)
-    low, high, _ = build_ranges(groups, [to_hsv(image)], LEAST)
-    names = name_hues([group[0].hue for group in groups])
-    darker, boxes = painted(PLATES, seed=5, shade=0.75)
-    for k, name in enumerate(names):
-        assert inside(mask_range(to_hsv(darker), low[k], high[k]), boxes[name]) > 0.9
-
-
-def test_red_goes_over_zero():
-    image, boxes = painted({"red": (179, 210, 200)})
-    hsv = to_hsv(image)
-    group = pool_samples([find_samples(hsv, LEAST)], 1)
-    low, high, _ = build_ranges(group, [hsv], LEAST)
-    assert low[0, 0] > 150 and high[0, 0] < 30
-    assert inside(mask_range(hsv, low[0], high[0]), boxes["red"]) > 0.95
-
-
 def test_neighbouring_hues_share_the_gap_between_them():
     def sample(hue):
         return [ColourSample(hue, np.full((50, 3), (hue, 200, 200), np.uint8), 1.0, 0, (0, 0, 5, 5))]
@@ -85,22 +67,56 @@ def test_neighbouring_hues_share_the_gap_between_them():
     assert (low[2, 0], high[2, 0]) == (167, 3)
 
 
-def test_what_else_a_range_marks_is_counted():
-    image, boxes = painted({"red": PLATES["red"], "blue": PLATES["blue"]})
-    image[430:450, 500:530] = image[boxes["red"][1] + 8, boxes["red"][0] + 12]
-    hsv = to_hsv(image)
-    red, blue = sample_box(hsv, boxes["red"]), sample_box(hsv, boxes["blue"])
-    assert red is not None and blue is not None
-    found = [[red], [blue]]
-    assert build_ranges(found, [hsv], LEAST)[2].tolist() == [1, 0]
-
-
 def test_a_box_on_grey_has_no_colour_and_one_half_on_the_plate_has_the_plates():
     image, boxes = painted({"blue": PLATES["blue"]})
     x, y, _, _ = boxes["blue"]
     half = sample_box(to_hsv(image), (x - 8, y - 4, 24, 16))
     assert half is not None and abs(hue_difference(half.hue, 112)) <= 4
     assert sample_box(np.full((20, 20, 3), (90, 10, 200), np.uint8), (0, 0, 20, 20)) is None
+
+
+LOW = np.array([[170, 80, 60], [10, 80, 60], [55, 40, 40], [0, 0, 0]], float)
+HIGH = np.array([[8, 255, 255], [30, 255, 255], [65, 255, 200], [180, 255, 90]], float)
+
+
+@pytest.fixture(scope="module", params=["onboard", "torch"])
+def finder(request) -> ColourFinder:
+    if request.param == "torch":
+        pytest.importorskip("torch")
+    return load_colours(request.param)
+
+
+def picture(height: int = 120, width: int = 160) -> np.ndarray:
+    random = np.random.default_rng(0)
+    patches = random.integers(0, 256, (height // 10, width // 10, 3)).astype(np.float32)
+    return cv2.resize(patches, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+
+
+def by_in_range(image: np.ndarray) -> np.ndarray:
+    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    masks = [cv2.inRange(hsv, low, high) for low, high in zip(LOW, HIGH, strict=True)]
+    ends = cv2.inRange(hsv, LOW[0], np.array([180.0, 255, 255])), cv2.inRange(hsv, LOW[0] * (0, 1, 1), HIGH[0])
+    return np.stack([np.maximum(*ends), *masks[1:]])
+
+
+def test_masks_are_those_of_opencv_also_for_a_hue_that_goes_over_zero(finder):
+    image = picture()
+    found, wanted = finder.masks(image, LOW, HIGH), by_in_range(image)
+    assert found.dtype == np.uint8 and found.shape == (4, 120, 160) and set(np.unique(found)) == {0, 255}
+    assert ((wanted > 0).mean((1, 2)) > 0.002).all()
+    assert (found != wanted).mean() <= (0 if finder.name == "onboard" else 0.002)
+
+
+def test_large_pictures_are_looked_at_in_parts_that_leave_no_trace():
+    image = picture(700, 900)
+    np.testing.assert_array_equal(load_colours("onboard").masks(image, LOW, HIGH), by_in_range(image))
+    wide = picture(20, 140_000 // 10 * 10)
+    np.testing.assert_array_equal(load_colours("onboard").masks(wide, LOW, HIGH), by_in_range(wide))
+
+
+def test_no_ranges_and_no_pixels_give_empty_masks(finder):
+    assert finder.masks(picture(), LOW[:0], HIGH[:0]).shape == (0, 120, 160)
+    assert finder.masks(np.zeros((0, 5, 3), np.uint8), LOW, HIGH).shape == (4, 0, 5)
 
 
 def test_pictures_of_one_team_are_taken_together():

@@ -24,14 +24,6 @@ def sightings(east_north_m, own=0.01, common=None, body=None):
     return Sightings(places, np.ones(n), np.zeros(n), np.full(n, "both"), own_m2, body_m, camera_m)
 
 
-def test_one_vehicle_alone_keeps_its_places_and_covariances():
-    alone = sightings([[1, 2], [3, 4], [9, -1]], own=0.2, common=1.43, body=(0.1, 0.5))
-    found = fuse([alone])
-    assert found.members.tolist() == [[0], [1], [2]]
-    assert np.allclose(found.east_north_m, alone.east_north_m)
-    assert np.allclose(found.covariance_m2, alone.covariance_m2)
-
-
 def test_independent_sightings_are_averaged_by_the_inverse_of_their_covariances():
     first, second = np.array([[1.0, 0.3], [0.3, 0.5]]), np.array([[0.2, 0.0], [0.0, 3.0]])
     found = fuse([sightings([[0, 0]], own=first), sightings([[0.6, 0.4]], own=second)])
@@ -40,35 +32,10 @@ def test_independent_sightings_are_averaged_by_the_inverse_of_their_covariances(
     assert np.allclose(found.east_north_m, both @ np.linalg.inv(second) @ [0.6, 0.4])
 
 
-def test_a_second_person_tells_how_far_two_vehicles_disagree():
-    one, two = np.array([[0.0, 0.0]]), np.array([[0.0, 0.0], [8.0, 0.0]])
-    spread = [
-        fuse([sightings(people, 0.5, 1.0), sightings(people, 0.01, 1.0)]).covariance_m2[0, 0, 0]
-        for people in (one, two)
-    ]
-    # The exact vehicle alone has 1.01; the GPS of both is the floor at 0.5.
-    assert 0.5 < spread[1] < spread[0] < 1.01
-
-
-def test_the_error_common_to_all_that_a_vehicle_sees_does_not_shrink_with_their_number():
-    people = np.arange(20.0).reshape(-1, 1) * (3, 0)
-    found = fuse([sightings(people, 0.01, 1.0), sightings(people, 0.01, 1.0)])
-    assert (found.covariance_m2[:, 0, 0] > 0.5).all()
-
-
 @pytest.mark.parametrize(("apart", "people"), [(0.95, 1), (1.05, 2)])
 def test_the_gate_is_that_of_three_sigmas(apart, people):
     limit = np.sqrt(gate_distance(3.0) * 0.02)
     assert len(fuse([sightings([[0, 0]]), sightings([[apart * limit, 0]])])) == people
-
-
-def test_a_vehicle_off_by_more_than_people_stand_apart_is_matched_as_a_whole():
-    rng = np.random.default_rng(3)
-    people = np.array([[0, 0], [2, 0.5], [4, 0], [5.5, 2], [2.5, 3]])
-    shifted = people + np.array([2.1, 0.4]) + rng.normal(0, 0.05, people.shape)
-    order = rng.permutation(5)
-    found = associate([sightings(people, 0.01, 1.43), sightings(shifted[order], 0.01, 1.43)])
-    assert sorted(found.tolist()) == sorted([k, int(np.flatnonzero(order == k)[0])] for k in range(5))
 
 
 def test_beliefs_worked_out_one_by_one_or_all_at_once_are_the_same(monkeypatch):

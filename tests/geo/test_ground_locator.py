@@ -57,14 +57,6 @@ def test_an_identity_twice_in_a_frame_is_said_with_its_line():
         GroundLocator(camera(), SETTINGS).locate_tables([twice])
 
 
-def test_scores_that_are_no_probabilities_make_sure_positions():
-    one = table(camera(), frames=(1,))
-    graded = replace(one, score=np.array([87.0, 3.5]))
-    (located,) = GroundLocator(camera(), SETTINGS).locate_tables([graded])
-    assert located.positions.score.tolist() == [1, 1]
-    assert located.score.tolist() == [87, 3.5]
-
-
 def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
     south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
     tables = [table(south), table(west, west.place, identity=(40, 30))]
@@ -91,14 +83,6 @@ def test_frames_that_lie_near_are_one_look_where_asked_for():
     assert all((look.members >= 0).all() for look in looks)
 
 
-def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first():
-    there = tuple(lonlat(np.array([[-15.0, 12.0]]), ORIGIN)[0].tolist())
-    south = camera(place=ORIGIN, geographic=True, **NEAR)
-    west = camera(heading_rad=np.pi / 2, place=there, geographic=True, **NEAR)
-    looks = found([table(south), table(west, (-15.0, 12.0))], [south, west])
-    assert np.allclose(looks[0].positions.east_north_m, walked(1), atol=1e-3)
-
-
 def test_paper_mode_converts_by_111320_metres_a_degree():
     paper = load_config(overrides=["ground.mode=paper"])
     cam = camera(place=ORIGIN, geographic=True)
@@ -114,25 +98,15 @@ def test_paper_mode_converts_by_111320_metres_a_degree():
         found([table(cam), table(cam)], [cam, cam], settings=paper)
 
 
-def test_cut_is_what_the_table_says_and_else_what_touches_the_border():
-    cam = camera()
-    at_border = replace(table(cam), box_px=table(cam).box_px - (0, 600, 0, 0))
-    assert found([at_border], [cam])[0].cut.tolist() == [True, True]
-    said = replace(at_border, cut=np.zeros(6, bool))
-    assert found([said], [cam])[0].cut.tolist() == [False, False]
-
-
-def test_whoever_has_no_distance_is_a_sighting_and_no_position():
-    cam = camera()
-    given = table(cam)
-    box = given.box_px.copy()
-    box[0] = (600, 700, 150, 260)  # cut at the feet
-    (look, *_) = found([replace(given, box_px=box)], [cam])
-    assert look.sightings.by.tolist() == ["bearing", "both"]
-    assert look.positions.target.tolist() == [9]
-
-
 def test_cameras_in_degrees_and_in_metres_do_not_mix():
     cam = camera()
     with pytest.raises(InputError, match="give all in one kind"):
         found([table(cam), table(cam)], [cam, replace(cam, geographic=True, place=ORIGIN)])
+
+
+def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first():
+    there = tuple(lonlat(np.array([[-15.0, 12.0]]), ORIGIN)[0].tolist())
+    south = camera(place=ORIGIN, geographic=True, **NEAR)
+    west = camera(heading_rad=np.pi / 2, place=there, geographic=True, **NEAR)
+    looks = found([table(south), table(west, (-15.0, 12.0))], [south, west])
+    assert np.allclose(looks[0].positions.east_north_m, walked(1), atol=1e-3)

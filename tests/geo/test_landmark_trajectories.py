@@ -66,30 +66,6 @@ def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_la
     assert len(course.at(1 + 25 * 21)) == 0  # beyond the plan, long after the last report
 
 
-def test_a_dropout_between_reports_on_a_plan_begins_and_ends_without_a_jump():
-    plan = [(1, 0, 0, 0, 1), (501, 0, 20, 0, 1)]
-    reports = [(1 + 25 * t, 0, t, 1.0) for t in range(4)] + [(1 + 25 * t, 0, t, -1.0) for t in range(15, 20)]
-    course = LandmarkTrajectories(landmarks(reports + plan), KNOBS, RATE)
-    north = np.array([course.at(frame).east_north_m[0, 1] for frame in range(1, 400)])
-    assert north[75] == pytest.approx(1.0) and north[375] == pytest.approx(-1.0)
-    assert np.abs(np.diff(north)).max() < 0.02
-
-
-def test_a_table_with_places_in_pictures_gives_those_rows_and_no_others():
-    rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (1, 1, 1, 1, 0, np.nan, 7, 8), (3, 0, 2, 0, 0, np.nan, 9, 9), (2, 1, 1, 1)]
-    course = LandmarkTrajectories(landmarks(rows, ("a", "b")), KNOBS, RATE)
-    assert course.pictured
-    assert course.at(1).landmark.tolist() == [0, 1] and course.at(1).image_px.tolist() == [[5, 6], [7, 8]]
-    assert len(course.at(2)) == 0
-    assert course.at(3).landmark.tolist() == [0]
-
-
-def test_a_row_with_a_picture_and_no_place_gets_the_place_between_its_reports():
-    rows = [(1, 0, 0, 0, 0, np.nan, 5, 6), (2, 0, np.nan, np.nan, 0, np.nan, 5, 7), (3, 0, 2, 0, 0, np.nan, 5, 8)]
-    marks = LandmarkTrajectories(landmarks(rows), KNOBS, RATE).at(2)
-    assert marks.east_north_m.tolist() == [[1, 0]] and marks.image_px.tolist() == [[5, 7]]
-
-
 def test_speeds_are_those_over_the_ground():
     course = LandmarkTrajectories(
         landmarks(once_a_second(range(5), [(3 * t, 4 * t) for t in range(5)]), ("a", "b")), KNOBS, RATE

@@ -1,13 +1,17 @@
-"""One-to-one assignment is SciPy's, whether or not SciPy is asked."""
+"""One-to-one assignment: pairs of the largest sum of scores or the least cost, with SciPy only where it is needed."""
 
+import itertools
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.geometry import cheapest
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import best_pairs, cheapest
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 3), (2, 7), (7, 2), (12, 12), (12, 40), (40, 12)])
@@ -50,3 +54,23 @@ def test_what_a_run_onboard_loads_leaves_the_slow_libraries_out() -> None:
     script += f"import torchvision_dddas.detection.opencv_engine\nprint([n for n in {slow!r} if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 3), st.integers(0, 3), st.data())
+def test_pairs_are_one_to_one_and_score_the_most(rows, columns, data):
+    entry = st.integers(-4, 9) | st.just(-np.inf)
+    score = np.array(data.draw(st.lists(entry, min_size=rows * columns, max_size=rows * columns)), float)
+    score = score.reshape(rows, columns)
+    found = best_pairs(score)
+    padded = np.hstack([score, np.zeros((rows, rows))])
+    choices = itertools.permutations(range(columns + rows), rows)
+    most = max(sum(padded[i, c] for i, c in enumerate(to)) for to in choices)
+    assert len(set(found[:, 0])) == len(set(found[:, 1])) == len(found)
+    assert (score[tuple(found.T)] > 0).all() and score[tuple(found.T)].sum() == most
+
+
+@pytest.mark.parametrize("score", [np.zeros(3), [[np.nan]], [[np.inf]]])
+def test_bad_scores_are_refused(score):
+    with pytest.raises(InputError, match="best_pairs needs"):
+        best_pairs(np.array(score))

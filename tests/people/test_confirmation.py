@@ -42,18 +42,6 @@ def test_a_person_inside_the_gate_is_at_the_blob_and_the_distance_is_kept():
     assert found.nearest_sigmas[0] == pytest.approx(0.5 / math.hypot(0.3, 0.1))
 
 
-def test_the_gate_is_the_chi_square_of_both_covariances():
-    # 99 % of a two-dimensional normal lie within 3.0349 sigma.
-    edge = 3.0349 * math.hypot(0.3, 0.1)
-    assert seen([0, 10], [edge * 0.999, 10]).people[0] == 1
-    assert seen([0, 10], [edge * 1.001, 10]).people[0] == 0
-
-
-def test_a_blob_well_within_view_with_none_near_is_looked_at_and_empty():
-    found = seen([0, 10])
-    assert (found.looked[0], found.people[0], found.nearest_m[0]) == (True, 0, np.inf)
-
-
 @pytest.mark.parametrize(
     "blob",
     [(0, 1.5), (0, 30), (0, -10), (8, 10), (0, 2.3), (0, 19.7)],
@@ -137,46 +125,6 @@ def test_one_chance_hit_makes_no_crowd_of_a_car():
     assert weight(car, np.zeros((0, 4))) < weight(person, np.zeros((0, 4)))
 
 
-def test_what_was_never_seen_keeps_the_prior_and_is_unseen():
-    beliefs = Beliefs(ConfirmParameters(prior=0.3))
-    beliefs.add(["blob"], [("ugv", one(False))])
-    assert beliefs.kind("blob") == "unseen"
-    assert beliefs.probability("blob") == pytest.approx(0.3)
-
-
-def test_looks_of_two_vehicles_add_up_and_later_ones_of_the_same_weigh_less():
-    parameters = ConfirmParameters(limit=50)
-    two, again = Beliefs(parameters), Beliefs(parameters)
-    two.add(["blob"], [("a", one(True, 1, 1.0)), ("b", one(True, 1, 1.0))])
-    for _ in range(2):
-        again.add(["blob"], [("a", one(True, 1, 1.0))])
-    odds = parameters.detection_rate / parameters.false_rate
-    assert two.probability("blob") == pytest.approx(odds**2 / (1 + odds**2))
-    assert again.probability("blob") == pytest.approx(
-        odds ** (1 + parameters.fresh) / (1 + odds ** (1 + parameters.fresh))
-    )
-
-
-def test_with_rates_as_stated_the_probabilities_are_calibrated():
-    # Simulated: half of the blobs are people, each is looked at by two vehicles once.
-    rng = np.random.default_rng(0)
-    parameters = ConfirmParameters()
-    human = rng.random(20_000) < parameters.prior
-    beliefs = Beliefs(parameters)
-    names = list(range(len(human)))
-    for vehicle in "ab":
-        people = (rng.random(len(human)) < np.where(human, parameters.detection_rate, parameters.false_rate)).astype(
-            int
-        )
-        nothing = np.full(len(human), np.nan)
-        looks = GroundObservation(np.ones(len(human), bool), people, nothing, nothing, people.astype(float))
-        beliefs.add(names, [(vehicle, looks)])
-    said = np.array([beliefs.probability(name) for name in names])
-    for value in np.unique(said.round(9)):
-        where = np.isclose(said, value)
-        assert human[where].mean() == pytest.approx(value, abs=4 * math.sqrt(0.25 / where.sum()))
-
-
 def test_boxes_are_confirmed_by_the_people_they_share():
     blobs = np.array([[100, 100, 60, 130], [300, 100, 60, 130], [500, 150, 30, 40], [0, 0, 200, 20.0]])
     people = np.array([[110, 95, 40, 120], [500, 120, 40, 110.0], [330, 400, 40, 100]])
@@ -194,3 +142,10 @@ def test_nothing_to_compare_is_fine(which):
     assert len(seen(blobs, people).looked) == len(blobs)
     boxes = observe_picture(np.zeros((len(blobs), 4)), np.zeros((len(people), 4)), np.ones(len(people)), KNOBS)
     assert len(boxes.people) == len(blobs)
+
+
+def test_what_was_never_seen_keeps_the_prior_and_is_unseen():
+    beliefs = Beliefs(ConfirmParameters(prior=0.3))
+    beliefs.add(["blob"], [("ugv", one(False))])
+    assert beliefs.kind("blob") == "unseen"
+    assert beliefs.probability("blob") == pytest.approx(0.3)

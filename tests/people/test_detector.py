@@ -9,10 +9,9 @@ import pytest
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people.detector import UNREAD, PersonDetector, detect_in_clip, detect_people
-from torchvision_dddas.types import DetectionTable, Frame, People
+from torchvision_dddas.types import DetectionTable, Frame
 
 SIZE = (320, 240)
-WINDOW = np.array([64, 128])
 
 
 class Brightest:
@@ -153,17 +152,6 @@ def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
     images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
     with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
         detect_people(images, Brightest(), PeopleParameters())
-
-
-def test_pictures_at_hand_give_the_people_of_the_clip():
-    clip = Clip(numbers=(1, 2, 3), last=3)
-    images = [frame.image for frame in clip]
-    for one, r in zip(
-        detect_people(images, Brightest(), PeopleParameters()),
-        detect_in_clip(clip, Brightest(), settings()),
-        strict=True,
-    ):
-        assert isinstance(one, People) and same(one, r.people)
 
 
 def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypatch):

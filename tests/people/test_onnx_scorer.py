@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import textwrap
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,7 @@ from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people import onnx_scorer as onboard_people
 from torchvision_dddas.people.classifiers import read_classifier
-from torchvision_dddas.people.onnx_scorer import Gradient, OnnxScorer
-from torchvision_dddas.runtime import SHIPPED, manifest
+from torchvision_dddas.people.onnx_scorer import OnnxScorer
 from torchvision_dddas.types import Part
 
 SVM = read_classifier("opencv", 3780)
@@ -40,18 +38,6 @@ def scored(image: np.ndarray, part: Part | None = None) -> np.ndarray:
     return found
 
 
-def test_every_window_of_a_picture_of_many_tiles_scores_as_in_opencv():
-    image = picture(0, 370, 430)
-    opencv = cv2.HOGDescriptor()
-    opencv.setSVMDetector(np.append(SVM.weights, SVM.bias).astype(np.float32))
-    places, wanted = (np.asarray(hit) for hit in opencv.detect(image, -1e9, (8, 8), (0, 0)))
-    found = scored(image)
-    assert found.size == len(wanted) > 1000
-    found = found[places[:, 1] // 8, places[:, 0] // 8]
-    np.testing.assert_allclose(found, wanted.ravel(), atol=2e-5, rtol=0)
-    assert ((found > 0) == (wanted.ravel() > 0)).all()
-
-
 @pytest.mark.parametrize(
     ("tile_px", "gradient_px", "blocks", "band_px"),
     [(16, 200_000, 5000, 20_000), (40, 1, 5000, 1), (72, 30_000, 1, 3000), (1000, 10**6, 10**6, 10**6)],
@@ -64,37 +50,6 @@ def test_how_the_work_is_cut_changes_nothing(monkeypatch, tile_px, gradient_px, 
     monkeypatch.setattr(onboard_people, "_BLOCKS", blocks)
     monkeypatch.setattr(onboard_people, "_BAND_PX", band_px)
     np.testing.assert_allclose(scored(image), wanted, atol=5e-6, rtol=0)
-
-
-def test_a_recognizer_may_be_asked_by_several_threads_at_once():
-    recognizer = OnnxScorer(PeopleParameters(), SVM)
-    images = [picture(seed, 200, 180) for seed in range(6)]
-    with ThreadPoolExecutor(3) as threads:
-        together = list(threads.map(lambda image: recognizer.scores([image], [[whole(image)]])[0][0], images))
-    for image, found in zip(images, together, strict=True):
-        np.testing.assert_allclose(found, scored(image), atol=5e-6, rtol=0)
-
-
-def test_the_gradient_of_each_pixel_is_that_of_the_channel_where_it_is_largest():
-    planes = np.zeros((3, 3, 3), np.uint8)
-    planes[0, 1, 2], planes[1, 2, 1], planes[2, 1, 0] = 100, 144, 121
-    magnitude, moment = Gradient(gamma=True, signed=True)(planes)[:, 0, 0]
-    assert magnitude == 12 and moment / magnitude == pytest.approx(np.pi / 2, abs=1e-5)
-    magnitude, moment = Gradient(gamma=False, signed=False)(planes[::-1][:1])[:, 0, 0]
-    assert magnitude == 121 and moment / magnitude == pytest.approx(np.pi, abs=1e-5)
-
-
-def test_a_gradient_and_its_opposite_have_one_direction_unless_it_is_signed():
-    planes = cv2.split(picture(4, 40, 50))
-    for signed in (False, True):
-        one, other = (
-            Gradient(False, signed)(np.stack(levels)).copy() for levels in (planes, [255 - p for p in planes])
-        )
-        steep = one[0] > 5
-        apart = np.abs(one[1] - other[1])[steep] / one[0][steep]
-        np.testing.assert_allclose(
-            apart.min() if signed else np.minimum(apart, np.pi - apart).max(), np.pi * signed, atol=1e-4
-        )
 
 
 def test_graphs_of_another_layout_are_refused_with_what_makes_them():
@@ -110,12 +65,7 @@ def test_a_folder_without_graphs_is_refused(tmp_path: Path, text: str | None):
         OnnxScorer(PeopleParameters(graphs=str(tmp_path)), SVM)
 
 
-def test_the_shipped_graphs_are_small_and_fit_the_default_settings():
-    assert sum(path.stat().st_size for path in SHIPPED.glob("people*.onnx")) < 100_000
-    made_for = manifest(SHIPPED)["graphs"]["people_scores.onnx"]["knobs"]
-    assert made_for == {name: int(getattr(PeopleParameters(), name)) for name in onboard_people.BAKED}
-
-
+@pytest.mark.slow
 def test_a_frame_needs_no_torch_and_further_ones_no_more_memory():
     """In a process of its own, on two threads: torch is not imported, resident memory is flat and below 150 MB."""
     script = textwrap.dedent("""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people import pyramid, suppression
+from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import WindowScorer, load_scorer
 from torchvision_dddas.people.torch_scorer import TorchScorer
@@ -79,12 +79,6 @@ def opencv_map(level: np.ndarray, parameters: PeopleParameters, svm: LinearSvm =
     return wanted
 
 
-def random_svm(parameters: PeopleParameters) -> LinearSvm:
-    """Of mixed signs, so that about half of all windows score above zero."""
-    weights = descriptor(parameters).getDescriptorSize()
-    return LinearSvm((np.random.default_rng(0).normal(size=weights) * 6 / weights**0.5).astype(np.float32), -0.05)
-
-
 def same(maps: list[np.ndarray], others: list[np.ndarray], within: float = 2e-5) -> None:
     for one, other in zip(maps, others, strict=True):
         assert one.shape == other.shape and one.dtype == other.dtype == np.float32
@@ -117,29 +111,6 @@ def test_every_window_of_every_level_scores_as_in_opencv(backend, given, grey):
         assert found.shape == wanted.shape and found.dtype == np.float32
         np.testing.assert_allclose(found, wanted, atol=2e-5, rtol=0)
         assert ((found > 0) == (wanted > 0)).all()
-
-
-LAYOUTS = {
-    "small": {"cell_px": 4, "block_px": 8, "block_stride_px": 4, "window_width_px": 32, "window_height_px": 64},
-    "signed": {"signed": True, "bins": 18},
-    "no gamma": {"gamma": False},
-    "large cells": {"cell_px": 16, "block_px": 32, "block_stride_px": 16, "bins": 6},
-}
-
-
-@pytest.mark.parametrize("stride", [4, 6, 16])
-@pytest.mark.parametrize("given", LAYOUTS.values(), ids=LAYOUTS)
-def test_another_descriptor_scores_as_in_opencv_at_any_stride(given, stride):
-    parameters = PeopleParameters(
-        **PLAIN | given | {"window_stride_px": stride, "padding_px": stride, "scale_step": 1.5}
-    )
-    svm = random_svm(parameters)
-    picture = scene(2, 140, 160)
-    parts = pyramid.everywhere((160, 140), parameters)
-    (maps,) = load_scorer(parameters, "torch", svm).scores([picture], [parts])
-    for part, found in zip(parts, maps, strict=True):
-        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        np.testing.assert_allclose(found, opencv_map(level, parameters, svm), atol=1e-4, rtol=0)
 
 
 @pytest.fixture(scope="module", params=BACK_ENDS)
@@ -178,35 +149,6 @@ def test_pictures_and_parts_asked_for_together_are_each_as_alone(recognizer):
         same(maps, recognizer.scores([picture], [wanted])[0], within=2e-6)
 
 
-def test_a_grey_picture_scores_as_one_of_three_equal_channels(recognizer):
-    picture = scene(8, 140, 100)[..., 1].copy()
-    part = Part((100, 140), 0, 0, 100, 140)
-    grey, colour = recognizer.scores([picture, cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)], [[part]] * 2)
-    same(grey, colour, within=2e-6)
-
-
-@pytest.mark.parametrize("backend", BACK_ENDS)
-@pytest.mark.parametrize(
-    ("stride", "pad", "step", "least"), [(8, 0, 1.05, 2), (8, 32, 1.05, 2), (4, 8, 1.1, 3), (8, 8, 1.2, 0)]
-)
-def test_detections_by_opencvs_grouping_are_opencvs(backend, stride, pad, step, least):
-    parameters = PeopleParameters(
-        **PLAIN | {"window_stride_px": stride, "padding_px": pad, "scale_step": step, "threshold": -0.3},
-        suppression="opencv",
-        group=least,
-    )
-    assert same_boxes(scene(10, 233, 311), parameters, SVM, backend) >= 2
-
-
-SMALL: dict[str, Any] = {
-    "window_width_px": 16,
-    "window_height_px": 32,
-    "cell_px": 4,
-    "block_px": 8,
-    "block_stride_px": 4,
-}
-
-
 def test_gradients_reach_the_levels_of_the_picture_and_the_weights():
     recognizer = TorchScorer(PeopleParameters(), SVM, "cpu")
     recognizer.weights.requires_grad_()
@@ -234,29 +176,3 @@ def test_pictures_that_must_not_be_written_to_or_lie_otherwise_in_memory_score_t
     for scored in found:
         np.testing.assert_array_equal(scored[0], wanted[0])
     assert not recwarn.list
-
-
-def same_boxes(picture: np.ndarray, parameters: PeopleParameters, svm: LinearSvm, backend: str) -> int:
-    """Asserts that grouped detections are those of detectMultiScale, and says how many there are."""
-    size, stride, pad = picture.shape[1::-1], parameters.window_stride_px, parameters.padding_px
-    rectangles, weights = opencv(parameters, svm).detectMultiScale(
-        picture,
-        hitThreshold=parameters.threshold,
-        winStride=(stride, stride),
-        padding=(pad, pad),
-        scale=parameters.scale_step,
-        groupThreshold=parameters.group,
-    )
-    wanted = np.column_stack([np.reshape(rectangles, (-1, 4)), np.ravel(weights)])
-    parts = pyramid.everywhere(size, parameters)
-    (maps,) = load_scorer(parameters, backend, svm).scores([picture], [parts])
-    boxes, scores = suppression.group_rectangles(
-        *pyramid.windows(parts, maps, size, parameters), parameters.group, parameters.group_distance
-    )
-    # OpenCV cuts the boxes at the picture's border, last of all; here a body's place in its window needs all of it.
-    low, high = np.maximum(boxes[:, :2], 0), np.minimum(boxes[:, :2] + boxes[:, 2:], size)
-    found = np.column_stack([low, high - low, scores])[(high > low).all(axis=1)]
-    # OpenCV's order is that in which its threads end.
-    order, own = np.lexsort(wanted.T[::-1]), np.lexsort(found.T[::-1])
-    np.testing.assert_allclose(found[own], wanted[order], atol=5e-5, rtol=0)
-    return len(wanted)

@@ -5,7 +5,7 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.people import pyramid
-from torchvision_dddas.people.search_regions import ExpectedPeople, Search, around_blobs
+from torchvision_dddas.people.search_regions import ExpectedPeople, Search
 from torchvision_dddas.types import People
 
 SIZE = (640, 480)
@@ -56,16 +56,6 @@ def test_every_level_has_its_turn_once_in_a_round_and_no_window_is_searched_twic
         assert all(part in everywhere for part in look.parts if part.level in alone)
 
 
-def test_velocity_is_learnt_and_carries_over_frames_that_show_nobody():
-    expected = ExpectedPeople(KNOBS)
-    for n in range(1, 21):
-        expected.update(n, people(walker(n, speed=9)))
-    for n in (21, 22, 23):
-        expected.update(n, people())
-    assert len(expected) == 1
-    assert expected.box_px(24)[0] == pytest.approx(walker(24, speed=9), abs=4)
-
-
 def test_one_who_is_missed_stays_expected_for_two_rounds_and_a_glimpse_is_soon_forgotten():
     expected = ExpectedPeople(KNOBS)
     for n in range(1, 21):
@@ -81,17 +71,6 @@ def test_one_who_is_missed_stays_expected_for_two_rounds_and_a_glimpse_is_soon_f
         assert len(expected) == 1
     expected.update(47, people())
     assert len(expected) == 0
-
-
-def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost():
-    def found(n):
-        return people(walker(n), (400, 200, 40, 110)) if n < 5 else people()
-
-    made = looks(Search(KNOBS), found, 10)
-    assert [n for n, look in made.items() if look.regions_px is None] == [1, 6]
-    assert [(a.old < 0.2, a.new, a.cause) for a in made[6].adjustments] == [
-        (True, 1.0, "none of 2 people expected was found")
-    ]
 
 
 @pytest.mark.parametrize("share", [0.2, pytest.param(0.01, marks=pytest.mark.slow)])
@@ -141,24 +120,6 @@ def test_with_blobs_alone_only_their_surroundings_are_searched_and_nothing_where
     assert all(look.share == 0 and look.parts == [] and len(look.regions_px) == 0 for n, look in made.items() if n > 1)
 
 
-def test_with_blobs_and_regions_both_are_searched_and_the_whole_picture_at_first():
-    blob = np.array([[400, 100, 50, 120.0]])
-    made = looks(Search(KNOBS, lambda n: blob), lambda n: people(walker(n)), 12)
-    assert [n for n, look in made.items() if look.regions_px is None] == [1]
-    assert all(np.shape(made[n].regions_px) == (2, 4) for n in range(2, 13))
-
-
-@pytest.mark.parametrize("share", [0.5, 1.0, 1.7, 2.5])
-def test_bodies_from_half_a_blob_to_those_of_which_it_is_the_legs_are_looked_for(share):
-    blob = np.array([200, 160, 40, 100.0])
-    regions_px, heights_px = around_blobs(blob[None])
-    height = share * blob[3]
-    standing = blob[1] + blob[3] + (5 if share > 1 else 0) - height  # legs alone are at the lower end
-    body = np.array([blob[0] + 20 - 0.2 * height, standing, 0.4 * height, height])
-    assert heights_px[0, 0] <= height <= heights_px[0, 1]
-    assert inside(body, regions_px[0])
-
-
 def test_a_blob_that_those_expected_explain_is_not_searched_again():
     blob = np.array([[0, 220, 30, 80.0], [400, 220, 30, 80]])
 
@@ -170,3 +131,14 @@ def test_a_blob_that_those_expected_explain_is_not_searched_again():
     assert len(made[6].regions_px) == 2
     assert inside(np.array(walker(6)), made[6].regions_px[0])
     assert inside(blobs(6)[1], made[6].regions_px[1])
+
+
+def test_a_frame_is_searched_everywhere_once_when_all_who_were_expected_are_lost():
+    def found(n):
+        return people(walker(n), (400, 200, 40, 110)) if n < 5 else people()
+
+    made = looks(Search(KNOBS), found, 10)
+    assert [n for n, look in made.items() if look.regions_px is None] == [1, 6]
+    assert [(a.old < 0.2, a.new, a.cause) for a in made[6].adjustments] == [
+        (True, 1.0, "none of 2 people expected was found")
+    ]

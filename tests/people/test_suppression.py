@@ -6,7 +6,6 @@ import pytest
 
 from torchvision_dddas.config import load_config
 from torchvision_dddas.people.suppression import (
-    body_boxes,
     group_rectangles,
     non_maximum_suppression,
     people_from_windows,
@@ -30,11 +29,6 @@ def crowd(seed, number=120):
     return np.column_stack([rng.uniform(0, 300, (number, 2)), height / 2, height]), rng.normal(size=number)
 
 
-def test_the_best_of_boxes_that_overlap_stays_and_others_are_untouched():
-    box = boxes([0, 0, 40, 100], [4, 0, 40, 100], [200, 0, 40, 100])
-    assert non_maximum_suppression(box, np.array([1.0, 2, 0.5]), 0.5).tolist() == [1, 2]
-
-
 def test_a_part_of_a_better_box_goes_where_containment_counts():
     box = boxes([0, 0, 40, 100], [10, 60, 20, 40])
     assert non_maximum_suppression(box, np.array([2.0, 1]), 0.4).tolist() == [0, 1]
@@ -52,24 +46,9 @@ def test_those_that_stay_are_apart_and_each_that_goes_has_a_better_one_on_it(see
         assert any(iou(box[i], box[j]) > 0.3 and score[j] >= score[i] for j in kept)
 
 
-def test_suppression_does_not_depend_on_the_order_of_rows():
-    box, score = crowd(7)
-    order = np.random.default_rng(0).permutation(len(box))
-    assert (
-        order[non_maximum_suppression(box[order], score[order], 0.3, 0.7)].tolist()
-        == non_maximum_suppression(box, score, 0.3, 0.7).tolist()
-    )
-
-
 def test_a_box_settles_on_the_weighted_mean_of_its_neighbours():
     box = boxes([0, 0, 40, 100], [4, 8, 40, 100], [300, 0, 40, 100])
     np.testing.assert_allclose(refine_boxes(box, np.array([3.0, 1, 5]), np.array([0]), 0.7), [[1, 2, 40, 100]])
-
-
-def test_a_box_alone_or_without_weight_stays_where_it_is():
-    box = boxes([0, 0, 40, 100], [4, 8, 40, 100])
-    np.testing.assert_allclose(refine_boxes(box, np.ones(2), np.array([1, 0]), 1.0), box[[1, 0]], atol=1e-9)
-    np.testing.assert_allclose(refine_boxes(box, np.zeros(2), np.array([0]), 0.7), box[[0]], atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +84,6 @@ def test_groups_are_those_of_opencv_to_the_rectangle_and_the_weight(scored, thre
     np.testing.assert_allclose([row[4] for row in ours], [row[4] for row in wanted])
 
 
-def test_boxes_that_a_chain_links_are_one_group_whatever_their_order():
-    chain = boxes(*[[x, 0, 64, 128] for x in range(0, 96, 16)])
-    order = [3, 0, 5, 1, 4, 2]
-    for rows in (chain, chain[order]):
-        box, best = group_rectangles(rows, np.arange(6.0), least=2)
-        assert box.tolist() == [[40, 0, 64, 128]] and best.tolist() == [5]
-
-
 SIZE = (640, 480)
 
 
@@ -127,11 +98,6 @@ def around(box, k):
     return np.stack([x - (width - wide) / 2, y + tall - k.feet_share * height, width, height], axis=-1)
 
 
-def test_a_body_is_the_calibrated_share_of_its_window():
-    k = parameters(height_share=0.75, width_share=0.5, feet_share=0.9)
-    np.testing.assert_allclose(body_boxes(np.array([[100.0, 50, 64, 128]]), k), [[116, 50 + 0.15 * 128, 32, 96]])
-
-
 def test_windows_around_one_person_are_one_between_them():
     window = np.array([[100.0, 50, 64, 128], [108, 50, 64, 128], [104, 46, 67.2, 134.4], [400, 100, 64, 128]])
     people = people_from_windows(window, np.array([1.0, 1.0, 0.5, 0.3]), SIZE, parameters())
@@ -140,16 +106,6 @@ def test_windows_around_one_person_are_one_between_them():
     middle = people.box_px[0, 0] + people.box_px[0, 2] / 2
     assert 100 + 32 < middle < 108 + 32
     np.testing.assert_allclose(people.window_px[1], window[3])
-
-
-def test_legs_are_no_second_person():
-    k = parameters()
-    whole = np.array([100.0, 50, 100, 200])
-    x, y, wide, tall = body_boxes(whole[None], k)[0]
-    legs = around(np.array([[x + 5, y + 0.5 * tall, wide / 2, tall / 2]]), k)[0]
-    window, margin = np.stack([legs, whole]), np.array([1.0, 2.0])
-    np.testing.assert_allclose(people_from_windows(window, margin, SIZE, k).window_px, whole[None])
-    assert len(people_from_windows(window, margin, SIZE, parameters(contained=1.0))) == 2
 
 
 def test_people_come_best_first_with_a_probability_that_rises_with_the_score():

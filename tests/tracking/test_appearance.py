@@ -1,10 +1,17 @@
-"""Histograms of boxes, their similarity, and the association score that follows."""
+"""Histograms of boxes, their similarity and score; association scores, the speed prior and the memory of tracks."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import settings as given_settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
-from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.config import Settings
+from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.appearance import (
     SIGNATURE,
     appearance_scores,
@@ -12,8 +19,9 @@ from torchvision_dddas.tracking.appearance import (
     is_ambiguous,
     similarity,
     strip_histograms,
-    visible_shares,
 )
+from torchvision_dddas.tracking.kalman import SEEN, VX, VY
+from torchvision_dddas.tracking.scores import SceneState, SpeedPrior, association_scores
 
 RED, GREEN, BLUE = (0, 0, 200), (0, 200, 0), (200, 0, 0)
 GROUND = (110, 120, 115)
@@ -57,21 +65,6 @@ def test_the_likeness_of_a_target_to_itself_is_one_and_to_another_colour_less():
     assert likeness(same, same) == pytest.approx(1, abs=1e-5)
     assert likeness(same, again) == pytest.approx(1, abs=1e-5)
     assert likeness(same, other) < 0.8
-
-
-def test_the_size_of_a_target_hardly_matters():
-    image = picture((BOX, RED, BLUE), ((200, 100, 15, 45), RED, BLUE))
-    one, small = strip_histograms(image, np.array([BOX, (200, 100, 15, 45)], float))
-    assert likeness(one, small) > 0.95
-
-
-def test_the_middle_of_a_box_counts_more_than_its_sides():
-    middle, sides = picture(), picture()
-    middle[40:160, 113:127] = RED
-    sides[40:160, 100:107] = sides[40:160, 133:140] = RED
-    body = strip_histograms(picture((BOX, RED, RED)), np.array([BOX], float))[0]
-    in_the_middle, at_the_sides = (strip_histograms(image, np.array([BOX], float))[0] for image in (middle, sides))
-    assert likeness(body, in_the_middle) > likeness(body, at_the_sides) + 0.1
 
 
 def test_a_box_outside_has_zeros_and_one_half_outside_has_its_inside():
@@ -122,15 +115,6 @@ def test_the_same_look_scores_best_and_a_mixture_of_two_between_them():
     assert score[0] == pytest.approx(KNOBS.appearance_weight * (1 - KNOBS.appearance_offset))
 
 
-def test_there_is_an_end_to_what_an_unlike_look_says_against_a_link():
-    """Light and turning change a look at once, so a larger weight makes the likes of it count more, not the unlikes."""
-    heavy = with_parameters(Settings(), {"track.appearance_weight": 100}).track
-    apart = np.eye(12)[:2]
-    score, more = (score_of(apart, apart, np.ones(2), parameters) for parameters in (KNOBS, heavy))
-    assert more[0, 0] > score[0, 0]
-    assert more[0, 1] == score[0, 1] < 0
-
-
 def test_what_is_unknown_scores_nothing():
     known = looks(2)
     score = score_of(np.stack([known[0], UNKNOWN]), np.stack([UNKNOWN, known[1]]), np.ones(2), KNOBS)
@@ -170,37 +154,117 @@ def test_a_first_look_is_taken_whole_and_an_unknown_one_changes_nothing():
     np.testing.assert_array_equal(blend_histograms(UNKNOWN[None], UNKNOWN[None], visible, hits), UNKNOWN[None])
 
 
-def test_a_memory_fades_but_does_not_vanish_at_once():
-    old, new = looks(2)
-    memory = old[None]
-    far = []
-    for hits in range(30, 60):
-        memory = blend_histograms(memory, new[None], np.ones(1), np.array([hits]))
-        assert memory.sum() == pytest.approx(1)
-        far.append(np.abs(memory - new).sum())
-    assert far[0] > 0.5 * np.abs(old - new).sum()
-    assert far[-1] < 0.01
-    assert far == sorted(far, reverse=True)
+SIGHT = SceneState(frame=11, interval=5, speed=0.07, size=(1000.0, 800.0))
+PERSON = np.array([500.0, 300, 32, 80])
+HERE = np.zeros(1, bool)
 
 
-def test_a_covered_target_leaves_the_memory_alone():
-    old, new = looks(2)
-    moved = [
-        np.abs(blend_histograms(old[None], new[None], np.array([visible]), np.array([8])) - old).sum()
-        for visible in (1, 0.5, 0)
-    ]
-    assert moved[0] > moved[1] > moved[2] == 0
+def track(box: np.ndarray = PERSON, seen: int = 6, velocity: tuple[float, float] = (0, 0)) -> np.ndarray:
+    """(1, COLUMNS) a target seen several times, last at a frame."""
+    state = kalman.start(box[None], 1, KNOBS.scatter, 0.07)
+    state = kalman.update(kalman.predict(state, 6, KNOBS.agility), box[None], 6, KNOBS.scatter)
+    state[:, [VX, VY]] = velocity
+    state[:, SEEN] = seen
+    return state
 
 
-def test_who_stands_lower_in_the_picture_covers_who_stands_behind():
-    behind, before = [0.0, 0, 10, 20], [5.0, 5, 10, 20]
-    share = visible_shares(np.array([behind, before]))
-    assert share.tolist() == [pytest.approx(1 - 5 * 15 / 200), 1.0]
-    assert visible_shares(np.array([before, behind])).tolist() == share[::-1].tolist()
+def scored(
+    boxes: ArrayLike, state: np.ndarray | None = None, sight: SceneState = SIGHT, left: bool = False
+) -> list[float]:
+    """The scores of one track's links."""
+    state = track() if state is None else state
+    return association_scores(state, np.full(len(state), left), np.asarray(boxes), sight, KNOBS)[0].tolist()
 
 
-def test_a_share_is_never_below_nothing():
-    crowd = np.array([[0.0, 0, 10, 20], [0.0, 1, 10, 20], [0.0, 2, 10, 20], [0.0, 3, 10, 20]])
-    share = visible_shares(crowd)
-    assert share[0] == 0 and share[-1] == 1
-    assert ((share >= 0) & (share <= 1)).all()
+def moved(*steps: tuple[float, float]) -> np.ndarray:
+    return np.array([[PERSON[0] + x, PERSON[1] + y, *PERSON[2:]] for x, y in steps])
+
+
+@pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1), (0.6, 0.8)])
+@pytest.mark.parametrize("seen", [6, 1])
+def test_a_score_falls_with_distance_and_below_nothing(direction, seen):
+    steps = [(direction[0] * d, direction[1] * d) for d in (0, 5, 20, 60, 150, 400)]
+    score = scored(moved(*steps), track(seen=seen))
+    assert score == sorted(score, reverse=True)
+    assert len(set(score)) == len(score)
+    assert score[0] > 0 > score[-1]
+
+
+@given_settings(max_examples=40, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.05, 20), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.sampled_from([1, 6]))
+def test_the_scale_of_the_scene_and_its_place_do_not_matter(seed, scale, x, y, seen):
+    random = np.random.default_rng(seed)
+    similar = np.array([[scale, 0, x], [0, scale, y], [0, 0, 1]])
+    boxes = PERSON + random.normal(0, 30, (5, 4)) * [2, 2, 0.2, 0.5]
+    state, sight = track(seen=seen, velocity=(6, -3)), replace(SIGHT, size=None)
+    expected = association_scores(state, HERE, boxes, sight, KNOBS)
+    there = association_scores(
+        kalman.transform(state, similar), HERE, kalman.transform_boxes(boxes, similar), sight, KNOBS
+    )
+    np.testing.assert_allclose(there, expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("tracks", "boxes"), [(0, 0), (0, 2), (2, 0)])
+def test_nobody_or_nothing_gives_an_empty_table(tracks, boxes):
+    state = np.repeat(track(), tracks, axis=0)
+    assert association_scores(state, np.zeros(tracks, bool), np.tile(PERSON, (boxes, 1)), SIGHT, KNOBS).shape == (
+        tracks,
+        boxes,
+    )
+
+
+def test_who_was_lost_may_have_stood_still_though_it_was_walking():
+    """Only after a gap: a target seen in the last look is where its velocity says."""
+    at_rest, onward, back, half = moved((0, 0), (160, 0), (-120, 0), (40, 0))
+    walking = {gap: track(seen=11 - gap, velocity=(8, 0)) for gap in (5, 20)}
+    lost, still = scored([at_rest], walking[20])[0], scored([at_rest], track(seen=-9))[0]
+    assert lost > 0
+    assert still >= lost
+    assert scored([back, onward], walking[20])[0] < 0
+    assert scored([at_rest], walking[5])[0] < 0.5 * scored([half], walking[5])[0]
+
+
+def test_the_border_counts_only_for_those_that_were_missed():
+    edge = np.array([0.0, 300, 32, 80])
+    for seen, matters in ((6, False), (1, True)):
+        state = track(edge, seen)
+        inside = scored([edge], state, replace(SIGHT, size=None))[0]
+        assert (scored([edge], state)[0] < inside) == matters
+        assert (scored([edge], state, replace(SIGHT, size=None), left=True)[0] < inside) == matters
+
+
+def walkers(frame: int, speed: float, count: int = 6) -> np.ndarray:
+    """(N, 4) boxes 40 px high, far apart, that walk to the right at so many heights a frame."""
+    x = 300.0 * np.arange(count) + 40 * speed * frame
+    return np.stack([x, np.full(count, 50.0), np.full(count, 16.0), np.full(count, 40.0)], axis=1)
+
+
+def learned(speed: float, interval: int = 5, looks: int = 40, start: float = 0.07) -> float:
+    pace = SpeedPrior(start)
+    for look in range(looks):
+        pace.add(walkers(interval * look, speed), walkers(interval * (look + 1), speed), interval)
+    return pace.speed
+
+
+def test_it_starts_as_told_and_learns_nothing_from_nothing():
+    pace = SpeedPrior(0.2)
+    for before, now in ((np.zeros((0, 4)), walkers(0, 0.1)), (walkers(0, 0.1), np.zeros((0, 4)))):
+        pace.add(before, now, 5)
+    pace.add(walkers(0, 0.1, 2), walkers(1, 0.1, 2), 1)
+    assert pace.speed == 0.2
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])
+def test_it_ends_near_the_true_speed(speed):
+    assert speed / 1.6 < learned(speed) < 1.6 * speed
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_targets_without_a_partner_are_no_steps(left):
+    """Those that left are nobody's nearest, those that came are nearest to none: their distances are no speeds."""
+    pace, other = SpeedPrior(0.07), SpeedPrior(0.07)
+    before, now = walkers(0, 0.1), walkers(5, 0.1)
+    strangers = walkers(0, 0.1) - np.array([5000, 0, 0, 0])
+    pace.add(before, now, 5)
+    other.add(np.concatenate([strangers, before]) if left else before, now if left else np.r_[now, strangers], 5)
+    assert other.speed == pytest.approx(pace.speed)

@@ -64,11 +64,6 @@ def test_a_small_blob_behind_a_crowd_has_no_identity_for_a_while_and_a_large_one
     assert identities(crowd + [[(1, 4 + 0.2 * k, 0, 2.3), (2, 0.5, 0, 1.8)] for k in range(20)])[20] == [1, 2]
 
 
-def test_a_blob_that_could_not_be_located_keeps_its_identity():
-    frames = [[(1, 0, 0, 2.0), (2, 12, 0, 2.0)]] * 10 + [[(2, np.nan, np.nan, np.nan), (3, np.nan, np.nan, np.nan)]]
-    assert identities(frames)[-1] == [2, 3]
-
-
 def test_tracks_get_the_identities_of_their_crowds_and_boxes_that_bridge_a_gap_keep_theirs():
     crowds = CrowdIdentities()
     boxes, scores = np.arange(8.0).reshape(2, 4), np.array([0.9, 0.8])
@@ -81,3 +76,8 @@ def test_tracks_get_the_identities_of_their_crowds_and_boxes_that_bridge_a_gap_k
     later = rename([4, 9], [0, -1], [20, 0])
     assert later.identity.tolist() == [1, 2] and later.row.tolist() == [-1, 0]
     assert later.box_px.tolist() == boxes[::-1].tolist()
+
+
+def test_a_blob_that_could_not_be_located_keeps_its_identity():
+    frames = [[(1, 0, 0, 2.0), (2, 12, 0, 2.0)]] * 10 + [[(2, np.nan, np.nan, np.nan), (3, np.nan, np.nan, np.nan)]]
+    assert identities(frames)[-1] == [2, 3]

@@ -49,24 +49,6 @@ def test_a_straight_walk_before_a_pinhole_camera_is_predicted_exactly_also_towar
     np.testing.assert_allclose(later[:, [WIDTH, HEIGHT]], filmed(3 + gap)[:, 2:], rtol=1e-9)
 
 
-@pytest.mark.parametrize("middle", [4, 9])
-def test_two_short_predictions_are_one_long_one(middle):
-    """For the values; the variances too, as the velocity is a random walk."""
-    once, first = kalman.predict(known(0), 10, AGILITY), kalman.predict(known(0), middle, AGILITY)
-    first[:, SEEN] = middle
-    twice = kalman.predict(first, 10, AGILITY)
-    twice[:, SEEN] = 0
-    np.testing.assert_allclose(twice, once, rtol=1e-9)
-
-
-def test_nothing_is_predicted_to_pass_through_the_camera():
-    state = known(0)
-    state[:, GROWTH] = 0.2
-    later = kalman.predict(state, 100, AGILITY)
-    assert np.isfinite(later).all()
-    np.testing.assert_allclose(later[:, HEIGHT], 2 * state[:, HEIGHT])
-
-
 def test_velocity_and_growth_are_learned_from_boxes_alone():
     state = kalman.start(filmed(0), 0, SCATTER, 0.07)
     for frame in range(1, 60):
@@ -80,11 +62,6 @@ def test_velocity_and_growth_are_learned_from_boxes_alone():
 def kalman_boxes(state: np.ndarray) -> np.ndarray:
     size = state[:, [WIDTH, HEIGHT]]
     return np.concatenate([state[:, [X, Y]] - size / 2, size], axis=1)
-
-
-def test_a_new_target_rests_where_it_was_seen():
-    state = kalman.start(filmed(2), 2, SCATTER, 0.07)
-    np.testing.assert_allclose(kalman_boxes(kalman.predict(state, 30, AGILITY)), filmed(2))
 
 
 @settings(max_examples=60, deadline=None)

@@ -90,20 +90,6 @@ def shuffled(centres: np.ndarray, seed: int = 0) -> tuple[list[Detections], list
     return [seen(*c[o]) for c, o in zip(centres, order, strict=True)], [o.tolist() for o in order]
 
 
-@pytest.mark.parametrize("look_ahead", [True, False])
-@pytest.mark.parametrize("hits", [1, 3, 5])
-def test_each_frame_comes_out_once_in_order_no_later_than_promised(hits, look_ahead):
-    """Within `hits` + 2 looks, empty ones too."""
-    run, found = tracker(hits=hits, look_ahead=look_ahead), []
-    for n in range(30):
-        found += run.feed(1 + 5 * n, seen(*[(100 + 10 * n, 300)] * (n % 7 != 3)))
-        assert [page.frame for page in found] == [1 + 5 * k for k in range(len(found))]
-        assert n - len(found) < hits + 2
-    found += run.end()
-    assert [page.frame for page in found] == [1 + 5 * k for k in range(30)]
-    assert run.end() == []
-
-
 @given_settings(max_examples=8, deadline=None)
 @given(st.integers(0, 1000), st.integers(2, 14))
 def test_what_has_come_out_is_the_same_whatever_comes_later(seed, stop):
@@ -135,76 +121,12 @@ def test_people_whose_ways_cross_keep_their_identities_at_a_low_frame_rate(seed,
     assert all(len(page) == 6 for page in found)
 
 
-@pytest.mark.parametrize("score", [1.0, DOUBTFUL])
-def test_the_order_of_the_rows_only_renames_the_tracks(score):
-    centres = walks(7, 20, 5, 3)
-    plain = names(tracked([seen(*c, score=score) for c in centres]))
-    frames, order = shuffled(centres, 8)
-    again = names(tracked([Detections(f.box_px, np.full(len(f), score)) for f in frames]))
-    new_name: dict[int, int] = {}
-    for page, other, here in zip(plain, again, order, strict=True):
-        assert len(page) == len(other)
-        for row, who in other.items():
-            assert new_name.setdefault(page[here[row]], who) == who
-    assert len(set(new_name.values())) == len(new_name)
-
-
-def test_identities_begin_at_one_leave_none_out_and_are_per_run():
-    for _ in range(2):
-        frames = [seen((200, 300))] * 4 + [seen((200, 300), (600, 500, 90), (900, 300))] * 4
-        found = tracked([seen((900, 700), score=DOUBTFUL), *frames])
-        assert [sorted(page.identity.tolist()) for page in found] == [[], *[[1]] * 4, *[[1, 2, 3]] * 4]
-
-
 def test_only_a_good_detection_begins_a_track_but_a_fair_one_may_go_on_with_it():
     parameters = with_parameters(Settings(), {}).track
     fair = (parameters.min_score + parameters.birth_score) / 2
     assert not any(names(tracked([seen((300, 300), score=fair)] * 9)))
     good_then_fair = [seen((300, 300), score=parameters.birth_score)] + [seen((300, 300), score=fair)] * 8
     assert names(tracked(good_then_fair)) == [{0: 1}] * 9
-
-
-def test_a_poor_detection_is_never_used():
-    """It neither goes on with a track nor moves its row numbers, and does not stand in the way of a good one."""
-    poor = Settings().track.min_score - 0.01
-    frames = [seen((300, 300), (700, 300), score=[poor, 1.0])] * 6
-    assert names(tracked(frames)) == [{1: 1}] * 6
-    gone = [seen((300, 300))] * 3 + [seen((300, 300), score=poor)] * 6
-    assert names(tracked(gone)) == [{0: 1}] * 3 + [{}] * 6
-
-
-@pytest.mark.parametrize(("score", "looks", "shown"), [(DOUBTFUL, 2, 0), (DOUBTFUL, 3, 3), (1.0, 1, 1)])
-def test_three_detections_confirm_a_track_and_a_certain_one_alone(score, looks, shown):
-    frames = [seen()] * 2 + [seen((300, 300), score=score)] * looks + [seen()] * 5
-    assert sum(map(len, names(tracked(frames)))) == shown
-
-
-@pytest.mark.parametrize("gap", [1, 2, 3, 4])
-def test_short_gaps_are_filled_longer_ones_are_not_and_both_are_bridged(gap):
-    def here(n: int) -> tuple[float, float]:
-        return 200 + 15.0 * n, 300
-
-    frames = [seen(here(n)) if not 8 <= n < 8 + gap else seen() for n in range(20)]
-    for n, page in enumerate(tracked(frames)):
-        missed = 8 <= n < 8 + gap
-        assert page.identity.tolist() == ([] if missed and gap > 2 else [1])
-        assert page.row.tolist() == ([] if missed and gap > 2 else [-1] if missed else [0])
-        if len(page):
-            np.testing.assert_allclose(page.box_px, boxes(here(n)), atol=1e-9)
-
-
-def test_who_stands_still_behind_something_comes_back_as_the_same():
-    """Others walk past it meanwhile, and it had been walking."""
-    frames, people = [], []
-    for n in range(30):
-        stands = 150 + 12.0 * min(n, 8), 300
-        others = [(100 + 25.0 * n, 330), (1000 - 25.0 * n, 360)]
-        hidden = 9 <= n < 17
-        frames.append(seen(*others) if hidden else seen(*others, stands))
-        people.append([0, 1] if hidden else [0, 1, 2])
-    found = tracked(frames)
-    assert switches(found, people) == 0
-    assert names(found)[-1] == names(found)[0] == {0: 1, 1: 2, 2: 3}
 
 
 def test_who_left_the_picture_is_remembered_for_less_long_than_who_was_lost_inside():
@@ -214,24 +136,6 @@ def test_who_left_the_picture_is_remembered_for_less_long_than_who_was_lost_insi
         for n in range(26):
             run.feed(1 + 5 * n, seen((start + 25.0 * n, 300)) if n < 6 else seen())
         assert len(run.tracks) == remembered
-
-
-def test_who_was_never_confirmed_is_soon_dropped():
-    run = tracker()
-    for n in range(24):
-        alarm = [(80 + 45 * n, 100)] * (n % 3 == 0)
-        run.feed(1 + 5 * n, seen((600, 600), *alarm, score=[1.0, DOUBTFUL][: 1 + len(alarm)]))
-        assert len(run.tracks) <= 3
-        assert len(run.smoother.counts) <= 3
-
-
-def test_one_target_for_ever_keeps_its_identity_and_the_tracker_its_size():
-    run, found = tracker(), []
-    for n in range(600):
-        found += run.feed(1 + 5 * n, seen((600 + 200 * np.sin(n / 20), 400)))
-        assert len(run.tracks) <= 1
-    found += run.end()
-    assert all(page.identity.tolist() == [1] for page in found)
 
 
 def filmed(looks: int, seed: int, roughness: float) -> tuple[list[np.ndarray | None], list[np.ndarray]]:
@@ -265,24 +169,9 @@ def test_a_moving_camera_known_by_its_homographies_gives_the_identities_of_one_t
     assert switches(tracked(moved, size=None), people) > 5
 
 
-def test_a_camera_that_moves_does_not_pass_for_people_that_run():
-    frames, _ = shuffled(walks(6, 20, 5, 1, speed=3.0))
-    steps, now_from_first = filmed(20, 1, roughness=1.0)
-    standing, moving = tracker(size=None), tracker(size=None)
-    for n, (frame, step, h) in enumerate(zip(frames, steps, now_from_first, strict=True)):
-        standing.feed(1 + 5 * n, frame)
-        moving.feed(1 + 5 * n, Detections(transform_boxes(frame.box_px, h), frame.score), step)
-    assert standing.speed_prior.speed != standing.speed_prior.start
-    assert moving.speed_prior.speed == pytest.approx(standing.speed_prior.speed, rel=1e-6)
-
-
 def coloured(*bins: int) -> Callable[[], np.ndarray]:
     """Each target in a colour of its own; -1 is unknown."""
     return lambda: np.array([np.eye(12, dtype=np.float32)[b] if b >= 0 else np.zeros(12, np.float32) for b in bins])
-
-
-def never() -> np.ndarray:
-    raise AssertionError("pictures of targets were compared")
 
 
 @pytest.mark.parametrize("look_ahead", [True, False])
@@ -325,32 +214,3 @@ def test_pictures_are_looked_at_where_places_leave_a_doubt_and_once_at_most():
     asked[:] = [0] * 16
     assert names(tracked(frames, pictures=[looked(n) for n in range(16)], appearance="always")) == doubts
     assert asked == [1] * 16
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_colours_belong_to_rows_also_where_some_rows_are_not_used(order):
-    score = [0.1, 1, 1]
-    frames = [seen((600, 300), (300, 300), (340, 300), score=score)] * 4
-    frames += [seen((600, 300), (320, 292), (320, 308), score=score)] * 4
-    colours = [coloured(3, 3, 7)] * 4 + [coloured(7, *(np.array([3, 7])[[*order]]))] * 4
-    assert names(tracked(frames, pictures=colours))[-1] == {1: 1 + order[0], 2: 1 + order[1]}
-
-
-def test_frames_at_uneven_distances_are_linked_by_their_numbers():
-    """A walker is found again where it must be after so many frames, though another stands nearer to its last place."""
-    run, found = tracker(), []
-    for frame in (1, 6, 11, 16, 36, 41):
-        found += run.feed(frame, seen((100 + 6.0 * frame, 300), (330, 310)))
-    assert names(found + run.end()) == [{0: 1, 1: 2}] * 6
-
-
-@pytest.mark.parametrize("every", [2, 5])
-def test_false_alarms_elsewhere_do_not_cost_a_still_target_its_identity(every):
-    """It is missed for a single look now and then, and comes back exactly where it was; nobody else is near."""
-    random, frames = np.random.default_rng(0), []
-    for n in range(150):
-        alarm = [tuple(random.uniform((100, 100), (1100, 400)))] * (n % 3 == 0)
-        still = [(600, 600)] * (n % every != 1)
-        frames.append(seen(*still, *alarm, score=[1.0] * len(still) + [DOUBTFUL] * len(alarm)))
-    found = names(tracked(frames, 1))
-    assert len({page[0] for n, page in enumerate(found) if n % every != 1}) == 1

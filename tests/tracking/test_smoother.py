@@ -51,24 +51,6 @@ def test_each_frame_is_settled_once_in_order_as_soon_as_no_later_look_can_tell(h
     assert [len(at_once) for at_once in settled] == [0] * waits + [1] * (12 - waits) + [waits]
 
 
-@pytest.mark.parametrize("hits", [1, 2, 3, 6])
-def test_so_many_hits_confirm_a_track_from_its_first_one_on(hits):
-    assert names(pages([{0: 0.9}] * hits + [{}] * 9, hits=hits))[:hits] == [[1]] * hits
-    assert not any(names(pages([{0: 0.9}] * (hits - 1) + [{}] * 9, hits=hits)))
-
-
-def test_a_certain_detection_confirms_alone():
-    assert names(pages([{0: 1.0}, {}, {}])) == [[1], [], []]
-    assert names(pages([{0: 0.9}, {0: 1.0}, {}])) == [[1], [1], []]
-
-
-def test_identities_begin_at_one_and_leave_none_out_for_false_alarms():
-    looks = [{5: 1.0, 9: 0.8}, {7: 0.8, 5: 1.0}, {2: 1.0, 5: 1.0}, {1: 1.0, 2: 1.0}]
-    found = pages(looks)
-    assert names(found) == [[1], [1], [2, 1], [3, 2]]
-    assert [page.row.tolist() for page in found] == [[0], [1], [0, 1], [0, 1]]
-
-
 @pytest.mark.parametrize("gap", [1, 2, 3, 4])
 def test_gaps_of_two_looks_are_filled_and_longer_ones_are_not_but_the_identity_lives_on(gap):
     found = pages([{0: 1.0}, {0: 1.0}, *[{}] * gap, {0: 1.0}, {0: 1.0}])
@@ -129,29 +111,6 @@ def test_boxes_stay_as_given_where_they_are_certain_or_smoothing_is_off():
     assert out != given
 
 
-def test_the_camera_is_taken_out_before_boxes_are_smoothed():
-    """A target at rest before a camera that pans and zooms is given exactly, so it must come out exactly."""
-    smoother, here, truth, found = FixedLagSmoother(3, True), np.array([[100.0, 50, 20, 40]]), [], []
-    for look in range(40):
-        step = None if look % 5 == 0 else PAN if look % 2 else ZOOM if look % 4 else np.linalg.inv(ZOOM)
-        here = here if step is None else transform_boxes(here, step)
-        truth.append(here)
-        smoother.add(look + 1, np.zeros(1, int), here, np.full(1, 0.8), np.zeros(1, int), step)
-        found += smoother.settle()
-    found += smoother.settle(everything=True)
-    for page, expected in zip(found, truth, strict=True):
-        np.testing.assert_allclose(page.box_px, expected, rtol=1e-6)
-
-
-def test_forgotten_tracks_stay_in_the_pages_that_are_not_settled():
-    smoother = FixedLagSmoother(3, False)
-    for look in range(3):
-        smoother.add(look + 1, np.array([4]), np.array([box(4, look)]), np.ones(1) * 0.9, np.zeros(1, int), None)
-    assert smoother.are_confirmed(np.array([4, 6])).tolist() == [True, False]
-    smoother.forget(np.array([4, 6]))
-    assert names(smoother.settle(everything=True)) == [[1], [1], [1]]
-
-
 def test_what_is_kept_does_not_grow_with_the_length_of_a_run():
     """Sightings, pages and steps are dropped once nothing can ask for them."""
     smoother = FixedLagSmoother(3, True)
@@ -173,9 +132,6 @@ def test_what_is_kept_does_not_grow_with_the_length_of_a_run():
     assert sizes[0] == sizes[1]
 
 
-LOOKS = np.arange(10, dtype=float)
-
-
 def walk(looks: ArrayLike, growth: float = 0.0) -> np.ndarray:
     """(N, 4) boxes on a straight line whose sides grow by a factor a look."""
     looks = np.asarray(looks, float)
@@ -192,24 +148,3 @@ def test_a_straight_walk_is_hardly_changed_whichever_looks_are_missing(seen, at,
     looks = np.array(sorted(seen), float)
     near = np.clip(at, looks[0], looks[-1])
     np.testing.assert_allclose(smooth_box(walk(looks, growth), looks, near), walk([near], growth)[0], atol=0.6)
-
-
-def test_one_box_or_several_at_one_time_are_their_mean():
-    box = walk([0, 0])
-    box[1, :2] += 4
-    np.testing.assert_allclose(smooth_box(box[:1], np.zeros(1), 0), box[0])
-    np.testing.assert_allclose(smooth_box(box, np.zeros(2), 0), box.mean(axis=0))
-
-
-def test_noisy_boxes_come_nearer_to_the_truth_within_a_walk_and_at_its_end():
-    random = np.random.default_rng(4)
-    better: dict[int, list[np.ndarray]] = {4: [], 9: []}
-    for _ in range(200):
-        noisy = walk(LOOKS)
-        noisy += random.normal(0, 4, noisy.shape)
-        for at, found in better.items():
-            truth = walk([at])[0]
-            found.append(np.abs([smooth_box(noisy, LOOKS, at) - truth, noisy[at] - truth]))
-    for found in better.values():
-        smooth, given_ = np.mean(found, axis=0)
-        assert (smooth < 0.85 * given_).all()

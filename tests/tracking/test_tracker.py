@@ -72,16 +72,6 @@ def identities(followed, lane):
     return {i for found in all_of(followed).values() for box, i in found.items() if box[1] == lane}
 
 
-def test_a_table_alone_gives_each_walker_one_identity_and_keeps_every_row():
-    rows = walkers(range(1, 31))
-    followed = list(track_table(table_of(rows), SETTINGS, 1))
-    assert [f.number for f in followed] == list(range(1, 31))
-    assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
-    assert identities(followed, 60) != identities(followed, 140)
-    assert [(f.number, tuple(box)) for f in followed for box in f.detections.box_px] == rows
-    assert [line for f in followed for line in f.lines] == list(range(1, 61))
-
-
 @pytest.mark.parametrize("interval", [1, 3, 7])
 def test_only_the_frames_of_the_interval_are_looked_at(interval):
     wanted = list(range(1, 41, interval))
@@ -94,14 +84,6 @@ def test_only_the_frames_of_the_interval_are_looked_at(interval):
         assert [f.number for f in followed if len(f.detections)] == wanted
         assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
     assert clip.given == len(wanted)
-
-
-def test_a_clip_goes_on_before_and_after_its_table():
-    table = table_of(walkers(range(10, 20)))
-    followed = list(track_clip(Clip(30), table, load_engine("onboard", SETTINGS), SETTINGS, 1))
-    assert [f.number for f in followed] == list(range(1, 31))
-    assert all(f.frame is not None and f.frame.number == f.number for f in followed)
-    assert sum(len(f.detections) for f in followed) == len(table)
 
 
 @pytest.mark.parametrize("lost", [(1,), (2, 3), (7, 8, 9), (29, 30), tuple(range(1, 31))])
@@ -132,25 +114,6 @@ def test_what_is_settled_while_a_clip_runs_is_what_the_whole_run_gives():
         assert early == {number: whole[number] for number in early}
 
 
-def test_scores_that_are_no_probabilities_are_certain_to_the_tracker_and_written_as_given():
-    followed = list(track_table(table_of(walkers(range(1, 21)), score=-0.8), SETTINGS, 1))
-    assert all(f.tracks.score.tolist() == [-0.8, -0.8] for f in followed)
-    assert all(f.untracked == [] for f in followed)
-
-
-ODD = {
-    "zero targets in every frame": [],
-    "zero targets in a frame": walkers([1, 2, 3, 5, 6, 7]),
-    "one target in one frame": walkers([3], lanes=(60,)),
-    "one target for ever": walkers(range(1, 400), lanes=(60,), speed=0.0),
-    "two identical boxes": [(n, (20.0 + n, 60.0, 12.0, 40.0)) for n in range(1, 21) for _ in "ab"],
-    "boxes outside the picture": [(n, (900.0 + n, -500.0, 12.0, 40.0)) for n in range(1, 21)],
-    "huge and tiny boxes": [(n, box) for n in range(1, 21) for box in ((-1e6, -1e6, 2e6, 2e6), (5, 5, 1e-3, 1e-3))],
-    "far away": [(n, (1e9, 1e9, 12.0, 40.0)) for n in range(1, 21)],
-    "far apart in time": walkers([1, 2, 3, 600, 601, 602], speed=0.01),
-}
-
-
 def scenes_of(count, step=None, adjustments=None, bad=()):
     for number in range(1, count + 1):
         boxes = np.array([box for _, box in walkers([number])])
@@ -166,26 +129,6 @@ def scenes_of(count, step=None, adjustments=None, bad=()):
         )
 
 
-def test_own_boxes_that_lose_their_legs_or_grow_a_shadow_keep_their_identity():
-    """What is seen to move of a walker: now all, now the trunk or the legs alone, now the shadow as well."""
-    random, shown = np.random.default_rng(0), [(0, 0, 1, 1), (0, 0, 1, 0.65), (0, 0.35, 1, 0.65), (0, 0, 2, 1)]
-    scenes = []
-    for scene in scenes_of(60):
-        parts = np.array([shown[k] for k in random.integers(0, 4, 2)])
-        whole = scene.detections.box_px
-        boxes = np.concatenate([whole[:, :2] + parts[:, :2] * whole[:, 2:], parts[:, 2:] * whole[:, 2:]], axis=1)
-        scenes.append(replace(scene, detections=replace(scene.detections, box_px=boxes)))
-    tracks = [f.tracks for f in track_scenes(scenes, SETTINGS, 1, SIZE)]
-    assert all(sorted(t.identity.tolist()) == [1, 2] for t in tracks)
-    assert len({bool(t.box_px[t.identity == 1, 1] < 120) for t in tracks}) == 1
-
-
-def test_own_detections_count_as_certain_whatever_their_contrast():
-    followed = list(track_scenes(scenes_of(20), SETTINGS, 1, SIZE))
-    assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
-    assert followed[0].tracks.score.tolist() == [0.55, 0.55]
-
-
 def test_steps_times_and_adjustments_between_the_frames_looked_at_are_kept():
     class Step(np.ndarray):
         __bool__ = lambda self: True  # noqa: E731
@@ -198,28 +141,6 @@ def test_steps_times_and_adjustments_between_the_frames_looked_at_are_kept():
     assert moves == [None, [-8, 2], [-6, 1.5], [-8, 2]]  # the step that is not known counts as none
     assert [len(f.adjustments) for f in followed] == [1, 4, 4, 4]
     assert [f.seconds["foreground"] for f in followed] == [0.5, 2, 2, 2]
-
-
-def test_doubtful_boxes_come_out_smoothed_and_certain_ones_to_the_digit():
-    random = np.random.default_rng(0)
-    rows = [(n, (100 + 5 * n + random.normal(0, 3), 200 + random.normal(0, 3), 40, 100)) for n in range(1, 31)]
-    for score, moved in ((0.97, True), (1.0, False)):
-        followed = list(track_table(table_of(rows, score), SETTINGS, 1))
-        apart = np.concatenate([f.tracks.box_px - f.detections.box_px[f.tracks.row] for f in followed if len(f.tracks)])
-        assert len(apart) == 30
-        assert (np.abs(apart).max() > 0.5) == moved
-        assert np.concatenate([f.tracks.score for f in followed]).tolist() == [score] * 30
-
-
-def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
-    followed = [list(track_scenes(scenes_of(12), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)]
-    for with_picture, without in zip(*followed, strict=True):
-        assert with_picture.frame.image.any()
-        assert without.frame.image.shape == with_picture.frame.image.shape
-        assert without.frame.image.strides == (0, 0, 0) and without.frame.number == with_picture.frame.number
-        np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
-        np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
-    assert any(len(f.tracks) for f in followed[1])
 
 
 SETTINGS = load_config()
@@ -272,14 +193,6 @@ def test_a_long_stretch_without_rows_is_left_out_and_changes_no_track(interval, 
     assert {n for n in numbers if 0 < n - max((r for r in rows if r <= n), default=n) <= memory} <= set(fed)
     # Two stretches, of 140 and 120 frames, of which little more than the memory is looked at.
     assert len(numbers) - len(fed) >= (260 - 2 * (memory + (hits + 5) * interval)) // interval > 20
-
-
-def test_a_row_on_the_last_frame_that_may_be_costs_a_few_looks():
-    table = crowd_table([1, 2, 3, 10_000_000])
-    for interval in (1, 3):
-        fed = [f.number for f in track_table(table, SETTINGS, interval)]
-        assert fed[0] == 1 and fed[-2:] == [10_000_000 - interval, 10_000_000]
-        assert len(fed) < 200
 
 
 def own(frames=40):
@@ -384,3 +297,14 @@ def test_bad_input_of_the_public_tracker_is_refused_in_one_line(given, message):
 def test_a_tracker_of_bad_settings_is_refused(given, message):
     with pytest.raises(InputError, match=message):
         Tracker(**given)
+
+
+def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
+    followed = [list(track_scenes(scenes_of(12), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)]
+    for with_picture, without in zip(*followed, strict=True):
+        assert with_picture.frame.image.any()
+        assert without.frame.image.shape == with_picture.frame.image.shape
+        assert without.frame.image.strides == (0, 0, 0) and without.frame.number == with_picture.frame.number
+        np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
+        np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
+    assert any(len(f.tracks) for f in followed[1])

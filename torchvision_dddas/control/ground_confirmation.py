@@ -115,7 +115,7 @@ def expected_regions(
     """(R, 4) boxes in the picture within which bodies of the targets in view lie, and (R, 2) heights of these, in px.
 
     place_m (N, 2), covariance_m2 (N, 2, 2), radius_m (N,): of the targets. camera_m (2,): where the camera stands, by
-    the same origin. As targets.scan.within wants them; a target that a picture cannot show has no region.
+    the same origin. In the form that `people.pyramid.within` takes; a target outside the picture has no region.
     """
     regions: list[list[float]] = []
     heights: list[tuple[float, float]] = []

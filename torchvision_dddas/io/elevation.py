@@ -172,7 +172,7 @@ def _resample(
     own = raster.crs or CRS.from_epsg(3857)
     local, bounds = own, (*low, *high)
     if origin_deg is not None:
-        # On the ellipsoid the orthographic projection is the tangent plane's east and north, as in targets.geodesy.
+        # On the ellipsoid the orthographic projection is the tangent plane's east and north, as in geometry.east_north.
         local = CRS.from_proj4(f"+proj=ortho +lat_0={origin_deg[1]!r} +lon_0={origin_deg[0]!r} +datum=WGS84 +units=m")
         bounds = transform_bounds(local, own, *bounds)
     shape = (rows, columns) if isinstance(bands, int) else (len(bands), rows, columns)

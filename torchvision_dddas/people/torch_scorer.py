@@ -1,4 +1,4 @@
-"""Scores of windows by `ops.hog`: batched over pictures of one size, differentiable, on a CPU or GPU."""
+"""Scores of windows by `functional.hog`: batched over pictures of one size, differentiable, on a CPU or GPU."""
 
 import math
 from collections import defaultdict
