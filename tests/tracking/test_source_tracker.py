@@ -120,12 +120,13 @@ def test_a_target_that_leaves_takes_the_identity_of_another_with_it():
 
 
 def test_without_pictures_location_alone_decides():
-    frames = [Features(at((400, 300), (404, 300)).box_px, None), Features(at((404, 300), (400, 300)).box_px, None)]
+    boxes = [at((400, 300), (404, 300)).box_px, at((404, 300), (400, 300)).box_px]
+    frames = [Features(box, None) for box in boxes]
     for rule in ("dispersion", "fixed"):
         found = associate(frames, parameters(window=2, rule=rule, weight=0.0))
         assert (found.weight, found.appearance_dispersion) == (1.0, None)
         assert found.rows.tolist() == [[1, 2], [2, 1]]
-    seen = [Features(frame.box_px, coloured(10, 200)) for frame in frames]
+    seen = [Features(box, coloured(10, 200)) for box in boxes]
     assert associate(seen, parameters(window=2, rule="fixed", weight=0.3)).weight == 0.3
 
 
