@@ -1,8 +1,8 @@
 """How alike the targets of two or three frames are: the generalised Jaccard coefficient (appendix C, eq. 1, 4, 5).
 
 Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), histograms
-(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0. `tracking.source_affinity` is the twin
-for one window without torch.
+(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0.
+`tracking.source_affinity` is the twin for one window without torch.
 """
 
 import torch
