@@ -1,5 +1,7 @@
 """Homographies and affine maps of the plane, the linear solver, and the robust estimation that both share."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -85,7 +87,7 @@ def test_a_square_moved_and_doubled_gives_the_matrix_written_by_hand(model):
 
 def test_the_fewest_points_give_what_opencv_gives(model):
     module, true, size = model
-    by_opencv = {3: cv2.getAffineTransform, 4: cv2.getPerspectiveTransform}[size]
+    by_opencv: Any = cv2.getAffineTransform if size == 3 else cv2.getPerspectiveTransform
     p, q, _ = pairs(count=20 * size, true=true)
     p, q = p.reshape(2, 20, size, 2), q.reshape(2, 20, size, 2)
     found, valid = minimal(module)(p, q)
