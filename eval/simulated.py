@@ -361,10 +361,10 @@ def measure_whole(options: bench.Options) -> tuple[str, Any]:
 
 def fly_whole(case: Case) -> Case:
     """The score of one run, by name."""
-    from torchvision_dddas.cli.mission import fly_into
+    from torchvision_dddas.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
-        _, score = fly_into(Path(out), case["scenario"], seed=case["seed"], quiet=True)
+        _, score = run_scenario(Path(out), case["scenario"], seed=case["seed"])
     return score.by_name()
 
 

@@ -1,6 +1,6 @@
 """What commands say of clips."""
 
-from torchvision_dddas.cli.clips import clip_names
+from torchvision_dddas.cli.progress import clip_names
 
 
 def test_clip_names_are_telling_and_different():

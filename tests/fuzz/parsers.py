@@ -17,7 +17,7 @@ import numpy as np
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from tests.fuzz.layouts import LAYOUTS, ROOT
-from torchvision_dddas.cli.colours import _box, _names
+from torchvision_dddas.cli.colours import parse_box, parse_names
 from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError
 from torchvision_dddas.evaluation.datasets import kinds
@@ -251,8 +251,8 @@ def _stream_word(path: Path) -> None:
 
 
 def _boxes_of_colours(path: Path) -> None:
-    _names(_words(path))
-    _box(_words(path))
+    parse_names(_words(path))
+    parse_box(_words(path))
 
 
 def _dataset(kind: str, path: Path) -> None:

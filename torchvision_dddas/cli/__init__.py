@@ -15,7 +15,7 @@ from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
 from torchvision_dddas.cli.export import export
 from torchvision_dddas.cli.locate import locate
-from torchvision_dddas.cli.mistakes import BAD_INPUT, INTERRUPTED
+from torchvision_dddas.cli.options import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.people import people
 from torchvision_dddas.cli.run import run
 from torchvision_dddas.cli.settings import settings

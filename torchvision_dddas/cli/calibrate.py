@@ -6,24 +6,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Config, Overrides
+from torchvision_dddas.cli.options import Config, Overrides, parse_size, report_errors
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
 
-LEAST_M, MOST_M = 0.1, 10.0
-"""Heights of a person, or of what stands in for one."""
-
-PLACES = ("longitude_deg", "latitude_deg", "east_m", "north_m")
-"""Keys whose numbers are written with all their digits."""
+BODY_HEIGHTS_M = 0.1, 10.0  # of a person, or of what stands in for one
+UNROUNDED = ("longitude_deg", "latitude_deg", "east_m", "north_m")  # keys that are written with all their digits
+FOCAL_KEYS = ("focal_px", "focal_v_px", "hfov_deg", "focal_sigma")
 
 Found = tuple[dict[str, float], list[str]]
-"""Keys of a camera's TOML, and what to tell the user."""
+"""Keys of a camera's TOML, and lines for the user."""
 
 
-@explained
+@report_errors
 def calibrate(
     table: Annotated[
         Path | None,
@@ -32,15 +29,15 @@ def calibrate(
     body_height: Annotated[
         float | None, typer.Option(metavar="M", help="Height of the person. [default: ground.body_height_m]")
     ] = None,
-    distance: Annotated[
-        float | None, typer.Option(metavar="M", help="How far from the camera the person stands.")
-    ] = None,
+    distance: Annotated[float | None, typer.Option(metavar="M", help="Distance of the person from the camera.")] = None,
     pixels: Annotated[
         list[float] | None, typer.Option(metavar="N", help="The person's height in a picture; may be repeated.")
     ] = None,
     camera: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A camera's TOML to complete; with its focal length, find how it stands."),
+        typer.Option(
+            metavar="FILE", help="A camera's TOML to complete; if it has a focal length, find height and pitch."
+        ),
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Size of the pictures, such as 768x576.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="The TOML to write. [default: print it]")] = None,
@@ -53,16 +50,20 @@ def calibrate(
 
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
-    from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.camera_files import has_measurements
+    from torchvision_dddas.config import format_toml, load_config
+    from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, refuse_own_input, write_whole
+    from torchvision_dddas.io.camera_files import has_measurements, read_camera_keys, read_measurements
 
     settings = load_config(config, set_ or [])
-    tall = settings.ground.body_height_m if body_height is None else body_height
-    if not LEAST_M <= tall <= MOST_M:
-        raise InputError(f"--body-height is {tall:g}; wanted metres, {LEAST_M:g} to {MOST_M:g}")
+    body_m, (low, high) = settings.ground.body_height_m if body_height is None else body_height, BODY_HEIGHTS_M
+    if not low <= body_m <= high:
+        raise InputError(f"--body-height must be {low:g} to {high:g} m, got {body_m:g}")
     if out is not None:
-        _check_out(out, table)
-    known = _known(camera, size)
+        refuse_own_input([] if table is None else [table], [out], "--out")
+        refuse_folder(out)
+    known = {} if camera is None else read_camera_keys(camera)
+    if size is not None:
+        known["width_px"], known["height_px"] = parse_size(size, 1, 100_000)
     if pixels and table is not None:
         raise InputError("--pixels and a table were given; give the person's heights in one way")
     if not pixels and table is None:
@@ -70,59 +71,59 @@ def calibrate(
     if table is not None and has_measurements(table):
         if distance is not None:
             raise InputError(f"{table} has its own distances, and --distance was given as well; leave one out")
-        found, lines = _from_measurements(table, tall)
+        distances, heights = read_measurements(table)
+        found, lines = _find_focal_length(distances.tolist(), heights.tolist(), body_m)
     elif distance is not None:
-        found, lines = _from_person(table, pixels or [], distance, tall)
+        heights_px = pixels or [] if table is None else _read_heights(table)
+        found, lines = _find_focal_length([distance] * len(heights_px), heights_px, body_m)
     elif table is not None:
-        found, lines = _from_people(table, camera, tall, settings)
+        found, lines = _find_pose(table, camera, body_m, settings)
     else:
         raise InputError("--pixels needs --distance: how far from the camera the person stood, in metres")
-    text = _toml({**_without_focal(known, found), **found})
+    replaced = FOCAL_KEYS if "focal_px" in found else ()
+    keys = {key: value for key, value in known.items() if key not in replaced} | found
+    text = format_toml({key: value if key in UNROUNDED else _rounded(value) for key, value in keys.items()})
     for line in lines:
         typer.echo(line, err=out is None)
     if out is None:
         typer.echo(text, nl=False)
-    else:
-        _write(out, text)
-        lacks = "" if "width_px" in known else "; it still lacks width_px and height_px (--size)"
-        typer.echo(f"{out}: the camera{lacks}")
+        return
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(out, text.encode())
+    except OSError as error:
+        raise cannot_write(out, error) from error
+    missing = "" if "width_px" in known else "; width_px and height_px are still missing (--size)"
+    typer.echo(f"{out}: the camera{missing}")
 
 
-def _from_measurements(table: Path, body_height_m: float) -> Found:
-    from torchvision_dddas.io.camera_files import read_measurements
+def _read_heights(table: Path) -> list[float]:
+    """The heights of one person's whole boxes, px. Raises InputError for several people in a frame."""
+    import numpy as np
 
-    distance, height = read_measurements(table)
-    return _focal(distance.tolist(), height.tolist(), body_height_m)
+    from torchvision_dddas.io.detection_tables import read_detections
 
-
-def _from_person(table: Path | None, pixels: list[float], distance_m: float, body_height_m: float) -> Found:
-    if table is not None:
-        import numpy as np
-
-        from torchvision_dddas.io.detection_tables import read_detections
-
-        read = read_detections(table)
-        frames, count = np.unique(read.frame, return_counts=True)
-        if len(frames) and count.max() > 1:
-            raise InputError(
-                f"{table} has {count.max()} boxes in frame {frames[count.argmax()]}; "
-                "--distance wants one person alone in each picture"
-            )
-        whole = np.ones(len(read), bool) if read.cut is None else ~read.cut
-        pixels = read.box_px[whole, 3].tolist()
-        if not pixels:
-            raise InputError(f"{table} has no whole person to calibrate by")
-    return _focal([distance_m] * len(pixels), pixels, body_height_m)
+    read = read_detections(table)
+    frames, count = np.unique(read.frame, return_counts=True)
+    if len(frames) and count.max() > 1:
+        raise InputError(
+            f"{table} has {count.max()} boxes in frame {frames[count.argmax()]}; "
+            "--distance needs one person alone in each picture"
+        )
+    heights = read.box_px[:, 3] if read.cut is None else read.box_px[~read.cut, 3]
+    if not len(heights):
+        raise InputError(f"{table} has no whole person to calibrate by")
+    return [float(height) for height in heights]
 
 
-def _focal(distance_m: list[float], height_px: list[float], body_height_m: float) -> Found:
+def _find_focal_length(distances_m: list[float], heights_px: list[float], body_height_m: float) -> Found:
     import numpy as np
 
     from torchvision_dddas.geo.camera_calibration import calibrate_focal_length
 
-    found = calibrate_focal_length(np.array(distance_m), np.array(height_px), body_height_m)
+    found = calibrate_focal_length(np.array(distances_m), np.array(heights_px), body_height_m)
     _check("focal_px", found.focal_px, "px")
-    n = len(height_px)
+    n = len(heights_px)
     spread = "" if math.isnan(found.spread_px) else f", one measurement ± {found.spread_px:.1f} px"
     lines = [
         f"focal length {found.focal_px:.1f} ± {found.sigma_px:.1f} px from {n} measurement{'s' * (n != 1)}{spread}"
@@ -130,13 +131,13 @@ def _focal(distance_m: list[float], height_px: list[float], body_height_m: float
     if found.outlier.any():
         first = int(found.outlier.argmax())
         lines.append(
-            f"note: {int(found.outlier.sum())} of {n} left out as outliers, the first {height_px[first]:g} px at "
-            f"{distance_m[first]:g} m"
+            f"note: {int(found.outlier.sum())} of {n} left out as outliers, the first {heights_px[first]:g} px at "
+            f"{distances_m[first]:g} m"
         )
     return {"focal_px": found.focal_px, "focal_sigma": found.sigma_px / found.focal_px}, lines
 
 
-def _from_people(table: Path, camera: Path | None, body_height_m: float, settings: "Settings") -> Found:
+def _find_pose(table: Path, camera: Path | None, body_height_m: float, settings: "Settings") -> Found:
     from torchvision_dddas.geo.camera_calibration import calibrate_pose
     from torchvision_dddas.geo.ranging import touches_border
     from torchvision_dddas.io.camera_files import read_camera
@@ -145,11 +146,11 @@ def _from_people(table: Path, camera: Path | None, body_height_m: float, setting
     if camera is None:
         raise InputError(
             f"{table} has boxes without distances: give --distance for one person's, or --camera FILE with a focal "
-            "length to find how the camera stands"
+            "length to find the camera's height and pitch"
         )
-    kind, read = read_camera(camera), read_detections(table)
-    cut = touches_border(read.box_px, kind.size_px) if read.cut is None else read.cut
-    found = calibrate_pose(read.box_px[~cut], kind, body_height_m, settings.ground.height_sigma)
+    known, read = read_camera(camera), read_detections(table)
+    cut = touches_border(read.box_px, known.size_px) if read.cut is None else read.cut
+    found = calibrate_pose(read.box_px[~cut], known, body_height_m, settings.ground.height_sigma)
     _check("height_m", found.height_m, "m")
     keys = {
         "height_m": found.height_m,
@@ -165,39 +166,12 @@ def _from_people(table: Path, camera: Path | None, body_height_m: float, setting
     return keys, [line]
 
 
-def _known(camera: Path | None, size: str | None) -> dict[str, object]:
-    """The keys of the camera that is to be completed."""
-    known: dict[str, object] = {}
-    if camera is not None:
-        from torchvision_dddas.io.camera_files import read_camera_keys
-
-        known = read_camera_keys(camera)
-    if size is not None:
-        width, _, height = size.lower().partition("x")
-        if not all(side.isdecimal() and len(side) < 7 and 0 < int(side) <= 100_000 for side in (width, height)):
-            raise InputError(f"--size is {size!r}; wanted WIDTHxHEIGHT in pixels, such as 768x576")
-        known |= {"width_px": int(width), "height_px": int(height)}
-    return known
-
-
-def _without_focal(known: dict[str, object], found: dict[str, float]) -> dict[str, object]:
-    """What is known but the focal length that was found anew."""
-    old = ("focal_px", "focal_v_px", "hfov_deg", "focal_sigma") if "focal_px" in found else ()
-    return {key: value for key, value in known.items() if key not in old}
-
-
-def _toml(keys: dict[str, object]) -> str:
-    from torchvision_dddas.config import format_toml
-
-    return format_toml({key: _rounded(value) if key not in PLACES else value for key, value in keys.items()})
-
-
 def _rounded(value: object) -> object:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _check(key: str, value: float, unit: str) -> None:
-    """Raises InputError for what no camera's file may hold."""
+    """Raise InputError for a value that no camera's file may hold."""
     from torchvision_dddas.io.camera_files import LIMITS
 
     low, high = LIMITS[key]
@@ -206,21 +180,3 @@ def _check(key: str, value: float, unit: str) -> None:
             f"{key} would be {value:g} {unit}, which no camera has ({low:g} to {high:g}); check the distances in "
             "metres, the heights in pixels and the body height in metres"
         )
-
-
-def _check_out(path: Path, table: Path | None) -> None:
-    """Raises InputError where the TOML would replace the table, or a folder is in its place."""
-    from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input
-
-    refuse_own_input([] if table is None else [table], [path], "--out")
-    refuse_folder(path)
-
-
-def _write(path: Path, text: str) -> None:
-    from torchvision_dddas.io.atomic_files import cannot_write, write_whole
-
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text.encode())
-    except OSError as error:
-        raise cannot_write(path, error) from error

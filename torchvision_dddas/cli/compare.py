@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
+from torchvision_dddas.cli.options import report_errors
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,7 +18,7 @@ MOST_CLIPS = 20
 """Rows of single clips that are shown; --json has all."""
 
 
-@explained
+@report_errors
 def compare(
     first: Annotated[
         Path, typer.Argument(metavar="A", help="The folder of a study, as dddas evaluate --dataset wrote it.")

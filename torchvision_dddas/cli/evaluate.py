@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet, check_jobs
+from torchvision_dddas.cli.options import Backend, Config, Overrides, Quiet, check_jobs, report_errors
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ class Ignored(StrEnum):
     removed = "removed"
 
 
-@explained
+@report_errors
 def evaluate(
     truth: Annotated[
         Path | None,

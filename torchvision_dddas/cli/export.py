@@ -6,46 +6,44 @@ from typing import Annotated
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Overrides, Quiet
+from torchvision_dddas.cli.options import Overrides, Quiet, parse_size, print_lines, report_errors
 from torchvision_dddas.errors import InputError
 
 NEEDED = "torch", "kornia", "onnx", "onnxscript"
 
 
-@explained
+@report_errors
 def export(
     out: Annotated[Path, typer.Option(help="Folder for the graphs.")] = Path("dddas-graphs"),
     graph: Annotated[
-        list[str] | None, typer.Option("--graph", metavar="NAME", help="Which; may be repeated. [default: all]")
+        list[str] | None, typer.Option("--graph", metavar="NAME", help="Graph to make; may be repeated. [default: all]")
     ] = None,
     size: Annotated[
         list[str] | None,
-        typer.Option("--size", metavar="WxH", help="Size of the pictures, for graphs of one size; may be repeated."),
+        typer.Option("--size", metavar="WxH", help="Picture size, for graphs of one size; may be repeated."),
     ] = None,
     config: Annotated[
-        str, typer.Option(metavar="FILE|NAME", help="Whose parameters the graphs hold: a TOML file or a name.")
+        str, typer.Option(metavar="FILE|NAME", help="Parameters of the graphs: a TOML file or a shipped configuration.")
     ] = "fast",
     set_: Overrides = None,
-    list_: Annotated[bool, typer.Option("--list", help="Say which graphs there are, and make none.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the graphs, and make none.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make the ONNX graphs of our functions, for the onboard back end and for accelerators.
+    """Make ONNX graphs of the torch functions, for the onboard engine and for accelerators.
 
-    Writes the graphs and manifest.json (inputs, outputs, parameters, SHA-256, versions) under --out, once all agree
-    with torch. `step` takes half a minute, the others seconds.
+    Writes the graphs and manifest.json (inputs, outputs, parameters, SHA-256, versions) under --out, once all of them
+    agree with torch. `step` takes half a minute, the others seconds.
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.export import GRAPHS, export_graphs
 
     if list_:
-        for name, about in GRAPHS.items():
-            typer.echo(f"{name:16s} {about}")
+        print_lines([f"{name:16s} {about}" for name, about in GRAPHS.items()])
         return
-    sizes = [size_of(text) for text in size or ["640x480"]]
+    sizes = [parse_size(text, 64, 8192) for text in size or ["640x480"]]
     settings = load_config(config, set_ or [])
     if out.exists() and not out.is_dir():
-        raise InputError(f"--out {out} is a file; wanted a folder for the graphs")
+        raise InputError(f"--out {out} must be a folder for the graphs, got a file")
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise InputError(f"dddas export needs {', '.join(missing)}; pip install 'torchvision-dddas[torch,export]'")
     from torchvision_dddas.export.graph_files import ExportedGraph, write_graphs
@@ -59,17 +57,5 @@ def export(
             )
             typer.echo(f"{name}: {', '.join(found)}: compared with torch: {checks}", err=True)
     write_graphs(out, files)
-    if not quiet:
-        for name, made in files.items():
-            typer.echo(f"{out / name}: {len(made.content)} bytes")
-        typer.echo(f"{out / 'manifest.json'}")
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """(width, height) of `640x480`. Raises InputError for anything else."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and 64 <= int(width) <= 8192 and 64 <= int(height) <= 8192):
-        raise InputError(
-            f"--size is '{text}'; wanted width x height in pixels, from 64x64 to 8192x8192, such as 640x480"
-        )
-    return int(width), int(height)
+    lines = [f"{out / name}: {len(made.content)} bytes" for name, made in files.items()]
+    print_lines([*lines, str(out / "manifest.json")], quiet)

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchvision_dddas.cli import live_words
-from torchvision_dddas.cli.aerial import about
 from torchvision_dddas.cli.live_path import path
-from torchvision_dddas.cli.mistakes import INTERRUPTED
-from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, prepare_run
+from torchvision_dddas.cli.options import INTERRUPTED
 from torchvision_dddas.runtime import VERSION
 
 if TYPE_CHECKING:
     from torchvision_dddas.config import LiveParameters, Settings
+    from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun
     from torchvision_dddas.io.streams import About, Stream
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
@@ -28,7 +27,7 @@ _COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "resu
 def run_live(
     out: Path,
     clip: str,
-    given: AerialInput | None,
+    given: "AerialInput | None",
     telemetry: Path | None,
     interval: int,
     settings: "Settings",
@@ -45,6 +44,7 @@ def run_live(
     """
     from torchvision_dddas.detection import check_length
     from torchvision_dddas.io.output import RESULTS, make_session_folder
+    from torchvision_dddas.io.run_inputs import prepare_run
     from torchvision_dddas.io.video import without_secrets
     from torchvision_dddas.live import LiveSource
     from torchvision_dddas.live.runner import Feed, RepeatedFailure
@@ -109,7 +109,7 @@ def _health() -> "Health":
     return health
 
 
-def _about(ready: PreparedRun) -> "About":
+def _about(ready: "PreparedRun") -> "About":
     """What streams need to know; the clock's time follows the source."""
     from torchvision_dddas.io.streams import About
 
@@ -158,17 +158,18 @@ def _kept(
 
 def _facts(
     clip: str,
-    ready: PreparedRun,
-    given: AerialInput | None,
+    ready: "PreparedRun",
+    given: "AerialInput | None",
     telemetry: Path | None,
     source: "LiveSource",
     interval: int,
     people: bool,
 ) -> dict[str, Any]:
     """What run.json says beside how it goes."""
+    from torchvision_dddas.io.run_inputs import locator_facts
     from torchvision_dddas.io.video import without_secrets
 
-    located = {} if given is None or ready.watch is None else {**given.facts, **about(ready.watch.locator)}
+    located = {} if given is None or ready.watch is None else {**given.facts, **locator_facts(ready.watch.locator)}
     return {
         "input": without_secrets(clip),
         "telemetry": telemetry,

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from torchvision_dddas.io.run_inputs import PreparedRun
-
 if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
+    from torchvision_dddas.io.run_inputs import PreparedRun
     from torchvision_dddas.live import Health, LiveSource
     from torchvision_dddas.live.runner import Feed, Result
     from torchvision_dddas.people import PersonTracker, WindowScorer
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def path(
-    ready: PreparedRun, source: "LiveSource", people: bool, interval: int, backend: str, health: "Health"
+    ready: "PreparedRun", source: "LiveSource", people: bool, interval: int, backend: str, health: "Health"
 ) -> "Callable[[Feed], Iterator[Result]]":
     """What gives results of a feed, anew each time that it is called. Raises InputError at once."""
     from torchvision_dddas.config import with_parameters

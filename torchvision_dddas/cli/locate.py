@@ -1,37 +1,129 @@
-"""`dddas locate`: where targets stand on the ground."""
+"""`dddas locate`: positions of targets on the ground, seen from the air or by cameras on the ground."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.aerial import aerial
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Config, Overrides, Quiet, Rate, check_rate
-from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.cli.options import (
+    Backend,
+    Config,
+    EngineOption,
+    Out,
+    Overrides,
+    Poses,
+    Quiet,
+    Rate,
+    check_rate,
+    print_lines,
+    report_errors,
+)
+from torchvision_dddas.cli.progress import closing_lines, record_results
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.config import Settings
-    from torchvision_dddas.io.output.run_record import GroundRecord
+    from torchvision_dddas.io.output import RunRecord
+
+Telemetry = Annotated[
+    Path | None,
+    typer.Option("--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, KLV, NMEA."),
+]
+CameraFile = Annotated[Path | None, typer.Option("--camera", metavar="FILE", help="The TOML of the camera.")]
+Elevation = Annotated[
+    Path | None, typer.Option("--dem", metavar="FILE", help="Heights of the ground, a GeoTIFF. [default: level ground]")
+]
+Background = Annotated[
+    Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo under the map, a GeoTIFF.")
+]
 
 locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
-locate.command()(aerial)
 
 
 @locate.command()
-@explained
+@report_errors
+def aerial(
+    table: Annotated[
+        Path, typer.Argument(metavar="TABLE", help="Detections or tracks, CSV or MOTChallenge text, of the clip.")
+    ],
+    landmarks: Annotated[
+        Path, typer.Option(metavar="FILE", help="A CSV of landmarks: their places, and their pixels in the frames.")
+    ],
+    telemetry: Telemetry = None,
+    camera: CameraFile = None,
+    dem: Elevation = None,
+    clip: Annotated[
+        str | None, typer.Option(metavar="CLIP", help="The clip itself, for its rate and its picture size.")
+    ] = None,
+    background: Background = None,
+    out: Out = Path("dddas-positions"),
+    config: Config = None,
+    set_: Overrides = None,
+    backend: EngineOption = Backend.auto,
+    save: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="cot,map,report, all or none; tables are always written.")
+    ] = None,
+    rate: Rate = None,
+    quiet: Quiet = False,
+) -> None:
+    """Locate what a clip shows from the air, by landmarks of known place and by what the vehicle reports.
+
+    Writes positions.csv, fixes.csv (the pose of each picture), maps, a report and run.json under --out.
+    """
+    from torchvision_dddas import open_video
+    from torchvision_dddas.config import load_config
+    from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
+    from torchvision_dddas.io.output import AerialRecorder, parse_save
+    from torchvision_dddas.io.run_inputs import AerialInput, locator_facts, map_site, read_locator
+
+    given = AerialInput(landmarks, telemetry, camera, dem, background)
+    settings, names = load_config(config, set_ or []), parse_save(save, AerialRecorder.saved)
+    check_rate(rate)
+    inputs = [table, *given.files, *([Path(clip)] if clip else [])]
+    refuse_own_input(inputs, [out / name for name in AerialRecorder.files], "folder with --out")
+    with AerialRecorder(out, names) as output:
+        read = read_detections(table)
+        size, rate_hz = None, rate
+        if clip:
+            source = open_video(clip, rate_hz=rate)
+            check_within_clip(read, source)
+            size, rate_hz = source.size, source.rate_hz
+        locator, notes = read_locator(
+            given, settings, size, rate_hz, backend.value, (read.first, read.last), "table", clip, extent=read.extent
+        )
+        check_table(read, locator)
+        facts = {"input": table, **given.facts, "rows": len(read), **locator_facts(locator)}
+        record = output.begin({**facts, "settings": settings.model_dump()}, map_site(locator, background))
+        record.notes += notes
+        if not len(read):
+            record.notes.append("the table has no rows: nothing to locate")
+        elif read.identity is None or (read.identity < 1).all():
+            record.notes.append("the table has no identities: targets are numbered per frame, and there are no tracks")
+        if beyond := int(is_outside(locator, read.box_px[:, :2] + read.box_px[:, 2:] / 2).sum()):
+            width, height = locator.camera.size_px
+            record.notes.append(
+                f"{beyond} of {len(read)} boxes lie far outside the camera's pictures of {width} x {height} px: is its "
+                "file for this size?"
+            )
+        count = len(frames_to_locate(read, locator.site.landmarks))
+        record_results(output, record, locator.locate_table(read), "locate", count, quiet)
+    files = [name for name in AerialRecorder.files if (out / name).exists()]
+    first = f"{record.frames} frames, {record.targets} targets"
+    print_lines(closing_lines([first, *position_lines(record)], record, out, files), quiet)
+
+
+@locate.command()
+@report_errors
 def ground(
     tables: Annotated[
         list[Path],
-        typer.Argument(metavar="TABLE...", help="Tables of people or tracks, CSV or MOTChallenge text, one a camera."),
+        typer.Argument(metavar="TABLE...", help="Tables of people or tracks, CSV or MOTChallenge, one per camera."),
     ],
     camera: Annotated[list[Path], typer.Option(metavar="FILE", help="The TOML of each table's camera.")],
-    poses: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in their order.")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("dddas-positions"),
+    poses: Poses = None,
+    out: Out = Path("dddas-positions"),
     config: Config = None,
     set_: Overrides = None,
     rate: Rate = None,
@@ -39,79 +131,77 @@ def ground(
 ) -> None:
     """Locate people seen by cameras on the ground, by their height and their feet; several cameras are fused.
 
-    Writes positions.csv, sightings.csv (what each camera alone says), tracks.geojson and tracks.kml where longitudes
-    are known, and run.json under --out.
+    Writes positions.csv, sightings.csv (what each camera alone found), tracks.geojson and tracks.kml if longitudes are
+    known, and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-
-    journal = ground_into(out, tables, camera, poses or [], load_config(config, set_ or []), rate, quiet)
-    if not quiet:
-        for line in summary(journal, out):
-            typer.echo(line)
-
-
-def ground_into(
-    folder: Path,
-    tables: Sequence[Path],
-    cameras: Sequence[Path],
-    poses: Sequence[Path],
-    settings: "Settings",
-    rate_hz: float | None = None,
-    quiet: bool = False,
-) -> "GroundRecord":
-    """Locate and write under a folder; returns the record of the run. Raises InputError for bad input."""
-    from torchvision_dddas.geo.ground_locator import GroundLocator
+    from torchvision_dddas.geo import GroundLocator
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.detection_tables import read_detections
     from torchvision_dddas.io.output import GroundRecorder
 
-    if len(cameras) != len(tables):
-        raise InputError(f"{len(tables)} tables and {len(cameras)} cameras; wanted one --camera for each table")
-    check_rate(rate_hz)
+    settings, poses = load_config(config, set_ or []), poses or []
+    if len(camera) != len(tables):
+        raise InputError(f"{len(tables)} tables and {len(camera)} cameras; give one --camera for each table")
+    check_rate(rate)
     if poses and len(poses) != len(tables):
-        raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; wanted one --poses for each, or none")
-    written = [folder / name for name in GroundRecorder.files]
-    refuse_own_input([*tables, *cameras, *poses], written, "folder with --out")
-    with GroundRecorder(folder) as output:
+        raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; give one --poses for each, or none")
+    refuse_own_input([*tables, *camera, *poses], [out / name for name in GroundRecorder.files], "folder with --out")
+    with GroundRecorder(out) as output:
         read = [read_detections(table) for table in tables]
-        kinds = [read_camera(camera) for camera in cameras]
+        cameras = [read_camera(file) for file in camera]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
-        locator = GroundLocator(kinds, settings, poses=where, rate_hz=rate_hz)
+        locator = GroundLocator(cameras, settings, poses=where, rate_hz=rate)
         frames = locator.locate_tables(read)
         facts = {
             "input": list(tables),
-            "cameras": list(cameras),
+            "cameras": list(camera),
             "poses": list(poses),
             "rows": [len(table) for table in read],
             "settings": settings.model_dump(),
         }
-        journal = output.begin(facts, _told_apart([kind.name for kind in kinds]), locator.origin_deg is not None)
-        journal.notes += [
-            note for file, pose in zip(cameras, where, strict=True) if (note := describe_missing(file, pose))
-        ]
-        with progress("locate", None, quiet) as tick:
-            for frame in frames:
-                output.write(frame)
-                tick()
+        names = [one.name for one in cameras]
+        names = [f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1)]
+        record = output.begin(facts, names, locator.origin_deg is not None)
+        missing = (describe_missing(file, pose) for file, pose in zip(camera, where, strict=True))
+        record.notes += [note for note in missing if note]
+        record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
-            journal.notes.append("the tables have no rows: nobody to locate")
-    return journal
-
-
-def _told_apart(names: list[str]) -> tuple[str, ...]:
-    """The cameras' names, those that are alike numbered."""
-    return tuple(f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1))
-
-
-def summary(journal: "GroundRecord", folder: Path) -> list[str]:
-    """What to tell the user at the end."""
-    by = journal.by
-    told = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"
-    lines = [f"{journal.frames} frames, {journal.targets} sightings ({told}), {journal.people} positions"]
+            record.notes.append("the tables have no rows: nobody to locate")
+    by = record.by
+    counts = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"
+    lines = [f"{record.frames} frames, {record.targets} sightings ({counts}), {record.people} positions"]
     if by["bearing"]:
         lines.append(f"note: {by['bearing']} sightings have a bearing but no distance (see sightings.csv)")
-    made = [
-        name for name in ("positions.csv", "sightings.csv", "tracks.geojson", "tracks.kml") if (folder / name).exists()
-    ]
-    return [*lines, *(f"note: {note}" for note in journal.notes), f"{folder}: {', '.join([*made, 'run.json'])}"]
+    files = [*(name for name in GroundRecorder.files if name != "run.json" and (out / name).exists()), "run.json"]
+    print_lines(closing_lines(lines, record, out, files), quiet)
+
+
+def position_lines(record: "RunRecord") -> list[str]:
+    """How many positions there are and by which method, and which frames could not be located or were repaired."""
+    counts: dict[str, Any] = {"positions": 0, "by": {}, **record.counts}
+    by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")
+    lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
+    if gaps := counts["by"].get("nothing", 0):
+        lines.append(f"note: {gaps} frames could not be located and have no positions; run.json gives the causes")
+    for what, words in (("weak", "located with a warning"), ("repairs", "repaired")):
+        if spans := counts.get(what):
+            lines.append(f"note: {words}, {_describe_longest(spans)}")
+    for name, kept in counts.get("landmarks", {}).items():
+        # No landmark is used in a frame that could not be located; such frames do not count against this one.
+        tried = kept["used"] + kept["left_out"]
+        if kept["left_out"] > 0.5 * tried:
+            lines.append(
+                f"note: {name} was left out in {kept['left_out']} of {tried} frames; is its place "
+                "right, and does the ground rise or fall there (--dem)?"
+            )
+    return lines
+
+
+def _describe_longest(spans: Sequence[dict[str, Any]]) -> str:
+    longest = max(spans, key=lambda row: row["last"] - row["first"])
+    first, last = longest["first"], longest["last"]
+    where = f"frame {first}" if first == last else f"frames {first} to {last}"
+    more = f"; {len(spans) - 1} more in run.json" if len(spans) > 1 else ""
+    return f"{where}: {longest['cause']}{more}"

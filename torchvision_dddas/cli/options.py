@@ -1,12 +1,19 @@
-"""The options that several commands share, said once."""
+"""What all commands share: options, checks of them, exit codes, and errors as one line on stderr."""
 
+import functools
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
 from torchvision_dddas.errors import InputError
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 class Backend(StrEnum):
@@ -17,31 +24,88 @@ class Backend(StrEnum):
     onboard = "onboard"
 
 
+CLIP = "A video file, a folder or glob of images, camera:0 or rtsp://..."
+
 Config = Annotated[str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="Change a parameter; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="PARAMETER=VALUE", help="Change a parameter; may be repeated.")
 ]
 EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames a second, where the input does not say.")]
-Clips = Annotated[str | None, typer.Option(metavar="PATTERN,...", help="These clips alone, such as 'bms_*'.")]
-Jobs = Annotated[
-    int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")
+StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as the study's file says]")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
+Poses = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in the cameras' order."),
+]
+Clips = Annotated[str | None, typer.Option(metavar="PATTERN,...", help="Only these clips, such as 'bms_*'.")]
+Jobs = Annotated[int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler such as tcp://host:8786, instead of --jobs.")
 ]
 CacheFolder = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+OutPerInput = Annotated[Path, typer.Option(help="Folder for the results; with several inputs, one folder each in it.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+
+
+def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, and Ctrl-C into exit code 130."""
+
+    @functools.wraps(command)
+    def guarded(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        try:
+            return command(*args, **kwargs)
+        except InputError as error:
+            typer.echo(f"dddas: {' '.join(str(error).split())}", err=True)
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo("dddas: interrupted; results up to here are kept", err=True)
+            raise typer.Exit(INTERRUPTED) from None
+
+    return guarded
+
+
+def print_lines(lines: Sequence[str], quiet: bool = False) -> None:
+    """Print what a command reports at its end, unless --quiet was given."""
+    for line in () if quiet else lines:
+        typer.echo(line)
 
 
 def check_rate(rate_hz: float | None) -> None:
-    """Raises InputError for a --rate that is none."""
+    """Raise InputError for a --rate out of range."""
     if rate_hz is not None and not 0 < rate_hz <= 1000:
-        raise InputError(f"a frame rate of {rate_hz} per second will not do; wanted more than 0, at most 1000")
+        raise InputError(f"--rate must be a frame rate above 0 and at most 1000 per second, got {rate_hz}")
+
+
+def check_interval(interval: int | None, most: int | None = None) -> None:
+    """Raise InputError for an --interval out of range."""
+    if interval is not None and not 1 <= interval <= (most or interval):
+        limit = "1 or more" if most is None else f"1 to {most}"
+        raise InputError(f"--interval must be {limit} frames, got {interval}")
 
 
 def check_jobs(jobs: int | None, scheduler: str | None = None) -> None:
-    """Raises InputError for a --jobs that is none, and for one beside a --scheduler."""
+    """Raise InputError for --jobs below 1 and for --jobs together with --scheduler."""
     if jobs is not None and jobs < 1:
-        raise InputError(f"--jobs is {jobs}; wanted 1 or more processes")
+        raise InputError(f"--jobs must be 1 or more processes, got {jobs}")
     if jobs is not None and scheduler is not None:
-        raise InputError("--jobs and --scheduler were both given; a scheduler has workers of its own, wanted one")
+        raise InputError("--jobs and --scheduler were both given; a scheduler has its own workers, give only one")
+
+
+def parse_size(text: str, low: int, high: int) -> tuple[int, int]:
+    """(width, height) of `640x480`. Raises InputError for anything else."""
+    width, _, height = text.lower().partition("x")
+    if not all(side.isdecimal() and len(side) < 7 and low <= int(side) <= high for side in (width, height)):
+        raise InputError(f"--size must be WIDTHxHEIGHT in pixels from {low} to {high}, such as 640x480, got '{text}'")
+    return int(width), int(height)
+
+
+def split_patterns(text: str | None, option: str, what: str = "clip") -> list[str]:
+    """The patterns of names that an option gives between commas. Raises InputError if it was given without any."""
+    words = [word.strip() for word in (text or "").split(",") if word.strip()]
+    if text is not None and not words:
+        example = "'bms_*'" if what == "clip" else "'difference.*'"
+        raise InputError(f"{option} '{text}' names no {what}; give patterns of names, such as {example}")
+    return words

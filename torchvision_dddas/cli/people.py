@@ -1,32 +1,34 @@
 """`dddas people`: people, by their shape, moving or not."""
 
-from collections.abc import Callable, Sequence
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchvision_dddas.cli.clips import clip_facts, folders_for, last_lines
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, Config, EngineOption, Overrides, Quiet, Rate
-from torchvision_dddas.cli.progress import progress
+from torchvision_dddas.cli.options import (
+    CLIP,
+    Backend,
+    Config,
+    EngineOption,
+    OutPerInput,
+    Overrides,
+    Quiet,
+    Rate,
+    print_lines,
+    report_errors,
+)
+from torchvision_dddas.cli.progress import closing_lines, folders_for, record_results
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.config import Settings
     from torchvision_dddas.io.output.run_record import PeopleRecord
-    from torchvision_dddas.people.detector import WindowScorer
+    from torchvision_dddas.people import WindowScorer
+    from torchvision_dddas.types import DetectionTable, Source
 
 
-@explained
+@report_errors
 def people(
-    inputs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="INPUT...", help="A picture, a video file, a folder or glob of images, camera:0 or rtsp://..."
-        ),
-    ],
+    inputs: Annotated[list[str], typer.Argument(metavar="INPUT...", help=f"A picture. {CLIP}")],
     around: Annotated[
         Path | None,
         typer.Option(
@@ -34,9 +36,7 @@ def people(
             help="Search around these boxes, and nowhere else unless people.search=regions; CSV or MOTChallenge text.",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results; several inputs get a folder each in it.")] = Path(
-        "dddas-people"
-    ),
+    out: OutPerInput = Path("dddas-people"),
     config: Config = None,
     set_: Overrides = None,
     backend: EngineOption = Backend.auto,
@@ -50,94 +50,61 @@ def people(
 
     Writes detections.txt (MOTChallenge), detections.csv with the feet, overlay.mp4 (.png for a picture) and run.json.
     """
+    from torchvision_dddas import open_video
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.output import PeopleRecorder, parse_save
-    from torchvision_dddas.people.detector import load_scorer
+    from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
+    from torchvision_dddas.io.output import PeopleRecorder, clip_facts, parse_save
+    from torchvision_dddas.people import detector
+    from torchvision_dddas.people.pyramid import levels
 
     settings, names = load_config(config, set_ or []), parse_save(save, PeopleRecorder.saved)
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
-    recognizer = cache(lambda: load_scorer(settings.people, backend.value))
+    scorer: WindowScorer | None = None
     for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
-        journal = people_into(folder, clip, recognizer, settings, names, around, rate, quiet)
-        if not quiet:
-            for line in summary(journal, folder, names):
-                typer.echo(line)
-
-
-def people_into(
-    folder: Path,
-    clip: str,
-    recognizer: Callable[[], "WindowScorer"],
-    settings: "Settings",
-    save: Sequence[str] = (),
-    around: Path | None = None,
-    rate_hz: float | None = None,
-    quiet: bool = False,
-) -> "PeopleRecord":
-    """Recognize the people of one clip or picture and write under a folder; returns the record of the run.
-
-    Raises InputError for bad input, and KeyboardInterrupt after the outputs up to the last whole frame are in place.
-    """
-    from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.output import PeopleRecorder
-
-    given = [Path(clip), *([] if around is None else [around])]
-    refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
-    with PeopleRecorder(folder, save) as output:
-        from torchvision_dddas import open_video
-        from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
-        from torchvision_dddas.people.detector import detect_in_clip
-        from torchvision_dddas.people.pyramid import levels
-
-        table = read_detections(around) if around is not None else None
-        source = open_video(clip, rate_hz=rate_hz, single=True)
-        if table is not None:
-            check_within_clip(table, source)
-        try:
-            levels(source.size, settings.people)  # whether one fits is better said before the engine is loaded
-        except InputError as error:
-            raise InputError(f"{source.name}: {error}") from None
-        engine = recognizer()
-        facts = {
-            "input": clip,
-            "around": around,
-            "clip": clip_facts(source),
-            "backend": engine.name,
-            "settings": settings.model_dump(),
-        }
-        journal = output.begin(facts, source.rate_hz, source.exact and source.count == 1)
-        try:
-            with progress(source.name, source.count, quiet) as tick:
-                for recognized in detect_in_clip(source, engine, settings, table):
-                    output.write(recognized)
-                    tick()
+        given = [Path(clip), *([] if around is None else [around])]
+        refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
+        with PeopleRecorder(folder, names) as output:
+            table = read_detections(around) if around is not None else None
+            source = open_video(clip, rate_hz=rate, single=True)
             if table is not None:
-                journal.notes += _notes(journal, str(around), len(table), table.last, source.last)
-        finally:
-            journal.problems += [str(problem) for problem in source.problems]
-    return journal
+                check_within_clip(table, source)
+            try:
+                levels(source.size, settings.people)  # a picture that is too small is refused before the engine loads
+            except InputError as error:
+                raise InputError(f"{source.name}: {error}") from None
+            scorer = scorer or detector.load_scorer(settings.people, backend.value)
+            facts = {
+                "input": clip,
+                "around": around,
+                "clip": clip_facts(source),
+                "backend": scorer.name,
+                "settings": settings.model_dump(),
+            }
+            record = output.begin(facts, source.rate_hz, source.exact and source.count == 1)
+            frames = detector.detect_in_clip(source, scorer, settings, table)
+            record_results(output, record, frames, source.name, source.count, quiet, source)
+            record.notes += [] if table is None else _notes(record, str(around), table, source)
+        files = ["detections.csv", "detections.txt", *(record.overlay for _ in names), "run.json"]
+        print_lines(closing_lines(_counts(record), record, folder, files), quiet)
 
 
-def _notes(journal: "PeopleRecord", name: str, rows: int, last: int, frames: int) -> list[str]:
+def _notes(record: "PeopleRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:
     """What the user should know of a table that said where to search."""
-    if last > frames:
-        return [f"the clip ended after frame {frames}, {name} goes on to {last}"]
-    if journal.nowhere:
-        what = f"{name} holds no rows" if rows == 0 else f"{name} has no box there that a window fits"
-        return [f"{journal.nowhere} of {journal.frames} frames were not searched: {what}"]
+    if table.last > source.last:
+        return [f"the clip ended after frame {source.last}, {name} goes on to {table.last}"]
+    if record.nowhere:
+        what = f"{name} has no box there that a window fits" if len(table) else f"{name} holds no rows"
+        return [f"{record.nowhere} of {record.frames} frames were not searched: {what}"]
     return []
 
 
-def summary(journal: "PeopleRecord", folder: Path, save: Sequence[str]) -> list[str]:
-    """What to tell the user at the end."""
-    made = ["detections.csv", "detections.txt", *(journal.overlay for _ in save), "run.json"]
-    found = f"{journal.targets} {'person' if journal.targets == 1 else 'people'}"
-    first = f"{journal.frames} frame{'s' * (journal.frames != 1)}, {found}"
-    if journal.unlikely:
-        first += f", {journal.unlikely} of them unlikely"
-    if journal.cut:
-        first += f", {journal.cut} of them cut by the border"
-    if journal.share < 1:
-        first += f"; {journal.share:.0%} of the windows searched"
-    return last_lines(first, journal, folder, made, journal.notes)
+def _counts(record: "PeopleRecord") -> str:
+    found = f"{record.targets} {'person' if record.targets == 1 else 'people'}"
+    line = f"{record.frames} frame{'s' * (record.frames != 1)}, {found}"
+    if record.unlikely:
+        line += f", {record.unlikely} of them unlikely"
+    if record.cut:
+        line += f", {record.cut} of them cut by the border"
+    return line if record.share >= 1 else f"{line}; {record.share:.0%} of the windows searched"

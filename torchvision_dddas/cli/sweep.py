@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, CacheFolder, Clips, Config, Jobs, Overrides, Quiet, check_jobs
+from torchvision_dddas.cli.options import (
+    Backend,
+    CacheFolder,
+    Clips,
+    Config,
+    Jobs,
+    Overrides,
+    Quiet,
+    check_jobs,
+    report_errors,
+)
 from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
@@ -22,7 +31,7 @@ MOST_SHOWN = 20  # rows of the table
 MOST_PROPOSED = 10_000
 
 
-@explained
+@report_errors
 def sweep(
     dataset: Annotated[Path, typer.Option(metavar="FILE", help="The TOML of a study, as of dddas evaluate.")],
     measure: Annotated[

@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.mistakes import explained
-from torchvision_dddas.cli.options import Backend, CacheFolder, Clips, Config, Jobs, Overrides, Quiet, check_jobs
+from torchvision_dddas.cli.options import (
+    Backend,
+    CacheFolder,
+    Clips,
+    Config,
+    Jobs,
+    Overrides,
+    Quiet,
+    check_jobs,
+    report_errors,
+)
 from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
@@ -20,7 +29,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.tuning.tuner import Tuned
 
 
-@explained
+@report_errors
 def tune(
     study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as of dddas evaluate.")],
     parameters: Annotated[

@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.colours import Patches, find_patches
+from torchvision_dddas.types import Colours
 
 # Names of hues, in OpenCV's units.
 HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
@@ -40,6 +43,89 @@ class ColourSample:
     score: float
     picture: int
     box_px: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class CalibratedColours:
+    """The ranges of K colours, (K,) samples of each, best first, and (K,) how many other patches each range marks."""
+
+    ranges: Colours
+    groups: tuple[tuple[ColourSample, ...], ...]
+    others: tuple[int, ...]
+
+
+def calibrate_colours(
+    images: Sequence[np.ndarray],
+    least_area_px: int,
+    count: int | None = None,
+    names: Sequence[str] = (),
+    boxes: Sequence[tuple[str, tuple[int, int, int, int]]] = (),
+) -> CalibratedColours:
+    """Find the colours of landmarks in (H, W, 3) uint8 BGR pictures that show all of them.
+
+    count: of colours; None: as many as names, or all that are clear. names: those of HUES go to the nearest colour,
+    others by hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture, instead of a search.
+    Raises InputError for a box without a strong colour, for too few colours, and for two that are too similar.
+    """
+    hsv = [to_hsv(image) for image in images]
+    if boxes:
+        groups, names = [[_named_sample(hsv[0], name, box)] for name, box in boxes], [name for name, _ in boxes]
+    else:
+        groups = _search(hsv, least_area_px, count or len(names) or None)
+        names = _match_names(names, [group[0].hue for group in groups])
+    low, high, others = build_ranges(groups, hsv, least_area_px)
+    for a, b in find_overlaps(low, high):
+        raise InputError(
+            f"the hues of {names[a]} and {names[b]} are too similar (about {low[a, 0]} and {low[b, 0]}); "
+            "give the landmarks colours that differ more"
+        )
+    return CalibratedColours(Colours(tuple(names), low, high), tuple(map(tuple, groups)), tuple(others.tolist()))
+
+
+def _named_sample(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -> ColourSample:
+    (x, y, wide, high), (height, width) = box_px, hsv.shape[:2]
+    if wide < 1 or high < 1 or x + wide > width or y + high > height:
+        raise InputError(f"the box {x},{y},{wide},{high} of {name} is not inside the picture, {width} x {height} px")
+    sample = sample_box(hsv, box_px)
+    if sample is None:
+        raise InputError(f"nothing in the box {x},{y},{wide},{high} of {name} has a strong colour")
+    return sample
+
+
+def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
+    groups = pool_samples([find_samples(one, least_area_px, number) for number, one in enumerate(hsv)], count)
+    if not groups or (count is not None and len(groups) < count):
+        has = f"{len(groups)} of {count} colours stand" if groups else "no colour stands"
+        where = "the picture" if len(hsv) == 1 else f"the {len(hsv)} pictures"
+        raise InputError(f"{has} out in {where}; give a box of each landmark with --at NAME=X,Y,W,H")
+    return sorted(groups, key=lambda group: group[0].hue)
+
+
+def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
+    """A name for each hue: the colour names that fit best, or the given names in the order of hues."""
+    from scipy.optimize import linear_sum_assignment  # heavy, and used by nothing else that runs onboard
+
+    if not names:
+        return name_hues(hues)
+    if not set(names) <= HUES.keys():
+        return list(names)
+    apart = [[float(abs(hue_difference(HUES[name], hue))) for name in names] for hue in hues]
+    return [names[place] for place in linear_sum_assignment(apart)[1]]
+
+
+def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
+    """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
+    return [
+        (a, b)
+        for a, b in combinations(range(len(low)), 2)
+        if _hues(low[a, 0], high[a, 0]) & _hues(low[b, 0], high[b, 0])
+        and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
+    ]
+
+
+def _hues(low: int, high: int) -> set[int]:
+    """The hues from 0 to 179 in a range."""
+    return {hue % 180 for hue in range(low, high + 1 if low <= high else high + 181)}
 
 
 def to_hsv(image: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ high = [8, 255, 255]
 """
 
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from torchvision_dddas.config import format_toml, read_toml
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.colour_calibration import CalibratedColours, find_overlaps, mask_range, to_hsv
 from torchvision_dddas.io.overlay.drawing import label, line_width, rectangle
 from torchvision_dddas.types import Colours
 
@@ -43,21 +43,6 @@ def read_colours(path: str | Path) -> Colours:
             "own, so that each landmark differs from the others"
         )
     return Colours(names, low, high)
-
-
-def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
-    """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
-    return [
-        (a, b)
-        for a, b in combinations(range(len(low)), 2)
-        if _hues(low[a, 0], high[a, 0]) & _hues(low[b, 0], high[b, 0])
-        and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
-    ]
-
-
-def _hues(low: int, high: int) -> set[int]:
-    """The hues from 0 to 179 that a range holds."""
-    return {hue % 180 for hue in range(low, high + 1 if low <= high else high + 181)}
 
 
 def _range(name: str, given: Any, path: str | Path) -> list[list[int]]:
@@ -87,6 +72,21 @@ def format_colours(colours: Colours) -> str:
     ranges = zip(colours.names, colours.low.tolist(), colours.high.tolist(), strict=True)
     comment = "Ranges of hue (0 to 180), saturation and value (0 to 255); a range from 172 to 8 goes over 0."
     return format_toml({name: {"low": low, "high": high} for name, low, high in ranges}, [comment])
+
+
+def draw_calibration(images: Sequence[np.ndarray], found: CalibratedColours) -> bytes:
+    """A PNG of all pictures, one below the other, as `draw_colours` shows the ranges that were found in them."""
+    sheets = []
+    for number, image in enumerate(images):
+        hsv, ranges = to_hsv(image), found.ranges
+        masks = np.stack([mask_range(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
+        own = [
+            np.array([s.box_px for s in group if s.picture == number], float).reshape(-1, 4) for group in found.groups
+        ]
+        sheet = draw_colours(image, masks, ranges, own)
+        width = images[0].shape[1]
+        sheets.append(cv2.resize(sheet, (width, max(round(sheet.shape[0] * width / sheet.shape[1]), 1))))
+    return cv2.imencode(".png", np.concatenate(sheets))[1].tobytes()
 
 
 def draw_colours(image: np.ndarray, masks: np.ndarray, colours: Colours, own_px: Sequence[np.ndarray]) -> np.ndarray:

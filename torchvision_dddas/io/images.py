@@ -120,6 +120,18 @@ def read_image(file: Path) -> np.ndarray | None:
     return decode_image(data, _FLAGS)
 
 
+def read_colour_image(file: Path) -> np.ndarray:
+    """A picture as (H, W, 3) uint8 BGR. Raises InputError if it cannot be read, is broken, grey or not of 8 bits."""
+    image = read_image(file)
+    if image is None:
+        raise InputError(f"{file} is not a whole picture; give a PNG, JPEG or TIFF")
+    if image.ndim == 3 and image.shape[2] == 4:
+        image = image[:, :, :3]
+    if image.dtype != np.uint8 or image.ndim != 3:
+        raise InputError(f"{file} has no colours of 8 bits; give a colour picture, as the camera delivers it")
+    return np.ascontiguousarray(image)
+
+
 def natural_order(name: str) -> list[str | int]:
     """Sorting key under which numbers count as numbers: frame2 comes before frame10."""
     # Texts and numbers by turns; digits of other scripts are text.

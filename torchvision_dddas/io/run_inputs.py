@@ -1,9 +1,12 @@
 """The files that `dddas run` and `dddas locate` take beside the pictures, read and checked before the first picture."""
 
+import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import Engine, load_engine
 from torchvision_dddas.errors import InputError
@@ -21,8 +24,9 @@ from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_solvers import load_solver
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
-from torchvision_dddas.io.elevation import read_elevation
+from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
+from torchvision_dddas.io.output import Site
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.pipeline import with_focal_length
 from torchvision_dddas.types import Colours, Source, Telemetry
@@ -129,6 +133,30 @@ def read_locator(
         *notes,
         *more,
     ]
+
+
+def locator_facts(locator: AerialLocator) -> dict[str, Any]:
+    """What run.json says of an aerial locator."""
+    camera = locator.camera
+    return {
+        "origin_deg": locator.site.origin_deg,
+        "rate_hz": locator.rate_hz,
+        "lens": {"size_px": camera.size_px, "focal_px": camera.focal_px, "centre_px": camera.centre_px},
+    }
+
+
+def map_site(locator: AerialLocator, background: Path | None) -> Site:
+    """What the maps show of the ground. Raises InputError for a background that cannot be read."""
+    site = locator.site
+    return Site(
+        names=site.landmarks.names,
+        origin_deg=site.origin_deg,
+        start_utc_s=site.telemetry.start_utc_s if site.telemetry is not None else math.nan,
+        rate_hz=locator.rate_hz,
+        background=None if background is None else read_ortho(background, site.places, site.origin_deg),
+        camera=locator.camera,
+        to_degrees=None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
+    )
 
 
 def _watch(given: AerialInput, settings: Settings, source: Source, backend: str) -> tuple[LandmarkWatch, list[str]]:

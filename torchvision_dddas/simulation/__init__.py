@@ -7,6 +7,7 @@ from torchvision_dddas.simulation.recording import (
     RecordingOutput,
     film,
     film_clip,
+    record_scenario,
 )
 from torchvision_dddas.simulation.scenario import (
     AircraftParameters,
@@ -63,6 +64,7 @@ __all__ = [
     "name_scenario_in_errors",
     "open_scenario",
     "open_simulator",
+    "record_scenario",
     "scenario_names",
     "scenario_settings",
     "scenario_toml",

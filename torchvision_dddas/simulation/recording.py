@@ -1,8 +1,9 @@
 """What the instruments of a simulated run give, as files that the tools take: pictures, telemetry, reports, poses."""
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -10,15 +11,17 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import format_toml
-from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
+from torchvision_dddas import geometry
+from torchvision_dddas.config import Settings, format_toml, with_parameters
+from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary, write_whole
 from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.overlay import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.simulation.scenario import Scenario
-from torchvision_dddas.simulation.scenario_file import load_scenario
-from torchvision_dddas.simulation.source import open_simulator
+from torchvision_dddas.simulation.scenario_file import load_scenario, scenario_settings, scenario_toml
+from torchvision_dddas.simulation.simulator import Simulator
+from torchvision_dddas.simulation.source import name_scenario_in_errors, open_simulator
 from torchvision_dddas.simulation.truth import LonLat, TruthOutput, moving_mask
 from torchvision_dddas.types import Camera, Colours, Flight, GroundPicture, Truth
 
@@ -60,6 +63,115 @@ class RecordedFrame:
     heard: tuple[RadioReport, ...] = ()
     ground: tuple[GroundPicture, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+
+
+def record_scenario(
+    folder: Path,
+    scenario: Scenario,
+    save: Sequence[str] = PLAIN,
+    frames: int | None = None,
+    name: str = "simulated",
+    progress: Callable[[str, int], AbstractContextManager[Callable[[], None]]] | None = None,
+) -> RunRecord:
+    """Run a scenario that nobody steers and write all that its instruments give; returns the record of the run.
+
+    save: some of RECORDED. frames: how many at most. name: the scenario's, for messages. progress: given a name and the
+    number of frames, a context with a function that is called for each frame. Raises InputError for bad input.
+    """
+    with RecordingOutput(folder, save) as output:
+        with name_scenario_in_errors(name):
+            simulator = open_simulator(scenario)
+        count = min(simulator.frames, frames or simulator.frames)
+        facts = {
+            "scenario": scenario.model_dump(mode="json"),
+            "clip": {"size": simulator.camera.size_px, "rate_hz": scenario.clip.rate_hz, "frames": count},
+        }
+        origin = scenario.world.origin_deg
+        record = output.begin(
+            facts,
+            scenario.clip.rate_hz,
+            simulator.camera,
+            simulator.colours,
+            scenario_toml(scenario),
+            lambda metres: geometry.lonlat(metres, origin),
+        )
+        shown = nullcontext(lambda: None) if progress is None else progress(Path(name).stem, count)
+        with shown as tick:
+            for number, frame in enumerate(_film_all(simulator, "ground" in save), 1):
+                output.write(frame)
+                tick()
+                if number == 1:
+                    record.notes += _write_elevation(folder / "dem.tif", simulator)
+                if number == count:
+                    break
+        if "video" in save and record.counts["dropped"]:
+            record.notes.append("where the camera dropped a frame, clip.mp4 shows the one before again")
+    return record
+
+
+def _film_all(simulator: Simulator, has_ground: bool) -> Iterator[RecordedFrame]:
+    """The frames of a run that nobody steers. has_ground: whether ground vehicles take pictures, all at once."""
+    scenario = simulator.scenario
+    apart_s = with_parameters(Settings(), scenario_settings(scenario)).steering.picture_s
+    apart = max(1, round(apart_s * scenario.clip.rate_hz))
+    while True:
+        begun = time.perf_counter()
+        shot = simulator.next()
+        if shot is None:
+            return
+        drawn = time.perf_counter()
+        is_due = has_ground and (shot.truth.frame - 1) % apart == 0
+        pictures = [simulator.picture(name) for name in simulator.names] if is_due else []
+        yield RecordedFrame(
+            shot.truth,
+            None if shot.frame is None else shot.frame.image,
+            tuple((moment.time_s, moment.flight) for moment in shot.said if moment.flight is not None),
+            tuple(
+                RadioReport(simulator.names[r.vehicle], r.frame, r.lonlat_deg, r.sigma_m, r.planned)
+                for moment in shot.said
+                for r in moment.reports
+            ),
+            tuple(picture for picture in pictures if picture is not None),
+            {"air": drawn - begun} | ({"ground": time.perf_counter() - drawn} if is_due else {}),
+        )
+
+
+def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
+    """Write the ground's heights above the sea as a GeoTIFF; returns a note if rasterio is missing."""
+    try:
+        import rasterio
+        from rasterio.crs import CRS
+        from rasterio.transform import from_origin
+    except ImportError:
+        return ["dem.tif is left out: it needs rasterio, pip install 'torchvision-dddas[elevation]'"]
+    relief, world = simulator.world.relief, simulator.scenario.world
+    heights = (relief.up_m + world.above_sea_m)[::-1].astype(np.float32)
+    # The plane that touches the ellipsoid at the origin, as in `geometry`.
+    lon, lat = world.origin_deg
+    local = CRS.from_proj4(f"+proj=ortho +lat_0={lat!r} +lon_0={lon!r} +datum=WGS84 +units=m")
+    step = relief.step_m
+    top = relief.corner_m[1] + (heights.shape[0] - 0.5) * step
+    part = temporary(path)
+    try:
+        with rasterio.open(
+            part,
+            "w",
+            driver="GTiff",
+            height=heights.shape[0],
+            width=heights.shape[1],
+            count=1,
+            dtype="float32",
+            crs=local,
+            transform=from_origin(relief.corner_m[0] - step / 2, top, step, step),
+            nodata=np.nan,
+        ) as raster:
+            raster.write(heights, 1)
+            raster.units = ("m",)
+        part.replace(path)
+    except OSError as error:
+        remove(part)
+        raise cannot_write(path, error) from error
+    return []
 
 
 class RecordingOutput(RunRecorder[RecordedFrame]):

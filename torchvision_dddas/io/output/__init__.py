@@ -13,7 +13,7 @@ from torchvision_dddas.io.output.recorders import (
     TrackRecorder,
 )
 from torchvision_dddas.io.output.run_log import NOTICED, PROBLEM, WORLD
-from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, finite, versions
+from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, clip_facts, finite, versions
 from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "SessionLog",
     "Site",
     "TrackRecorder",
+    "clip_facts",
     "finite",
     "make_session_folder",
     "parse_save",

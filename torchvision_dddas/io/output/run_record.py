@@ -23,6 +23,7 @@ from torchvision_dddas.types import (
     GroundLocations,
     PeopleFrame,
     Scene,
+    Source,
     TrackedFrame,
 )
 
@@ -154,6 +155,16 @@ class RunRecord:
             },
         }
         write_whole(self._path, (json.dumps(finite(record), indent=2) + "\n").encode())
+
+
+def clip_facts(source: Source) -> dict[str, Any]:
+    """What run.json says of a clip."""
+    return {
+        "name": source.name,
+        "size": source.size,
+        "rate_hz": source.rate_hz,
+        "announced_frames": source.count,
+    }
 
 
 def finite(value: Any) -> Any:
