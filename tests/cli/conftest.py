@@ -64,6 +64,16 @@ def dddas():
     return lambda *words: CliRunner().invoke(app, [str(w) for w in words])
 
 
+def bad(result):
+    """The one line that a user's mistake leaves on the terminal."""
+    assert result.exit_code == 2, result.output
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("dddas: ")
+    assert "Traceback" not in result.output
+    return lines[0]
+
+
 @pytest.fixture
 def file(tmp_path):
     """Write a file: file(name, text) gives its path."""

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
 from tests.upright import boxes, camera
 from torchvision_dddas.io.camera_files import read_camera
 
@@ -70,40 +69,3 @@ def test_a_camera_without_focal_length_is_completed(dddas, file, tmp_path):
     assert dddas("calibrate", *PERSON, "--pixels", 200, "--camera", known, "--out", out).exit_code == 0
     found = read_camera(out)
     assert (found.name, found.focal_px[0], found.place) == ('a "rover" \U0001f600\x7f', 1000.0, (-110.1234567, 32.0))
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ([], "nothing to calibrate by: give --distance with --pixels, or a table"),
-        (["--pixels", 200], "--pixels needs --distance"),
-        (["--pixels", -5, "--distance", 3], "a height in pixels of -5 will not do"),
-        (["--pixels", 200, "--distance", 0], "a distance of 0 will not do"),
-        (["--pixels", 200, "--distance", 3, "--body-height", 0], "--body-height is 0; wanted metres, 0.1 to 10"),
-        (["--pixels", 1e-6, "--distance", 3], "focal_px would be"),
-        (["--pixels", 1e308, "--distance", 1e308], "is beyond all numbers"),
-        (["--pixels", 200, "--distance", 3, "--size", "²x5"], "--size is '²x5'; wanted WIDTHxHEIGHT"),
-        (["--pixels", 200, "--distance", 3, "--camera", "odd.toml"], "heading_deg is 900; wanted a number"),
-        (["--pixels", 200, "--distance", 3, "--out", "/"], "--out / is a folder; wanted the name"),
-        (["far.csv", "--out", "far.csv"], "is a file that this run writes; choose another --out"),
-        (["crowd.txt", "--distance", 3], "has 2 boxes in frame 1; --distance wants one person alone"),
-        (["crowd.txt", "--distance", 3, "--pixels", 9], "--pixels and a table were given"),
-        (["crowd.txt"], "has boxes without distances: give --distance for one person's, or --camera"),
-        (["crowd.txt", "--camera", "known.toml"], "2 whole boxes of people; wanted 20"),
-        (["crowd.txt", "--camera", "none.toml"], "has no focal length"),
-        (["far.csv", "--distance", 3], "has its own distances"),
-        (["wrong.csv"], "line 2: distance_m is 'far'; wanted a number above 0"),
-        (["gone.csv"], "cannot be read: No such file"),
-        (["--pixels", 200, "--distance", 3, "--size", "640"], "--size is '640'; wanted WIDTHxHEIGHT"),
-    ],
-)
-def test_a_mistake_leaves_one_line(dddas, file, tmp_path, words, says):
-    file("crowd.txt", "1,-1,10,10,50,200,1\n1,-1,110,10,50,200,1\n")
-    file("known.toml", "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\n")
-    file("none.toml", "width_px = 1280\nheight_px = 960\n")
-    file("odd.toml", "width_px = 1280\nheight_px = 960\nheading_deg = 900\n")
-    file("far.csv", "distance_m,height_px\n3,100\n")
-    file("wrong.csv", "distance_m,height_px\nfar,100\n")
-    given = [tmp_path / word if str(word).endswith((".txt", ".csv", ".toml")) else word for word in words]
-    given = given if "gone.csv" not in words else [*given, *PERSON]
-    assert says in bad(dddas("calibrate", *given))

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
 from torchvision_dddas.io.colour_files import read_colours
 
 BOXES = {"red": (20, 30, 24, 16), "blue": (90, 60, 24, 16)}
@@ -53,35 +52,3 @@ def test_boxes_bring_their_names(dddas, picture, tmp_path):
     result = dddas("colours", picture, "--at", "rover 1=90,60,24,16", "--at", "x=20,30,24,16", "--out", out)
     assert result.exit_code == 0, result.output
     assert read_colours(out).names == ("rover 1", "x")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--count", 3), "2 of 3 colours stand out in"),
-        (("--count", 0), "--count is 0; wanted 1 to 12"),
-        (("--names", "a,,b"), "--names is 'a,,b'"),
-        (("--names", "a,a"), "the name a is given twice"),
-        (("--names", "a,b", "--count", 3), "--count is 3, but --names has 2 names"),
-        (("--at", "a=1,2,3"), "--at is 'a=1,2,3'; wanted NAME=X,Y,WIDTH,HEIGHT"),
-        (("--at", "a=150,2,20,20"), "--at a: the box 150,2,20,20 is not in"),
-        (("--at", "a=60,100,20,10"), "--at a: nothing in the box 60,100,20,10"),
-        (("--at", "a=20,30,9,9", "--at", "b=30,30,9,9"), "a and b are too near each other in hue"),
-        (("--at", "a=20,30,9,9", "--count", 1), "--at was given with --names or --count"),
-        (("--out", "colours.png"), "is a picture's name"),
-    ],
-)
-def test_each_mistake_is_one_line_and_leaves_no_file(dddas, picture, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in bad(dddas("colours", picture, *words))
-    assert [path.name for path in tmp_path.iterdir()] == ["view.png"]
-
-
-def test_a_picture_that_is_none_is_named_and_one_is_not_written_over(dddas, picture, tmp_path):
-    text = tmp_path / "text.png"
-    text.write_text("no picture")
-    assert "text.png is no whole picture" in bad(dddas("colours", text))
-    assert "cannot be read" in bad(dddas("colours", tmp_path / "nothing.png"))
-    assert "is a file that this run writes" in bad(dddas("colours", picture, "--out", tmp_path / "view.toml"))
-    cv2.imwrite(str(text), np.zeros((20, 20), np.uint8))
-    assert "has no colours" in bad(dddas("colours", text))

@@ -5,8 +5,6 @@ import json
 
 import pytest
 
-from tests.cli.mistakes import bad
-
 HEADER = "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2"
 BOXES = "frame,target,x_px,y_px,width_px,height_px,score,kind"
 CAMERA = """
@@ -63,18 +61,6 @@ def test_blobs_become_human_not_human_and_unseen_with_the_evidence(dddas, scene,
     assert record["state"] == "complete"
     assert record["kinds"] == {"human": 2, "not_human": 2, "unseen": 2}
     assert record["rows_looked_at"] == 4
-
-
-def test_numbers_that_are_anew_in_each_frame_do_not_add_up(dddas, tmp_path):
-    near, far = (0, 10), (5, 10)
-    order = [(near, far), (far, near), (far, near)]  # 1 and 2 are not the same blobs in each frame
-    lines = [place(f, n, *where) for f, pair in enumerate(order, 1) for n, where in enumerate(pair, 1)]
-    blobs = write(tmp_path / "air.csv", HEADER, *lines)
-    people = write(tmp_path / "ugv.csv", HEADER, *(place(f, 1, 0, 10, 0.1) for f in (1, 2, 3)))
-    done = dddas("confirm", blobs, people, "--out", tmp_path / "out")
-    assert "note: every row is judged alone" in done.stdout
-    kinds = [row["kind"] for row in rows(tmp_path / "out")]
-    assert kinds == ["human", "unseen", "unseen", "human", "unseen", "human"]
 
 
 def test_without_a_camera_nothing_is_found_not_human_and_a_note_says_so(dddas, scene, tmp_path):
@@ -150,15 +136,6 @@ def test_boxes_of_one_clip_are_confirmed_by_boxes(dddas, tmp_path):
     ]
 
 
-def test_tables_with_an_index_or_quoted_names_are_read_as_others(dddas, tmp_path):
-    header = "," + ",".join(f'"{name}"' for name in BOXES.split(","))
-    blobs = write(tmp_path / "detections.csv", header, "0,2,1,100,100,60,130,1,moving", "1,1,1,9,9,60,130,1,moving")
-    people = write(tmp_path / "people.csv", header, '0,1,1,10,10,40,120,0.9,"person"')
-    done = dddas("confirm", blobs, people, "--out", tmp_path / "out")
-    assert done.exit_code == 0, done.output
-    assert [row["kind"] for row in rows(tmp_path / "out") if row["frame"] == "1"] == ["human"]
-
-
 def test_looks_add_up_over_the_identities_of_tracks(dddas, tmp_path):
     track = write(tmp_path / "tracks.txt", *(f"{t},4,{100 + t},100,60,130,1,-1,-1,-1" for t in (2, 1, 3)))
     people = write(tmp_path / "people.txt", "1,-1,105,105,40,120,0.9,-1,-1,-1", "2,-1,105,105,40,120,0.9,-1,-1,-1")
@@ -187,57 +164,3 @@ def test_a_table_without_rows_is_confirmed_to_one_without_rows(dddas, scene, tmp
     assert done.exit_code == 0, done.output
     assert "has no rows" in done.stdout
     assert rows(tmp_path / "out") == []
-
-
-@pytest.mark.parametrize(
-    ("words", "wanted"),
-    [
-        (["{blobs}", "{boxes}"], "boxes.csv has boxes; give positions.csv for all"),
-        (["{boxes}", "{boxes}", "--camera", "{camera}"], "--camera and --poses are for positions"),
-        (["{blobs}", "absent.csv"], "absent.csv cannot be read"),
-        (["{blobs}", "{people}", "--camera", "absent.toml"], "absent.toml cannot be read"),
-        (["{blobs}", "{people}", "{people}", "--camera", "{camera}"], "2 tables of people and 1 cameras"),
-        (["{blobs}", "{people}", "--poses", "{blobs}"], "0 cameras and 1 files of poses"),
-        (["{blobs}", "{people}", "--interval", "0"], "--interval is 0"),
-        (["{blobs}", "{people}", "--set", "confirm.prior=2"], "confirm.prior"),
-        (["{twice}", "{people}", "--identities"], "target 3 is twice in frame 1"),
-        (["{odd}", "{people}"], "line 2: east_m is 'x'"),
-        (["{blobs}", "{people}", "--camera", "{degrees}"], "no longitude_deg and latitude_deg"),
-        (["{bytes}", "{people}"], "is no CSV text"),
-        (["{blobs}", "{empty}"], "empty.csv is empty; wanted a first line"),
-        (["{blobs}", "{people}", "--interval", str(10**30)], "--interval is 1000"),
-        (["{blobs}", "{people}", "--rate", "nan"], "a frame rate of nan"),
-    ],
-)
-def test_a_mistake_gets_one_line_and_leaves_nothing(dddas, scene, tmp_path, words, wanted):
-    blobs, people, camera = scene
-    degrees = CAMERA.replace("east_m", "longitude_deg").replace("north_m", "latitude_deg")
-    files = {
-        "blobs": blobs,
-        "people": people,
-        "camera": camera,
-        "boxes": write(tmp_path / "boxes.csv", BOXES, "1,1,1,1,9,9,1,moving"),
-        "twice": write(tmp_path / "twice.csv", HEADER, place(1, 3, 0, 0), place(1, 3, 1, 1), place(1, 4, 1, 1)),
-        "odd": write(tmp_path / "odd.csv", HEADER, "1,1,x,0,1,0,1"),
-        "empty": write(tmp_path / "empty.csv", ""),
-        "degrees": write(tmp_path / "degrees.toml", degrees),
-        "bytes": tmp_path / "bytes.csv",
-    }
-    files["bytes"].write_bytes(b"\xff\xfe\x00\x01")
-    line = bad(dddas("confirm", *(word.format(**files) for word in words), "--out", tmp_path / "out"))
-    assert wanted in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_input_is_not_overwritten(dddas, scene, tmp_path):
-    blobs, people, _ = scene
-    dddas("confirm", blobs, people, "--out", tmp_path / "out")
-    line = bad(dddas("confirm", tmp_path / "out" / "confirmed.csv", people, "--out", tmp_path / "out"))
-    assert "is a file that this run writes" in line
-
-
-def test_tables_in_degrees_and_in_metres_of_an_unknown_origin_are_not_compared(dddas, scene, tmp_path):
-    blobs, _, _ = scene
-    degrees = write(tmp_path / "p.csv", HEADER + ",longitude_deg,latitude_deg", place(1, 1, 0, 0, 0.3, 7.0, 50.0))
-    line = bad(dddas("confirm", blobs, degrees, "--out", tmp_path / "out"))
-    assert "some tables have longitude_deg and latitude_deg, others local metres" in line

@@ -33,31 +33,6 @@ def test_list_names_the_graphs_and_makes_none(dddas, tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--graph", "pepole"), "no graph is named 'pepole'; there are people, homography"),
-        (("--size", "640"), "--size is '640'; wanted width x height"),
-        (("--size", "20x20"), "--size is '20x20'"),
-        (("--config", "absent"), "absent"),
-        (("--graph", "step", "--config", "paper"), "difference.kind = to_reference"),
-        (("--graph", "step", "--size", "64x64"), "keypoints at 64x64"),
-    ],
-)
-def test_a_mistake_is_one_line_and_nothing_is_written(dddas, tmp_path: Path, arguments, line: str):
-    result = dddas("export", "--out", str(tmp_path / "own"), *arguments)
-    assert result.exit_code == 2 and line in result.output
-    assert len(result.output.strip().splitlines()) == 1
-    assert not (tmp_path / "own").exists()
-
-
-def test_a_file_in_the_place_of_the_folder_is_refused(dddas, tmp_path: Path):
-    (tmp_path / "own").write_text("mine")
-    result = dddas("export", "--graph", "homography", "--out", str(tmp_path / "own"))
-    assert result.exit_code == 2 and "is a file; wanted a folder" in result.output
-    assert (tmp_path / "own").read_text() == "mine"
-
-
 def test_what_is_not_installed_is_named(dddas, tmp_path: Path, monkeypatch):
     command = import_module("torchvision_dddas.cli.export")  # the name in the package is the function
     monkeypatch.setattr(command, "find_spec", lambda name: None if "onnx" in name else object())

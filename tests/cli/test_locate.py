@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.upright import boxes, camera
 from torchvision_dddas.io.ground_tables import read_positions
 
@@ -74,14 +74,6 @@ def test_a_place_in_degrees_gives_a_map(dddas, file, tmp_path):
     assert degrees is not None
     assert np.allclose(feature["geometry"]["coordinates"], degrees[::2], atol=1e-8)
     assert abs(degrees[0, 0] + 110.95) < 1e-4 and 0 < degrees[0, 1] - 32.23 < 2e-4
-
-
-def test_a_target_seen_once_is_a_point_of_the_map(dddas, file, tmp_path):
-    text = CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n"
-    table = file("t.csv", tracks(camera(), frames=(7,)))
-    dddas("locate", "ground", table, "--camera", file("c.toml", text), "--out", tmp_path / "out")
-    found = json.loads((tmp_path / "out/tracks.geojson").read_text())
-    assert [feature["geometry"]["type"] for feature in found["features"]] == ["Point", "Point"]
 
 
 def test_a_line_of_the_map_is_cut_at_180_degrees(dddas, file, tmp_path):
@@ -161,13 +153,6 @@ def test_whoever_has_no_distance_is_told_of(dddas, file, tmp_path):
     assert len(read_positions(tmp_path / "out/positions.csv")) == 1
 
 
-def test_paper_mode_has_no_covariances(dddas, file, tmp_path):
-    words = ("--camera", file("c.toml", CAMERA), "--set", "ground.mode=paper", "--out", tmp_path / "out")
-    result = dddas("locate", "ground", file("t.csv", tracks(camera())), *words)
-    assert result.exit_code == 0, result.output
-    assert np.isnan(read_positions(tmp_path / "out/positions.csv").covariance_m2).all()
-
-
 def test_a_table_without_rows_gives_empty_tables(dddas, file, tmp_path):
     text = CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n"
     words = ("--camera", file("c.toml", text), "--out", tmp_path / "out")
@@ -178,38 +163,3 @@ def test_a_table_without_rows_gives_empty_tables(dddas, file, tmp_path):
     assert json.loads((tmp_path / "out/tracks.geojson").read_text())["features"] == []
     record = json.loads((tmp_path / "out/run.json").read_text())
     assert (record["state"], record["people"]) == ("complete", 0)
-
-
-@pytest.mark.parametrize(
-    ("text", "words", "says"),
-    [
-        ("width_px = 1280\nheight_px = 960\n", [], "no focal length (focal_px). `dddas calibrate` finds it"),
-        (CAMERA.replace("height_m = 1.2\n", ""), ["--set", "ground.use=feet"], "has no height_m"),
-        (CAMERA, ["--camera", "again"], "1 tables and 2 cameras; wanted one --camera for each table"),
-        (CAMERA, ["--poses", "poses"], "cover frames 1 to 2; 2 of 6 rows of the table lie outside"),
-        (CAMERA, ["--poses", "poses", "--poses", "poses"], "1 tables and 2 files of poses"),
-        (CAMERA, ["--poses", "timed"], "are by time_s; say with --rate"),
-        (CAMERA, ["--poses", "timed", "--rate", 0], "a frame rate of 0.0 per second will not do"),
-        (CAMERA, ["--set", "ground.body_height_m=9"], "ground.body_height_m"),
-    ],
-)
-def test_a_mistake_leaves_one_line_and_no_folder(dddas, file, tmp_path, text, words, says):
-    names = {
-        "again": file("again.toml", CAMERA),
-        "poses": file("poses.csv", "frame,heading_deg\n1,0\n2,0\n"),
-        "timed": file("timed.csv", "time_s,heading_deg\n0,0\n2,0\n"),
-    }
-    given = [names.get(word, word) for word in words]
-    table, out = file("t.csv", tracks(camera())), tmp_path / "out"
-    result = dddas("locate", "ground", table, "--camera", file("c.toml", text), *given, "--out", out)
-    assert says in bad(result)
-    assert not out.exists()
-
-
-def test_a_run_does_not_read_what_it_writes(dddas, file, tmp_path):
-    table = file("positions.csv", tracks(camera()))
-    result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", tmp_path)
-    assert "is a file that this run writes" in bad(result)
-    words = ("--camera", file("c.toml", CAMERA), "--poses", file("sightings.csv", "frame,heading_deg\n1,0\n"))
-    result = dddas("locate", "ground", file("t.csv", tracks(camera())), *words, "--out", tmp_path)
-    assert "sightings.csv is a file that this run writes" in bad(result)

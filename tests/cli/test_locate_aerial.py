@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.overflight import Overflight
 
 
@@ -71,27 +71,16 @@ def test_a_landmark_without_reports_is_where_its_waypoints_say(aerial, tmp_path)
     assert flight.errors(found).max() < 0.001
 
 
-def test_what_is_amiss_and_what_was_repaired_is_said_at_the_end(aerial):
+def test_warnings_and_repairs_are_reported_at_the_end(aerial):
     flight = Overflight()
     assert "note: repaired" not in aerial(flight).stdout
     up = aerial(flight, telemetry=flight.telemetry_csv(heading_deg=-150)).stdout
-    assert "note: located with something amiss, frames 1 to 10: landmarks and telemetry disagree" in up
+    assert "note: located with a warning, frames 1 to 10: landmarks and telemetry disagree" in up
     header, *lines = (line.split(",") for line in flight.landmarks_csv().splitlines())
     for one, other in zip(lines[::4], lines[1::4], strict=True):
         one[2:4], other[2:4] = other[2:4], one[2:4]
     swapped = "\n".join(map(",".join, [header, *lines])) + "\n"
     assert "note: repaired, frames 1 to 10: identities" in aerial(flight, landmarks=swapped).stdout
-
-
-def test_longitudes_and_latitudes_are_those_of_the_metres(aerial, tmp_path):
-    from tests.overflight import ORIGIN
-    from torchvision_dddas.geometry import lonlat
-
-    flight = Overflight(frames=2)
-    found = located(aerial(flight), tmp_path / "out")
-    truth = lonlat(flight.targets(1), ORIGIN)
-    given = np.array([[float(row["longitude_deg"]), float(row["latitude_deg"])] for row in found[:4]])
-    np.testing.assert_allclose(given, truth, atol=2e-8)
 
 
 def test_landmarks_alone_will_do_and_so_will_local_metres(aerial, tmp_path):
@@ -172,15 +161,6 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(aerial, tmp_path):
     assert "note: 1 frames could not be located" in result.stdout
 
 
-def test_landmarks_that_are_too_few_for_most_frames_are_not_said_to_be_misplaced(aerial, tmp_path):
-    flight = Overflight()
-    few = flight.landmarks_csv(keep=lambda frame, k: frame < 3 or k < 3)
-    result = aerial(flight, landmarks=few, telemetry=None)
-    assert {int(row["frame"]) for row in located(result, tmp_path / "out")} == {1, 2}
-    assert "note: 8 frames could not be located" in result.stdout
-    assert "was left out" not in result.stdout
-
-
 def test_a_landmark_that_is_hardly_ever_where_it_is_expected_is_told_of(aerial, tmp_path):
     class Wrong(Overflight):
         def shown(self, frame, east_north, up_m=0.0):
@@ -222,94 +202,73 @@ def test_both_back_ends_agree(aerial, tmp_path, backend):
         assert float(a["east_m"]) == pytest.approx(float(b["east_m"]), abs=1e-4)
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# Mistakes.
+class Row(Overflight):
+    """Landmarks on one line."""
+
+    def marks(self, frame):
+        return np.outer(np.arange(4) - 1.5, [8.0, 3.0])
 
 
-def test_fewer_than_four_landmarks_everywhere(aerial):
-    flight = Overflight(landmarks=3)
-    line = bad(aerial(flight, telemetry=None))
-    assert "needs 4 landmarks" in line
-    assert "frame 1 has 3" in line
-    assert "1 missing" in line
+def change(text, names, new):
+    """A table with the cells of some columns changed: new(cells) gives theirs."""
+    header, *lines = (line.split(",") for line in text.splitlines())
+    columns = [header.index(name) for name in names]
+    for line in lines:
+        for column, cell in zip(columns, new([line[column] for column in columns]), strict=True):
+            line[column] = cell
+    return "\n".join(map(",".join, [header, *lines])) + "\n"
 
 
-def test_landmarks_on_one_line(aerial):
-    class Row(Overflight):
-        def marks(self, frame):
-            return np.outer(np.arange(4) - 1.5, [8.0, 3.0])
+FLIGHT, METRES = Overflight(), Overflight(geographic=False)
+MARKS, TELEMETRY, TRACKS = FLIGHT.landmarks_csv(), FLIGHT.telemetry_csv(), FLIGHT.tracks_txt()
+SWAPPED = change(MARKS, ("longitude_deg", "latitude_deg"), lambda cells: cells[::-1])
+FAR = change(METRES.telemetry_csv(), ("east_m",), lambda cells: ["541000.0"])
+LATER = "".join(f"{int(line.split(',', 1)[0]) + 100},{line.split(',', 1)[1]}\n" for line in TRACKS.splitlines())
 
-    assert "lie on one line" in bad(aerial(Row(), telemetry=None))
+
+@pytest.mark.parametrize(
+    ("flight", "how", "parts"),
+    [
+        (Overflight(landmarks=3), {"telemetry": None}, ("needs 4 landmarks", "frame 1 has 3", "1 missing")),
+        (Row(), {"telemetry": None}, ("lie on one line",)),
+        (METRES, {"telemetry": TELEMETRY}, ("landmarks are in local metres, the telemetry in longitude",)),
+        (FLIGHT, {"landmarks": SWAPPED}, ("swapped",)),
+        (FLIGHT, {"landmarks": MARKS + MARKS.splitlines()[1] + "\n"}, ("ugv0 is in frame 1 already",)),
+        (FLIGHT, {"telemetry": FLIGHT.telemetry_csv(shift_s=500.0)}, ("500.0 to 500.9 s", "0.0 to 0.9 s")),
+        (FLIGHT, {"telemetry": FLIGHT.telemetry_csv(altitude_m=-3.0)}, ("below ground",)),
+        (FLIGHT, {"telemetry": FLIGHT.telemetry_csv(pitch_deg=-90.0)}, ("into the sky", "turn the sign of pitch_deg")),
+        (METRES, {"telemetry": FAR}, ("the vehicle is 541 km or more from the landmarks",)),
+        (FLIGHT, {"table": LATER, "telemetry": None}, ("frames 101 to 110", "1 to 10")),
+        (FLIGHT, {"landmarks": FLIGHT.landmarks_csv(pictured=False)}, ("u_px,v_px",)),
+        (FLIGHT, {"camera": None}, ("--camera FILE or --clip CLIP",)),
+        (FLIGHT, {"rate": False}, ("--rate",)),
+        (METRES, {"telemetry": None, "more": ("--set", "aerial.mode=paper")}, ("works in degrees",)),
+        (FLIGHT, {"table": TRACKS + TRACKS.splitlines()[0] + "\n"}, ("identity 1 is there already",)),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_no_folder(aerial, tmp_path, flight, how, parts):
+    line = bad(aerial(flight, *how.pop("more", ()), **how))
+    assert [part for part in parts if part not in line] == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camera_of_another_size_than_the_clip(aerial, clip):
+    assert "1280 x 720 px, the clip of 64 x 48" in bad(aerial(Overflight(frames=5), "--clip", clip))
 
 
 def test_landmarks_on_one_line_that_receivers_errors_widen(aerial, tmp_path):
-    class Row(Overflight):
-        def marks(self, frame):
-            return np.outer(np.arange(4) - 1.5, [8.0, 3.0])
-
     flight = Row(gps_m=1.43, pixel=1.0, frames=2)
     assert "lie on one line" in bad(aerial(flight, telemetry=None))
     assert flight.errors(located(aerial(flight), tmp_path / "out")).max() < 3.0
 
 
-def test_degrees_and_metres_mixed(aerial):
-    metres, degrees = Overflight(geographic=False), Overflight()
-    line = bad(aerial(metres, telemetry=degrees.telemetry_csv()))
-    assert "landmarks are in local metres, the telemetry in longitude and latitude" in line
-
-
-def test_longitude_and_latitude_swapped(aerial):
-    flight = Overflight()
-    header, *lines = flight.landmarks_csv().splitlines()
-    names = header.split(",")
-    a, b = names.index("longitude_deg"), names.index("latitude_deg")
-    swapped = []
-    for line in lines:
-        cells = line.split(",")
-        cells[a], cells[b] = cells[b], cells[a]
-        swapped.append(",".join(cells))
-    assert "swapped" in bad(aerial(flight, landmarks="\n".join([header, *swapped])))
-
-
-def test_a_landmark_twice_in_a_frame(aerial):
-    flight = Overflight()
-    text = flight.landmarks_csv()
-    assert "ugv0 is in frame 1 already" in bad(aerial(flight, landmarks=text + text.splitlines()[1] + "\n"))
-
-
-def test_telemetry_of_another_time(aerial):
-    line = bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(shift_s=500.0)))
-    assert "500.0 to 500.9 s" in line
-    assert "0.0 to 0.9 s" in line
-
-
-def test_an_altitude_below_the_ground(aerial):
-    assert "below ground" in bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(altitude_m=-3.0)))
-
-
-def test_a_pitch_that_is_counted_upward(aerial):
-    said = bad(aerial(Overflight(), telemetry=Overflight().telemetry_csv(pitch_deg=-90.0)))
-    assert "looks into the sky" in said and "turn the sign of pitch_deg" in said
-
-
 def test_an_altitude_below_the_ground_for_a_while_is_told_of_and_not_used(aerial, tmp_path):
     flight = Overflight()
-    header, *lines = flight.telemetry_csv().splitlines()
-    k = header.split(",").index("altitude_m")
-    lines[:4] = [",".join([*(cells := line.split(","))[:k], "-3.0", *cells[k + 1 :]]) for line in lines[:4]]
-    result = aerial(flight, telemetry="\n".join([header, *lines]) + "\n")
+    header, *lines = flight.telemetry_csv().splitlines(keepends=True)
+    low = change("".join([header, *lines[:4]]), ("altitude_m",), lambda cells: ["-3.0"])
+    result = aerial(flight, telemetry="".join([low, *lines[4:]]))
     assert flight.errors(located(result, tmp_path / "out")).max() < 0.05
     assert "at or below ground in 4 of 10 samples, the first at 0.0 s: it is not used there" in result.stdout
-
-
-def test_telemetry_of_another_continent(aerial):
-    flight = Overflight(geographic=False)
-    header, *lines = flight.telemetry_csv().splitlines()
-    k = header.split(",").index("east_m")
-    away = [",".join([*(cells := line.split(","))[:k], "541000.0", *cells[k + 1 :]]) for line in lines]
-    assert "the vehicle is 541 km or more from the landmarks" in bad(
-        aerial(flight, telemetry="\n".join([header, *away]) + "\n")
-    )
 
 
 def test_landmarks_far_outside_the_cameras_pictures(aerial, tmp_path):
@@ -327,56 +286,3 @@ def test_boxes_far_outside_the_cameras_pictures_are_told_of(aerial):
     assert "lie far outside" not in aerial(flight).stdout
     away = aerial(flight, table=flight.tracks_txt() + "10,9,3000,100,20,20,1,-1,-1,-1\n")
     assert "note: 1 of 41 boxes lie far outside the camera's pictures of 1280 x 720 px" in away.stdout
-
-
-def test_no_frame_in_common(aerial):
-    flight = Overflight()
-    later = "".join(
-        f"{int(line.split(',', 1)[0]) + 100},{line.split(',', 1)[1]}\n" for line in flight.tracks_txt().splitlines()
-    )
-    line = bad(aerial(flight, table=later, telemetry=None))
-    assert "frames 101 to 110" in line
-    assert "1 to 10" in line
-
-
-def test_landmarks_without_places_in_the_picture(aerial):
-    flight = Overflight()
-    assert "u_px,v_px" in bad(aerial(flight, landmarks=flight.landmarks_csv(pictured=False)))
-
-
-def test_pictures_of_unknown_size(aerial):
-    assert "--camera FILE or --clip CLIP" in bad(aerial(Overflight(), camera=None))
-
-
-def test_a_camera_of_another_size_than_the_clip(aerial, clip):
-    line = bad(aerial(Overflight(frames=5), "--clip", clip, rate=True))
-    assert "1280 x 720 px, the clip of 64 x 48" in line
-
-
-def test_telemetry_without_a_rate(aerial):
-    assert "--rate" in bad(aerial(Overflight(), rate=False))
-
-
-def test_paper_mode_of_metres(aerial):
-    flight = Overflight(geographic=False)
-    assert "works in degrees" in bad(aerial(flight, "--set", "aerial.mode=paper", telemetry=None))
-
-
-def test_an_identity_twice_in_a_frame(aerial):
-    flight = Overflight()
-    text = flight.tracks_txt()
-    assert "identity 1 is there already" in bad(aerial(flight, table=text + text.splitlines()[0] + "\n"))
-
-
-def test_a_folder_that_holds_what_is_read(dddas, file, tmp_path):
-    flight = Overflight()
-    marks = file("landmarks.csv", flight.landmarks_csv())
-    table = file("positions.csv", flight.tracks_txt())
-    result = dddas("locate", "aerial", table, "--landmarks", marks, "--rate", 10, "--out", tmp_path)
-    assert "positions.csv is a file that this run writes" in bad(result)
-    assert table.read_text() == flight.tracks_txt()
-
-
-def test_bad_input_leaves_no_folder(aerial, tmp_path):
-    bad(aerial(Overflight(landmarks=3), telemetry=None, out=tmp_path / "new"))
-    assert not (tmp_path / "new").exists()

@@ -1,7 +1,6 @@
 """`dddas people`: what it writes for clips and pictures, and one line for each mistake."""
 
 import json
-import signal
 import subprocess
 import sys
 import textwrap
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from torchvision_dddas.io.detection_tables import read_detections
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,10 +115,6 @@ def test_a_picture_gives_a_picture(dddas, stub, photo, tmp_path):
     assert size(tmp_path / "out/overlay.png") == (150, 100, 3)
 
 
-def test_detect_still_refuses_a_picture(dddas, photo, tmp_path):
-    assert "photo.jpg is one image, not a clip; give its folder" in bad(dddas("detect", photo, "--out", tmp_path / "o"))
-
-
 def test_several_inputs_get_a_folder_each_and_share_one_engine(dddas, stub, photo, clip, tmp_path):
     loads = stub()
     result = dddas("people", photo, photo, clip, *SMALL, "--out", tmp_path / "out", "--save", "none", "--quiet")
@@ -190,71 +185,11 @@ def test_a_frame_that_cannot_be_decoded_is_told_and_recorded(dddas, stub, clip, 
     assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
 
 
-MISTAKES = [
-    (("--save", "masks"), "--save must name some of overlay, all or none, got 'masks'"),
-    (("--set", "people.serch=regions"), "unknown parameter"),
-    (("--set", "people.search=somewhere"), "everywhere or regions"),
-    (("--config", "nosuch"), "nosuch"),
-    (("--around", "nosuch.csv"), "nosuch.csv"),
-    (("--rate", "0"), "frame rate"),
-]
-
-
-@pytest.mark.parametrize(("words", "says"), MISTAKES)
-def test_a_mistake_in_an_option_is_one_line_and_leaves_no_folder(dddas, stub, clip, tmp_path, words, says):
-    assert says in bad(dddas("people", clip, *SMALL, "--out", tmp_path / "out", *words))
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_picture_smaller_than_the_window_names_both_sizes_and_what_to_do(dddas, stub, clip, tmp_path):
     said = bad(dddas("people", clip, "--out", tmp_path / "out"))
     assert str(clip) in said and "64 x 48 px" in said and "64 x 128 px" in said and "people.enlarge" in said
     assert not (tmp_path / "out").exists()
     assert dddas("people", clip, "--set", "people.enlarge=3", "--out", tmp_path / "out", "--quiet").exit_code == 0
-
-
-def test_a_table_of_another_clip_is_one_line(dddas, stub, clip, tmp_path):
-    (tmp_path / "det.txt").write_text("6,-1,20,10,10,24\n")
-    said = bad(dddas("people", clip, *SMALL, "--around", tmp_path / "det.txt", "--out", tmp_path / "out"))
-    assert "line 1: the table goes on to frame 6 but" in said and "ends after frame 5" in said
-
-
-def test_a_table_goes_with_one_clip(dddas, stub, clip, tmp_path):
-    (tmp_path / "det.txt").write_text("")
-    said = bad(dddas("people", clip, clip, "--around", tmp_path / "det.txt", "--out", tmp_path / "out"))
-    assert "--around is the table of one clip, and 2 were given" in said
-
-
-@pytest.mark.parametrize("name", ["detections.txt", "detections.csv", "overlay.png", "run.json"])
-def test_a_table_that_the_run_would_write_over_is_refused(dddas, stub, clip, tmp_path, name):
-    said = bad(dddas("people", clip, "--around", tmp_path / "out" / name, "--out", tmp_path / "out"))
-    assert f"{name} is a file that this run writes; choose another folder with --out" in said
-
-
-def test_the_input_is_not_written_over(dddas, stub, photo, tmp_path):
-    assert dddas("people", photo, "--set", "people.padding_px=0", "--out", tmp_path / "out").exit_code == 0
-    drawn = tmp_path / "out/overlay.png"
-    before = drawn.read_bytes()
-    said = bad(dddas("people", drawn, "--set", "people.padding_px=0", "--out", tmp_path / "out"))
-    assert "overlay.png is a file that this run writes; choose another folder with --out" in said
-    assert drawn.read_bytes() == before
-
-
-@pytest.mark.parametrize("content", [b"", b"no picture", None])
-def test_a_file_that_is_no_picture_is_one_line(dddas, stub, tmp_path, content):
-    path = tmp_path / "photo.png"
-    if content is not None:
-        path.write_bytes(content)
-    assert "photo.png" in bad(dddas("people", path, "--out", tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_classifier_of_the_wrong_length_names_both_lengths(dddas, clip, tmp_path):
-    (tmp_path / "svm.txt").write_text("1\n" * 100)
-    words = ("--set", f"people.classifier={tmp_path / 'svm.txt'}", "--out", tmp_path / "out")
-    said = bad(dddas("people", clip, "--set", "people.enlarge=4", *words))
-    assert "100" in said and "3780" in said
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -273,48 +208,6 @@ def test_each_engine_runs_and_finds_nobody_in_noise(dddas, photo, tmp_path, back
     assert result.exit_code == 0, result.output
     assert result.stdout.startswith("1 frame, 0 people")
     assert record(tmp_path / "out")["backend"] == backend
-
-
-def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path):
-    """In a process of its own, with a true signal after the third frame was written."""
-    program = """
-        import sys, time
-        from contextlib import contextmanager
-        import torchvision_dddas.cli
-        from tests.cli.test_people import Stub
-
-        @contextmanager
-        def stopping(*_):
-            seen = []
-            def tick():
-                seen.append(1)
-                if len(seen) == 3:
-                    print("now", flush=True)
-                    time.sleep(60)
-            yield tick
-
-        import torchvision_dddas.people.detector
-
-        sys.modules["torchvision_dddas.cli.people"].progress = stopping
-        torchvision_dddas.people.detector.load_scorer = lambda parameters, backend: Stub(parameters)
-        torchvision_dddas.cli.main()
-    """
-    words = [sys.executable, "-c", textwrap.dedent(program), "people", str(clip), *SMALL]
-    process = subprocess.Popen(
-        [*words, "--out", str(tmp_path / "out"), "--quiet"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "now\n", process.communicate(timeout=30)[1]
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert error == "dddas: stopped; what was done until then is kept\n"
-    kept = record(tmp_path / "out")
-    assert (kept["interrupted"], kept["frames"]["written"]) == (True, 3)
-    assert len(rows(tmp_path / "out")) == 3
-    assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
-    assert not list((tmp_path / "out").rglob("*.part*"))
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")

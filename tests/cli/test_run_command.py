@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.overflight import COLOURS_TOML, Overflight, pictures
 
 FRAMES, RATE_HZ = 24, 8.0
@@ -186,12 +186,6 @@ def test_without_landmarks_it_says_that_nothing_is_located(dddas, clip, engine, 
     assert not (tmp_path / "out" / "positions.csv").exists()
 
 
-def test_positions_of_someone_else_are_neither_replaced_nor_removed(dddas, clip, engine, file, tmp_path):
-    theirs = file("positions.csv", "not ours")
-    assert "was not written by dddas" in bad(dddas("run", clip, "--save", "none", "--out", tmp_path))
-    assert theirs.read_text() == "not ours"
-
-
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
     from torchvision_dddas.pipeline import Pipeline
 
@@ -212,24 +206,20 @@ def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
     assert max(int(row["frame"]) for row in rows(tmp_path / "out" / "positions.csv")) <= 4
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# Mistakes.
-
-
-def test_landmarks_that_nothing_shows(dddas, flown, tmp_path):
-    assert "--colours FILE" in bad(dddas(*given(flown, colours=None), "--out", tmp_path / "out"))
-
-
-def test_a_colour_of_no_landmark(dddas, flown, file, tmp_path):
-    colours = file("other.toml", COLOURS_TOML.replace("[ugv2]", "[tank]"))
-    line = bad(dddas(*given(flown, colours=colours), "--out", tmp_path / "out"))
-    assert "the colours name tank" in line
-
-
-def test_too_few_colours_without_telemetry(dddas, flown, file, tmp_path):
-    colours = file("three.toml", COLOURS_TOML.split("[ugv3]")[0])
-    line = bad(dddas(*given(flown, colours=colours, telemetry=None), "--out", tmp_path / "out"))
-    assert "colours are given for 3: 1 missing" in line
+@pytest.mark.parametrize(
+    ("how", "changed", "message"),
+    [
+        ({"colours": None}, "", "--colours FILE"),
+        ({"colours": "other.toml"}, COLOURS_TOML.replace("[ugv2]", "[tank]"), "the colours name tank"),
+        ({"colours": "other.toml", "telemetry": None}, COLOURS_TOML.split("[ugv3]")[0], "given for 3: 1 missing"),
+        ({"telemetry": "late.csv"}, over().telemetry_csv(shift_s=900.0), "900.0 to 902.9 s, the clip 0.0 to 2.9 s"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_no_folder(dddas, flown, file, tmp_path, how, changed, message):
+    changed = {name: file(name, changed) if name in ("other.toml", "late.csv") else name for name in how.values()}
+    line = bad(dddas(*given(flown, **{what: changed[name] for what, name in how.items()}), "--out", tmp_path / "out"))
+    assert message in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_grey_clip_has_no_colours(dddas, flown, tmp_path):
@@ -243,24 +233,3 @@ def test_a_grey_clip_has_no_colours(dddas, flown, tmp_path):
     words[1] = grey / "clip"
     assert "the clip is grey" in bad(dddas(*words, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
-
-
-def test_a_file_of_no_use_without_landmarks(dddas, clip, file, tmp_path):
-    line = bad(dddas("run", clip, "--colours", file("c.toml", COLOURS_TOML), "--out", tmp_path / "out"))
-    assert "--colours is of no use without --landmarks" in line
-
-
-def test_an_interval_below_one(dddas, clip, tmp_path):
-    assert "--interval is 0" in bad(dddas("run", clip, "--interval", 0, "--out", tmp_path / "out"))
-
-
-def test_telemetry_of_another_time(dddas, flown, file, tmp_path):
-    late = file("late.csv", over().telemetry_csv(shift_s=900.0))
-    line = bad(dddas(*given(flown, telemetry=late), "--out", tmp_path / "out"))
-    assert "900.0 to 902.9 s" in line
-    assert "the clip 0.0 to 2.9 s" in line
-
-
-def test_a_folder_that_holds_what_is_read(dddas, flown):
-    line = bad(dddas(*given(flown), "--out", flown))
-    assert "landmarks.csv is a file that this run writes" in line

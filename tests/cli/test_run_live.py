@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.synthetic_clip import render
 from torchvision_dddas.io.run_inputs import prepare_run
 from torchvision_dddas.io.video import without_secrets
@@ -131,32 +131,6 @@ def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
         run.communicate(timeout=120)
     assert run.returncode == 0
     assert session(tmp_path / "out")[1]["state"] == "stopped"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--emit", "json:-"], "--emit is for a run that keeps up with a camera; give --live too"),
-        (["--serve", "1"], "--serve is for a run"),
-        (["--people"], "--people is for a run"),
-        (["--live", "--save", "all"], "--save is of no use with --live"),
-        (["--live", "--serve", "eighty"], "--serve eighty is no address"),
-        (["--live", "--emit", "csv:-"], "csv:-"),
-        (["--live", "--emit", "json:/nowhere/at/all"], "/nowhere/at/all"),
-    ],
-)
-def test_a_mistake_at_the_start_is_one_line_and_leaves_nothing(dddas, frames, tmp_path, words, said):
-    assert said in bad(dddas("run", frames, "--out", tmp_path / "out", *words))
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_of_fewer_pictures_than_a_window_needs_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
-    (tmp_path / "clip").mkdir()
-    for number in (1, 2):
-        (tmp_path / "clip" / f"{number}.png").write_bytes((frames / f"{number:03d}.png").read_bytes())
-    said = bad(dddas("run", tmp_path / "clip", *FAST, "--out", tmp_path / "out"))
-    assert "the clip has 2 frames that can be read, a window needs 3: 1 missing" in said
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):

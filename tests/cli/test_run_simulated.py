@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry
 from torchvision_dddas.io.ground_tables import read_positions
@@ -113,47 +112,3 @@ def test_truth_that_is_not_asked_for_goes_with_the_earlier_run(made, dddas, tmp_
         assert result.exit_code == 0, result.output
         assert result.output == ""
         assert (tmp_path / "out" / "truth" / "gt.txt").exists() == there
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["sim:nowhere"], "no scenario is named 'nowhere'; there are border100, border200"),
-        (["sim:"], "no scenario is named ''; there are border100"),
-        (
-            ["sim:joining", "--scene", "uav.altitud_m=3"],
-            "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m",
-        ),
-        (
-            ["sim:joining", "--scene", "team.ugvs=3"],
-            "team.ugvs must be 4 or more in a clip located by landmarks",
-        ),
-        (["sim:joining", "--scene", "clip.located_by='nothing'"], "scenario joining is located by nothing"),
-        (
-            ["sim:joining", "--scene", "world.origin_deg=[0, 95]"],
-            "world.origin_deg must be a longitude from -180",
-        ),
-        (["sim:joining", "--scene", "camera.exposure_s=0.4"], "camera.exposure_s = 0.4 is longer than from picture"),
-        (["sim:joining", "--set", "steering.oops=1"], "unknown parameter 'steering.oops'"),
-        (["sim:joining", "--interval", "2"], "--interval is of no use with sim:joining"),
-        (["sim:joining", "--landmarks", "ugvs.csv"], "--landmarks is of no use with sim:joining"),
-        (["sim:joining", "--save", "film"], "--save must name some of overlay, cot, map, report, truth"),
-        (["joining", "--scene", "uav.altitude_m=60"], "--scene and --seed change a simulated scenario"),
-    ],
-)
-def test_a_mistake_is_told_in_one_line(dddas, tmp_path, words, line):
-    assert line in bad(dddas("run", *words, "--out", tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_empty_file_is_no_scenario(dddas, file, tmp_path):
-    path = file("empty.toml", "\n# nothing\n")
-    assert "empty.toml is empty; wanted tables" in bad(dddas("run", f"sim:{path}", "--out", tmp_path / "out"))
-
-
-def test_someone_elses_truth_is_not_replaced(dddas, tmp_path):
-    (tmp_path / "truth").mkdir()
-    (tmp_path / "truth" / "gt.txt").write_text("mine")
-    line = bad(dddas("run", "sim:joining", "--out", tmp_path))
-    assert "was not written by dddas and would be replaced" in line
-    assert (tmp_path / "truth" / "gt.txt").read_text() == "mine"

@@ -7,7 +7,6 @@ import tomllib
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry, open_video
 from torchvision_dddas.evaluation.metrics import truth as judges
@@ -192,41 +191,6 @@ def test_without_a_name_it_lists_the_scenarios(dddas):
     result = dddas("simulate")
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()] == scenario_names()
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["nowhere"], "no scenario is named 'nowhere'; there are border100, border200"),
-        (["joining", "--set", "uav.altitud_m=3"], "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
-        (
-            ["joining", "--set", "team.ugvs=3"],
-            "scenario joining: team.ugvs must be 4 or more in a clip located by landmarks",
-        ),
-        (["joining", "--seed", "-1"], "seed must be a whole number from 0 to 2147483647, got -1"),
-        (["joining", "--frames", "0"], "--frames is 0; wanted 1 or more"),
-        (["joining", "--save", "film"], "--save must name some of frames, video, masks, ground"),
-    ],
-)
-def test_a_mistake_is_told_in_one_line(dddas, tmp_path, words, line):
-    assert line in bad(dddas("simulate", *words, "--out", tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_way_that_is_too_low_is_told_with_the_file(dddas, file, tmp_path):
-    path = as_file(
-        tmp_path / "low.toml", small(uav={"altitude_m": 2.0, "way_m": ((25.0, 25.0),)}, world={"trees_per_ha": 500.0})
-    )
-    line = bad(dddas("simulate", path, "--out", tmp_path / "out"))
-    assert "low.toml: uav.altitude_m = 2 is too low" in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_someone_elses_files_are_not_replaced(dddas, tmp_path, made):
-    (tmp_path / "telemetry.csv").write_text("mine")
-    line = bad(dddas("simulate", made[0] / "scenario.toml", "--out", tmp_path))
-    assert "was not written by dddas and would be replaced" in line
-    assert (tmp_path / "telemetry.csv").read_text() == "mine"
 
 
 def test_run_locates_what_was_simulated(made, dddas, tmp_path):

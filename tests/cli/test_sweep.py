@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.synthetic_clip import render
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config

@@ -1,20 +1,12 @@
 """`dddas track`: what it writes, and one line for each mistake."""
 
 import json
-import signal
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.cli.mistakes import bad
-
 UNREAD = "the frame could not be read"
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def walker(frames, x=4.0):
@@ -115,18 +107,6 @@ def test_a_clip_in_which_nothing_moves_has_empty_tables(dddas, engine, clip, tmp
         assert (tmp_path / "out/tracks.csv").read_text().count("\n") == 1
 
 
-def test_rows_in_any_order_give_the_same_tracks(dddas, table, tmp_path):
-    text = walker(range(1, 20)) + walker(range(1, 20), x=40)
-    lines = text.splitlines(keepends=True)
-    made = []
-    for k, rows in enumerate([lines, lines[::-1]]):
-        dddas("track", "--detections", table("".join(rows)), "--out", tmp_path / f"{k}", "--quiet")
-        made.append(tracks(tmp_path / f"{k}"))
-    same = [{(f, *box): i for f, i, *box in run[:, :6].tolist()} for run in made]
-    assert same[0].keys() == same[1].keys()
-    assert len({(same[0][key], same[1][key]) for key in same[0]}) == 2
-
-
 def test_scores_that_are_no_probabilities_are_told_and_kept(dddas, table, tmp_path):
     text = walker(range(1, 6)).replace("0.95", "43.332")
     result = dddas("track", "--detections", table(text), "--out", tmp_path / "out")
@@ -140,80 +120,6 @@ def test_rows_that_get_no_identity_are_counted_and_stay_in_the_csv(dddas, table,
     assert "10 detections, 1 identities, 5 detections without one" in result.stdout
     assert (tmp_path / "out/tracks.csv").read_text().count("untracked") == 5
     assert len(tracks(tmp_path / "out")) == 5
-
-
-def test_settings_choose_the_mode_and_are_recorded(dddas, clip, table, tmp_path):
-    words = ("--set", "track.mode=paper", "--save", "none", "--quiet")
-    assert dddas("track", clip, "--detections", table(), "--out", tmp_path / "out", *words).exit_code == 0
-    assert record(tmp_path / "out")["settings"]["track"]["mode"] == "paper"
-
-
-MISTAKES = [
-    (("--set", "track.mod=paper"), "unknown parameter"),
-    (("--set", "track.mode=best"), "track.mode"),
-    (("--config", "nosuch"), "nosuch"),
-    (("--save", "masks"), "--save must name some of overlay, all or none, got 'masks'"),
-    (("--save", "overlay"), "--save overlay needs a clip"),
-    (("--interval", "0"), "--interval is 0; wanted 1 or more"),
-    (("--interval", "-2"), "--interval is -2"),
-]
-
-
-@pytest.mark.parametrize(("words", "says"), MISTAKES)
-def test_a_mistake_in_an_option_is_one_line_and_leaves_no_folder(dddas, table, tmp_path, words, says):
-    assert says in bad(dddas("track", "--detections", table(), "--out", tmp_path / "out", *words))
-    assert not (tmp_path / "out").exists()
-
-
-def test_neither_clip_nor_table_is_one_line(dddas):
-    assert "track needs a clip, a table of detections" in bad(dddas("track"))
-
-
-BAD_ROWS = [
-    ("3,-1,5,5,x,9\n", "line 6: width is 'x'"),
-    ("3,-1,5,5,-2,9\n", "line 6: width is '-2'; wanted pixels, 0.001 at least"),
-    ("3,-1,5,nan,2,9\n", "line 6: y is 'nan'"),
-    ("0,-1,5,5,2,9\n", "line 6: frame is '0'"),
-    ("3,-1,5\n", "line 6: 3 columns"),
-    ("6,-1,5,5,2,9\n", "line 6: the table goes on to frame 6 but"),
-]
-
-
-@pytest.mark.parametrize(("row", "says"), BAD_ROWS)
-def test_a_bad_row_is_one_line_that_names_it_and_leaves_no_folder(dddas, clip, table, tmp_path, row, says):
-    path = table(walker(range(1, 6)) + row)
-    said = bad(dddas("track", clip, "--detections", path, "--out", tmp_path / "out"))
-    assert says in said and str(path) in said
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("words", [["nosuch.mp4"], ["--detections", "nosuch.txt"]])
-def test_a_missing_input_is_one_line_and_leaves_no_folder(dddas, tmp_path, words):
-    assert words[-1] in bad(dddas("track", *words, "--out", tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_tracks_that_someone_else_made_are_not_replaced(dddas, table, tmp_path):
-    (tmp_path / "tracks.txt").write_text("truth")
-    assert "tracks.txt was not written by dddas" in bad(dddas("track", "--detections", table(), "--out", tmp_path))
-    assert (tmp_path / "tracks.txt").read_text() == "truth"
-
-
-@pytest.mark.parametrize("name", ["tracks.txt", "tracks.csv", "run.json", "overlay.mp4"])
-def test_a_table_that_the_run_would_write_over_is_refused(dddas, table, tmp_path, name):
-    out = tmp_path / "out"
-    assert dddas("track", "--detections", table(), "--out", out, "--quiet").exit_code == 0
-    (out / name).write_text(walker(range(1, 6)))
-    before = {path: path.read_bytes() for path in out.iterdir()}
-    said = bad(dddas("track", "--detections", tmp_path / "out/../out" / name, "--out", out))
-    assert f"{name} is a file that this run writes; choose another folder with --out" in said
-    assert {path: path.read_bytes() for path in out.iterdir()} == before
-
-
-def test_a_clip_that_the_run_would_write_over_is_refused(dddas, tmp_path):
-    film = tmp_path / "out/overlay.mp4"
-    said = bad(dddas("track", film, "--out", tmp_path / "out"))
-    assert "overlay.mp4 is a file that this run writes; choose another folder with --out" in said
 
 
 def test_the_record_of_a_run_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
@@ -261,47 +167,3 @@ def test_a_clip_cut_short_ends_with_a_note_and_keeps_the_rows_after_it(dddas, ta
     assert result.exit_code == 0, result.output
     assert "note: the clip ended after frame 8, the table goes on to 12" in result.stdout
     assert tracks(tmp_path / "out")[:, 0].tolist() == list(range(1, 13))
-
-
-def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, table, tmp_path):
-    """In a process of its own, with a true signal after the third frame was written."""
-    program = """
-        import sys, time
-        from torchvision_dddas.io.tables import TableFiles
-        honest, seen = TableFiles.write, []
-
-        def write(self, followed):
-            honest(self, followed)
-            seen.append(followed.number)
-
-        TableFiles.write = write
-        from contextlib import contextmanager
-        import torchvision_dddas.cli
-
-        @contextmanager
-        def stopping(*_):
-            def tick():
-                if len(seen) == 3:
-                    print("now", flush=True)
-                    time.sleep(60)
-            yield tick
-
-        sys.modules["torchvision_dddas.cli.track"].progress = stopping
-        from torchvision_dddas.cli import main
-        main()
-    """
-    words = [sys.executable, "-c", textwrap.dedent(program), "track", str(clip), "--detections", str(table())]
-    process = subprocess.Popen(
-        [*words, "--out", str(tmp_path / "out"), "--quiet"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "now\n", process.communicate(timeout=30)[1]
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert error == "dddas: stopped; what was done until then is kept\n"
-    assert (record(tmp_path / "out")["interrupted"], record(tmp_path / "out")["frames"]["written"]) == (True, 3)
-    assert tracks(tmp_path / "out")[:, 0].tolist() == [1, 2, 3]
-    assert cv2.VideoCapture(str(tmp_path / "out/overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
-    assert not list((tmp_path / "out").rglob("*.part*"))

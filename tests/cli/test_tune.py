@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.cli.mistakes import bad
+from tests.cli.conftest import bad
 from tests.evaluation.studies.world import filmed, study
 from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app

@@ -51,7 +51,7 @@ def calibrate(
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
     from torchvision_dddas.config import format_toml, load_config
-    from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, refuse_own_input, write_whole
+    from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input, save_file
     from torchvision_dddas.io.camera_files import has_measurements, read_camera_keys, read_measurements
 
     settings = load_config(config, set_ or [])
@@ -88,11 +88,7 @@ def calibrate(
     if out is None:
         typer.echo(text, nl=False)
         return
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(out, text.encode())
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    save_file(out, text.encode())
     missing = "" if "width_px" in known else "; width_px and height_px are still missing (--size)"
     typer.echo(f"{out}: the camera{missing}")
 

@@ -44,7 +44,7 @@ def colours(
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.geo.colour_calibration import calibrate_colours
-    from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, refuse_own_input, write_whole
+    from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input, save_file
     from torchvision_dddas.io.colour_files import draw_calibration, format_colours
     from torchvision_dddas.io.images import read_colour_image
 
@@ -59,12 +59,8 @@ def colours(
         refuse_folder(path)
     images = [read_colour_image(path) for path in pictures]
     found = calibrate_colours(images, least_px, count, wanted, boxes)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(drawing, draw_calibration(images, found))
-        write_whole(out, format_colours(found.ranges).encode())
-    except OSError as error:
-        raise cannot_write(out, error) from error
+    save_file(drawing, draw_calibration(images, found))
+    save_file(out, format_colours(found.ranges).encode())
     print_lines([*_describe(found, len(pictures)), f"{out}; {drawing} shows what the ranges mark"], quiet)
 
 

@@ -1,8 +1,6 @@
 """`dddas compare`: two studies of the same clips, and whether what changed is beyond noise."""
 
 import json
-import math
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.options import report_errors
+from torchvision_dddas.cli.study import MOST_CLIPS, format_figure, open_console
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-MOST_CLIPS = 20
-"""Rows of single clips that are shown; --json has all."""
 
 
 @report_errors
@@ -26,41 +22,29 @@ def compare(
     second: Annotated[Path, typer.Argument(metavar="B", help="The folder of another study of the same clips.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write it as a page too, such as compare.html.")
+        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page, such as compare.html.")
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.evaluation.studies.comparison import compare_studies as beside
+    from torchvision_dddas.evaluation.report.comparison import comparison_report
+    from torchvision_dddas.evaluation.studies.comparison import compare_studies
     from torchvision_dddas.evaluation.studies.storage import read_scores
+    from torchvision_dddas.io.atomic_files import refuse_folder, save_file
     from torchvision_dddas.io.output.run_record import finite
 
-    found = beside(read_scores(first), read_scores(second))
+    found = compare_studies(read_scores(first), read_scores(second))
     if out is not None:
-        _write(out, finite(found))
+        refuse_folder(out)
+        save_file(out, comparison_report(finite(found)).encode())
     if as_json:
         typer.echo(json.dumps(finite(found), indent=2))
     else:
-        show(found, str(first), str(second))
+        _show(found, str(first), str(second))
 
 
-def _write(path: Path, found: dict[str, Any]) -> None:
-    """The page. Raises InputError where it cannot be written."""
-    from torchvision_dddas.evaluation.report.comparison import comparison_report
-    from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, write_whole
-
-    refuse_folder(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, comparison_report(found).encode())
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-def show(found: Mapping[str, Any], first: str, second: str) -> None:
+def _show(found: Mapping[str, Any], first: str, second: str) -> None:
     """Print a table of each task, the clips that changed, and the notes."""
-    from rich.console import Console
-
-    console = Console() if sys.stdout.isatty() else Console(width=120)
+    console = open_console()
     console.print(f"A: {first}\nB: {second}", markup=False, highlight=False)
     for task, mine in found["tasks"].items():
         names = [(group, name) for group in mine["pooled"] for name in mine["pooled"][group]]
@@ -105,9 +89,9 @@ def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
         span = next((way["interval"] for way in ways if way.get("interval")), None)
         table.add_row(
             name,
-            _figure(entry["first"]),
-            _figure(entry["second"]),
-            _figure(entry["change"], "+"),
+            format_figure(entry["first"]),
+            format_figure(entry["second"]),
+            format_figure(entry["change"], "+"),
             "–" if span is None else f"{span[0]:+.3f} to {span[1]:+.3f}",
             *(f"{way['p_holm']:.3f}" if way else "–" for way in ways),
             entry["says"],
@@ -118,7 +102,3 @@ def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
 def _p(entry: Mapping[str, Any]) -> float:
     way = entry.get("over_frames")
     return float(way["p_holm"]) if way else 2.0
-
-
-def _figure(value: float, sign: str = "") -> str:
-    return "–" if math.isnan(value) else f"{value:{sign}.3f}"

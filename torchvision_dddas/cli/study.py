@@ -1,8 +1,9 @@
-"""`dddas evaluate --dataset`: how a study is asked for and shown."""
+"""Studies on the command line: how their files are changed by options, their progress, and tables of measures."""
 
+import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,18 +15,77 @@ from torchvision_dddas.cli.progress import EVERY_S
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from torchvision_dddas.evaluation.studies.jobs import Event
     from torchvision_dddas.evaluation.studies.results import Results
     from torchvision_dddas.evaluation.studies.runner import Plan
     from torchvision_dddas.evaluation.studies.spec import Spec
 
-MOST_NOTES = 12
+    Hooks = tuple[Callable[[Plan], None], Callable[[Event], None]]
+
+MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
+
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
+    "boxes": ("f1", "precision", "recall"),
+    "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
+    "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
+    "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
+    "ranking": ("ap", "log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1"),
+    "still": ("false_blobs_per_frame", "alarmed"),
+    "location": ("located", "belongs"),
+    "metres": ("median_m", "p95_m", "in_ellipse", "relative_median_m", "relative_p95_m", "relative_in_ellipse"),
+}
+TITLES: Mapping[str, str] = {
+    "pixels": "Pixels",
+    "boxes": "Boxes, IoU ≥ 0.5",
+    "target": "One labelled target",
+    "tracks": "Tracks",
+    "target_track": "The labelled target's track, IoU ≥ 0.3",
+    "ranking": "Ranked boxes, IoU ≥ 0.5",
+    "still": "Still clips",
+    "location": "Positions",
+    "metres": "Errors in metres, and share of them inside 95 % ellipses",
+}
+# Headings that fit a terminal of 80 columns beside the clips' names.
+SHORT: Mapping[str, str] = {
+    "f": "F",
+    "f1": "F1",
+    "precision": "prec.",
+    "specificity": "spec.",
+    "accuracy": "acc.",
+    "gmean": "Gmean",
+    "iou_0.3": "IoU ≥ 0.3",
+    "other_blobs_per_frame": "other blobs",
+    "hota": "HOTA",
+    "deta": "DetA",
+    "assa": "AssA",
+    "mota": "MOTA",
+    "idf1": "IDF1",
+    "ar_3": "AR_3",
+    "same_identity": "same identity",
+    "n_switches": "IDsw",
+    "n_fragmentations": "frag.",
+    "ap": "AP",
+    "log_average_miss_rate": "LAMR",
+    "miss_rate_at_0.1": "miss at 0.1",
+    "miss_rate_at_1": "miss at 1",
+    "false_blobs_per_frame": "false blobs",
+    "median_m": "median",
+    "p95_m": "95 %",
+    "in_ellipse": "inside",
+    "relative_median_m": "to team",
+    "relative_p95_m": "95 %",
+    "relative_in_ellipse": "inside",
+}
 
 
-def asked(
-    file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None
+def change_spec(
+    file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
 ) -> "Spec":
-    """A study's file, changed by what the command line says. Raises InputError for bad input."""
+    """Read a study's file and change it by what the command line says. Raises InputError for bad input."""
     from torchvision_dddas.evaluation.studies.spec import read_spec
 
     spec = read_spec(file)
@@ -33,40 +93,12 @@ def asked(
     return replace(spec, backend=backend or spec.backend, interval=spec.interval if interval is None else interval)
 
 
-def patterns(text: str | None, option: str, what: str = "clip") -> list[str]:
-    """The patterns of names that an option gives between commas. Raises InputError where it was given without any."""
-    words = [word.strip() for word in (text or "").split(",") if word.strip()]
-    if text is not None and not words:
-        example = "'bms_*'" if what == "clip" else "'difference.*'"
-        raise InputError(f"{option} '{text}' names no {what}; wanted patterns of names, such as {example}")
-    return words
-
-
-def study_into(
-    folder: Path,
-    spec: "Spec",
-    base: Path,
-    jobs: int | None = None,
-    scheduler: str | None = None,
-    cache: Path | None = None,
-    clips: Sequence[str] = (),
-    quiet: bool = False,
-) -> "tuple[Results, dict[str, Any]]":
-    """Run a study, write it into a folder and show how far it is; its results and measures. Raises InputError."""
-    from torchvision_dddas.evaluation.studies.output import write_study
-    from torchvision_dddas.evaluation.studies.workers import Workers
-
-    with Workers(jobs, scheduler) as workers, shown(quiet) as (begun, tell):
-        return write_study(folder, spec, base, workers, cache, clips, tell, begun)
-
-
 @contextmanager
-def shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Event], None]]]":
+def show_progress(quiet: bool) -> "Iterator[Hooks]":
     """How far a study is, on stderr: a bar on a terminal, elsewhere a line for each clip and every few seconds."""
     if quiet:
-        yield lambda planned: None, lambda event: None
-        return
-    if sys.stderr.isatty():
+        yield lambda plan: None, lambda event: None
+    elif sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -78,42 +110,42 @@ def shown(quiet: bool) -> "Iterator[tuple[Callable[[Plan], None], Callable[[Even
             TimeElapsedColumn(),
         )
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            yield _on(bar)
-        return
-    yield _in_lines()
+            yield _bar_hooks(bar)
+    else:
+        yield _line_hooks()
 
 
-def _on(bar: Any) -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
+def _bar_hooks(bar: Any) -> "Hooks":
     task, frames = bar.add_task("study", total=None, frames=0), 0
 
-    def begun(planned: "Plan") -> None:
-        bar.update(task, total=len(planned.jobs))
+    def begin(plan: "Plan") -> None:
+        bar.update(task, total=len(plan.jobs))
 
-    def tell(event: "Event") -> None:
+    def advance(event: "Event") -> None:
         nonlocal frames
         frames += event.frames
         bar.update(task, advance=event.done is not None, frames=frames, description=event.job.clip.name)
         if event.note:
             bar.console.print(event.note, markup=False, highlight=False, soft_wrap=True)
 
-    return begun, tell
+    return begin, advance
 
 
-def _in_lines() -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
+def _line_hooks() -> "Hooks":
     total = done = frames = 0
-    start = told = time.monotonic()
+    start = printed = time.monotonic()
 
     def say(text: str) -> None:
-        nonlocal told
-        told = time.monotonic()
+        nonlocal printed
+        printed = time.monotonic()
         print(text, file=sys.stderr, flush=True)
 
-    def begun(planned: "Plan") -> None:
+    def begin(plan: "Plan") -> None:
         nonlocal total
-        total = len(planned.jobs)
-        say(f"{total} clip{'s' * (total != 1)}, {planned.frames} frames to look at over all tasks")
+        total = len(plan.jobs)
+        say(f"{total} clip{'s' * (total != 1)}, {plan.frames} frames to process over all tasks")
 
-    def tell(event: "Event") -> None:
+    def advance(event: "Event") -> None:
         nonlocal done, frames
         frames += event.frames
         if event.note:
@@ -124,22 +156,19 @@ def _in_lines() -> "tuple[Callable[[Plan], None], Callable[[Event], None]]":
                 f"{d.task} left out" if d.cause else d.task if d.computed else f"{d.task} kept" for d in event.done
             ]
             say(f"{done} of {total}: {event.job.clip.name} ({', '.join(words)})")
-        elif time.monotonic() - told >= EVERY_S:
+        elif time.monotonic() - printed >= EVERY_S:
             say(f"{done} of {total} clips, {frames} frames, {frames / (time.monotonic() - start):.1f} frames/s")
 
-    return begun, tell
+    return begin, advance
 
 
-def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
-    """Print the measures of each task in short, what was left out, and where the rest is."""
-    from rich.console import Console
-
-    from torchvision_dddas.cli.study_tables import tables
+def print_study(results: "Results", measures: Mapping[str, Any], folder: Path) -> None:
+    """Print the main measures of each task, what was left out, and where the rest is."""
     from torchvision_dddas.evaluation.studies.output import FILES
 
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    for table in tables(measures):
-        console.print(table)
+    console = open_console()
+    for task, found in measures["tasks"].items():
+        print_measures(console, found, f"{task}: ", MOST_CLIPS)
     for line in results.left_out:
         console.print(f"left out: {line}", markup=False, highlight=False, soft_wrap=True)
     notes = list(dict.fromkeys(results.facts["notes"]))
@@ -149,23 +178,68 @@ def show(results: "Results", measures: dict[str, Any], folder: Path) -> None:
         typer.echo(f"note: {len(notes) - MOST_NOTES} more in run.json")
     kept = sum(1 for case in results.cases if not case.cause)
     typer.echo(f"{kept} of {len(results.cases)} cases scored, {results.facts['computed']} stages computed")
-    made = [name for name in FILES if (folder / name).is_file()]
-    typer.echo(f"{folder}: {', '.join(made)}")
+    typer.echo(f"{folder}: {', '.join(name for name in FILES if (folder / name).is_file())}")
 
 
-def refuse_nothing(results: "Results") -> None:
-    """Raises InputError where no case was scored."""
-    if all(case.cause for case in results.cases):
-        case = results.cases[0]
-        raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")
+def open_console() -> "Console":
+    """Standard output; 120 columns wide if it is no terminal."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=120)
 
 
-def prune_cache(cache: Path | None, days: float, quiet: bool) -> None:
-    """Remove kept results that nobody has used for so many days."""
-    from torchvision_dddas.evaluation.studies.runner import cache_folder
-    from torchvision_dddas.evaluation.studies.storage import Cache
+def print_measures(console: "Console", measures: Mapping[str, Any], prefix: str = "", most: int | None = None) -> None:
+    """Print a table for each group of measures: "clips" by name, "pooled" (with "intervals" in a study) and "mean".
 
-    folder = cache or cache_folder()
-    count, size = Cache(folder).prune(days)
-    if not quiet:
-        typer.echo(f"{folder}: {count} results removed that were not used for {days:g} days, {size / 1e6:.1f} MB")
+    prefix: of titles. most: clips in a table, the worst of them if there are more.
+    """
+    for group in COLUMNS:
+        if clips := {name: clip for name, clip in measures["clips"].items() if group in clip}:
+            console.print(_table(group, clips, measures, prefix, most or len(clips)))
+
+
+def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], prefix: str, most: int) -> "Table":
+    from rich.markup import escape
+    from rich.table import Table
+
+    columns, shown, more = COLUMNS[group], list(clips), ""
+    if len(clips) > most:
+        shown = sorted(clips, key=lambda name: _rank(clips[name][group][columns[0]], group))[:most]
+        more = f"; the {most} worst of {len(clips)} clips"
+    table = Table(title=f"{prefix}{TITLES[group]}{more}")
+    table.add_column("clip", no_wrap=True)
+    for column in ("frames", *columns):
+        table.add_column(SHORT.get(column, column), justify="right", no_wrap=True)
+    for name in shown:
+        cells = (format_figure(clips[name][group][c]) for c in columns)
+        table.add_row(escape(str(InputError(name))), str(clips[name]["frames"]), *cells)
+    if len(clips) > 1:
+        pooled, mean = measures["pooled"], measures["mean"].get(group, {})
+        table.add_section()
+        table.add_row("pooled", "", *(format_figure(pooled.get(group, {}).get(c)) for c in columns))
+        if "intervals" in pooled:
+            intervals = pooled["intervals"].get(group, {})
+            table.add_row("95 % interval", "", *(_format_interval(intervals.get(c)) for c in columns))
+        table.add_row("mean", "", *(format_figure(mean.get(c)) for c in columns))
+    return table
+
+
+def _rank(value: float | None, group: str) -> float:
+    """Lowest for the worst clip."""
+    if value is None or math.isnan(value):
+        return math.inf
+    return -value if group in ("still", "metres") else value
+
+
+def format_figure(value: float | int | None, sign: str = "") -> str:
+    """A measure or a count for a table."""
+    if type(value) is int:
+        return f"{value:{sign}d}"
+    return "–" if value is None or math.isnan(value) else f"{value:{sign}.3f}"
+
+
+def _format_interval(interval: Sequence[float] | None) -> str:
+    if interval is None:
+        return "–"
+    low, high = interval
+    return f"{low:.2f} to {high:.2f}" if abs(high) < 100 else f"{low:.0f} to {high:.0f}"

@@ -1,8 +1,8 @@
-"""`dddas sweep`: a study with other parameters, again and again, and which of them measure best."""
+"""`dddas sweep`: a study with many values of parameters, and which of them measure best."""
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,21 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.options import (
-    Backend,
     CacheFolder,
     Clips,
     Config,
     Jobs,
     Overrides,
     Quiet,
+    Scheduler,
+    StudyBackend,
     check_jobs,
     report_errors,
+    split_patterns,
 )
 from torchvision_dddas.cli.progress import EVERY_S
+from torchvision_dddas.cli.study import change_spec, open_console
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.evaluation.studies.sweep import SweepRecord, Trial
+    from torchvision_dddas.evaluation.studies.sweep import SweepRecord
 
 MOST_SHOWN = 20  # rows of the table
 MOST_PROPOSED = 10_000
@@ -35,44 +38,46 @@ MOST_PROPOSED = 10_000
 def sweep(
     dataset: Annotated[Path, typer.Option(metavar="FILE", help="The TOML of a study, as of dddas evaluate.")],
     measure: Annotated[
-        str, typer.Option(metavar="TASK.GROUP.MEASURE", help="What is to be best, such as motion.pixels.f.")
+        str, typer.Option(metavar="TASK.GROUP.MEASURE", help="What to optimise, such as motion.pixels.f.")
     ],
     grid: Annotated[
         list[str] | None,
-        typer.Option("--grid", metavar="KNOB=A,B,C", help="Values of a parameter; may be repeated: all combinations."),
+        typer.Option("--grid", metavar="PARAMETER=A,B,C", help="Values of a parameter; if repeated, all combinations."),
     ] = None,
     optuna: Annotated[
-        int | None, typer.Option(metavar="N", help="So many points within --range, as Optuna proposes them.")
+        int | None, typer.Option(metavar="N", help="Try N points within --range that Optuna proposes.")
     ] = None,
     range_: Annotated[
         list[str] | None,
-        typer.Option("--range", metavar="KNOB=LOW:HIGH", help="Of Optuna; or KNOB=LOW:HIGH:log, KNOB=A,B,C."),
+        typer.Option(
+            "--range", metavar="PARAMETER=LOW:HIGH", help="For --optuna; also PARAMETER=LOW:HIGH:log, PARAMETER=A,B,C."
+        ),
     ] = None,
     by: Annotated[
-        str, typer.Option(metavar="pooled|mean|worst", help="All clips' counts pooled, their mean, or the worst.")
+        str,
+        typer.Option(metavar="pooled|mean|worst", help="Judge by all clips' pooled counts, their mean, or the worst."),
     ] = "pooled",
     holdout: Annotated[
         str | None,
-        typer.Option(metavar="PATTERN,...", help="Clips without a say; before and best are measured on them too."),
+        typer.Option(
+            metavar="PATTERN,...", help="Clips that do not choose the best; it is measured on them afterwards."
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of what Optuna draws.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of Optuna.")] = 0,
     clips: Clips = None,
     jobs: Jobs = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler in place of --jobs.")
-    ] = None,
+    scheduler: Scheduler = None,
     cache: CacheFolder = None,
     config: Config = None,
     set_: Overrides = None,
-    backend: Annotated[Backend | None, typer.Option(help="The engine. [default: as FILE says]")] = None,
+    backend: StudyBackend = None,
     out: Annotated[Path, typer.Option(help="Folder for sweep.json and best.toml.")] = Path("dddas-sweep"),
     quiet: Quiet = False,
 ) -> None:
     """Try parameters on whole data sets, all points of a grid or as Optuna proposes; writes sweep.json and best.toml.
 
-    Results are kept as those of dddas evaluate --dataset: a sweep that is asked for again goes on where it was.
+    Results are kept as those of dddas evaluate --dataset: a repeated sweep continues where it stopped.
     """
-    from torchvision_dddas.cli.study import asked, patterns
     from torchvision_dddas.config import load_config
     from torchvision_dddas.evaluation.studies import search_space
     from torchvision_dddas.evaluation.studies.goals import parse_goal
@@ -81,6 +86,7 @@ def sweep(
         SweepRecord,
         best,
         check_optuna,
+        format_value,
         search_grid,
         search_ranges,
         split_clips,
@@ -89,7 +95,7 @@ def sweep(
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
-    goal, spec = parse_goal(measure, by), asked(dataset, config, set_ or [], backend and backend.value, None)
+    goal, spec = parse_goal(measure, by), change_spec(dataset, config, set_ or [], backend and backend.value)
     spec = replace(spec, tasks=(goal.task,))
     settings = load_config(spec.config, spec.overrides)
     points = search_space.parse_grid(grid or [], settings)
@@ -97,11 +103,13 @@ def sweep(
     count = optuna or search_space.count_points(points)
     if optuna is not None:
         check_optuna()
-    tuned, held = split_clips(spec, dataset.parent, patterns(clips, "--clips"), patterns(holdout, "--holdout"))
+    tuned, held = split_clips(
+        spec, dataset.parent, split_patterns(clips, "--clips"), split_patterns(holdout, "--holdout")
+    )
     asked_for: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
     record = SweepRecord(out, settings, goal, asked_for, tuned, held)
     with Workers(jobs, scheduler) as workers:
-        study = StudyMeasure(spec, dataset.parent, goal, workers, cache, _pace(quiet))
+        study = StudyMeasure(spec, dataset.parent, goal, workers, cache, _progress(quiet))
         on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
         if optuna is None:
             trials = search_grid(points, settings, on_tuned, prepare)
@@ -110,7 +118,8 @@ def sweep(
         for trial in trials:
             record.add(trial)
             if not quiet:
-                print(f"{trial.number} of {count}: {_said(trial)}", file=sys.stderr, flush=True)
+                point, value = _format_point(trial.parameters), trial.cause or format_value(trial.value)
+                print(f"{trial.number} of {count}: {point}: {value}", file=sys.stderr, flush=True)
         if (found := best(record.trials, goal.minimize)) is None:
             raise InputError(f"no setting has a {goal.name}: {record.trials[0].cause}")
         on_held = None
@@ -119,43 +128,44 @@ def sweep(
             on_held = (study.measure({}, held), study.measure(found.parameters, held))
     record.finish(found, on_held)
     if not quiet:
-        show(record)
+        _show(record)
 
 
-def _pace(quiet: bool) -> Callable[[int, int], None]:
-    """Tells every few seconds, on stderr, how many clips of the points under way are done."""
-    told = time.monotonic()
+def _progress(quiet: bool) -> Callable[[int, int], None]:
+    """Print every few seconds, on stderr, how many clips of the next points are done."""
+    printed = time.monotonic()
 
-    def tell(done: int, of: int) -> None:
-        nonlocal told
-        if not quiet and time.monotonic() - told >= EVERY_S:
-            told = time.monotonic()
+    def advance(done: int, of: int) -> None:
+        nonlocal printed
+        if not quiet and time.monotonic() - printed >= EVERY_S:
+            printed = time.monotonic()
             print(f"{done} of {of} clips of the next points", file=sys.stderr, flush=True)
 
-    return tell
+    return advance
 
 
 def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] | None) -> None:
     if optuna is None and ranges:
         raise InputError("--range is for Optuna; give --optuna N too, or --grid parameter=value,value")
     if optuna is not None and grid:
-        raise InputError("--grid and --optuna were both given; wanted one (--range takes values too: parameter=a,b,c)")
+        raise InputError(
+            "--grid and --optuna were both given; give only one (--range takes values too: parameter=a,b,c)"
+        )
     if optuna is None and not grid:
         raise InputError("nothing to try; give --grid parameter=value,value or --optuna N --range parameter=low:high")
     if optuna is not None and not ranges:
-        raise InputError("--optuna has nothing to draw; give --range parameter=low:high")
+        raise InputError("--optuna has nothing to propose; give --range parameter=low:high")
     if optuna is not None and not 1 <= optuna <= MOST_PROPOSED:
-        raise InputError(f"--optuna is {optuna}; wanted 1 to {MOST_PROPOSED} points")
+        raise InputError(f"--optuna must be 1 to {MOST_PROPOSED} points, got {optuna}")
 
 
-def show(swept: "SweepRecord") -> None:
-    """Print the best trials, what the clips held out say, and where the rest is."""
-    from rich.console import Console
+def _show(swept: "SweepRecord") -> None:
+    """Print the best trials, the measures on held-out clips, and where the rest is."""
     from rich.table import Table
 
     from torchvision_dddas.evaluation.studies.sweep import format_value, ranked
 
-    console = Console() if sys.stdout.isatty() else Console(width=120)
+    console = open_console()
     parameters = list(dict.fromkeys(parameter for trial in swept.trials for parameter in trial.parameters))
     table = Table(title=f"{swept.heading}, {'least' if swept.goal.minimize else 'most'} first")
     for column in ("trial", *parameters, swept.goal.measure):
@@ -165,7 +175,7 @@ def show(swept: "SweepRecord") -> None:
     if swept.trials[0] not in shown:
         shown.append(swept.trials[0])
     for trial in shown:
-        cells = [_value(trial.parameters[k]) if k in trial.parameters else "as it was" for k in parameters]
+        cells = [_value(trial.parameters[k]) if k in trial.parameters else "unchanged" for k in parameters]
         table.add_row(str(trial.number), *cells, format_value(trial.value))
     console.print(table)
     if len(ordered) > len(shown):
@@ -180,13 +190,8 @@ def show(swept: "SweepRecord") -> None:
     typer.echo(f"{swept.folder}: sweep.json, best.toml (for --config)")
 
 
-def _said(trial: "Trial") -> str:
-    from torchvision_dddas.evaluation.studies.sweep import format_value
-
-    parameters = (
-        ", ".join(f"{parameter}={_value(value)}" for parameter, value in trial.parameters.items()) or "as it was"
-    )
-    return f"{parameters}: {trial.cause or format_value(trial.value)}"
+def _format_point(parameters: Mapping[str, object]) -> str:
+    return ", ".join(f"{name}={_value(value)}" for name, value in parameters.items()) or "unchanged"
 
 
 def _value(value: object) -> str:
