@@ -110,7 +110,7 @@ def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
     if not set(names) <= HUES.keys():
         return list(names)
     apart = [[float(abs(hue_difference(HUES[name], hue))) for name in names] for hue in hues]
-    return [names[place] for place in linear_sum_assignment(apart)[1]]
+    return [names[place] for place in linear_sum_assignment(apart)[1].tolist()]
 
 
 def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
