@@ -35,7 +35,7 @@ def test_many_distances_and_an_outlier(dddas, file, tmp_path):
     result = dddas("calibrate", file("m.csv", text), "--body-height", 1.8, "--out", out)
     assert result.exit_code == 0, result.output
     assert "1 of 5 left out as outliers, the first 90 px at 12 m" in result.stdout
-    assert "it still lacks width_px and height_px (--size)" in result.stdout
+    assert "width_px and height_px are still missing (--size)" in result.stdout
     assert "focal_px = 1000.0" in out.read_text()
 
 

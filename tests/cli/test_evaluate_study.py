@@ -90,16 +90,16 @@ def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--jobs", "0"), "--jobs is 0; wanted 1 or more"),
-        (("--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "wanted one"),
+        (("--jobs", "0"), "--jobs must be 1 or more"),
+        (("--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "give only one"),
         (("--scheduler", "tcp://127.0.0.1:1"), "no Dask scheduler answers at tcp://127.0.0.1:1"),
         (("--scheduler", "nonsense"), "no Dask scheduler answers at nonsense"),
         (("--clips", "nobody"), "nobody fits none; there are other, table"),
         (("--clips", ""), "--clips '' names no clip"),
-        (("--interval", "1001"), "wanted a whole number of frames, 1 to 1000"),
+        (("--interval", "1001"), "--interval must be 1 to 1000 frames"),
         (("--set", "no.parameter=1"), "unknown parameter"),
         (("--first-frame", "0"), "--first-frame is of no use with --dataset"),
-        (("--interval", "0"), "interval is 0"),
+        (("--interval", "0"), "--interval must be 1 to 1000 frames, got 0"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(dddas, study, tmp_path, words, told) -> None:

@@ -67,8 +67,8 @@ def test_clips_held_out_have_no_say_and_are_told_apart(swept) -> None:
 def test_how_far_the_next_points_are_is_told_meanwhile(capsys, monkeypatch) -> None:
     sweep = import_module("torchvision_dddas.cli.sweep")
     monkeypatch.setattr(sweep, "EVERY_S", 0.0)
-    sweep._pace(False)(3, 24)
-    sweep._pace(True)(4, 24)
+    sweep._progress(False)(3, 24)
+    sweep._progress(True)(4, 24)
     assert capsys.readouterr().err == "3 of 24 clips of the next points\n"
 
 
@@ -98,15 +98,15 @@ def test_a_study_of_the_best_takes_from_the_cache_what_the_sweep_has_computed(st
     [
         ((), "nothing to try"),
         (("--range", "difference.threshold=1:9"), "--optuna"),
-        (("--optuna", "3"), "nothing to draw"),
+        (("--optuna", "3"), "nothing to propose"),
         (("--optuna", "0", "--range", "difference.threshold=1:9"), "1 to 10000"),
-        (("--optuna", "3", *GRID), "wanted one"),
+        (("--optuna", "3", *GRID), "give only one"),
         (("--grid", "difference.treshold=1"), "did you mean"),
         ((*GRID, "--holdout", "x*"), "fits no clip"),
         ((*GRID, "--holdout", "*"), "leaves no clip"),
         ((*GRID, "--by", "median"), "pooled, mean, worst"),
-        ((*GRID, "--jobs", "0"), "--jobs is 0"),
-        ((*GRID, "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "wanted one"),
+        ((*GRID, "--jobs", "0"), "--jobs must be 1 or more"),
+        ((*GRID, "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "give only one"),
         ((*GRID, "--clips", "none*"), "no clip is left"),
     ],
 )

@@ -38,7 +38,9 @@ Poses = Annotated[
     typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in the cameras' order."),
 ]
 Clips = Annotated[str | None, typer.Option(metavar="PATTERN,...", help="Only these clips, such as 'bms_*'.")]
-Jobs = Annotated[int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")]
+Jobs = Annotated[
+    int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")
+]
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler such as tcp://host:8786, instead of --jobs.")
 ]
