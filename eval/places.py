@@ -1,8 +1,7 @@
-"""Places of people on real data: distances from the ground, people as landmarks; and fusion of several vehicles.
+"""Places of people on real data: distances from the ground, people as landmarks.
 
 python eval/places.py ranging DATA      distances to people against world positions of PETS09-S2L1 and TUD-Stadtmitte
 python eval/places.py landmarks DATA    people of known place as moving landmarks, the others located
-python eval/places.py fusion            what several ground vehicles that see the same people gain; simulated
 
 DATA is a folder of MOTChallenge 2015 sequences whose gt.txt has world metres in columns 8 to 10. PETS comes with its
 camera (Tsai); that of TUD is fitted to the true feet and their world positions. The world positions of both were made
@@ -27,7 +26,6 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from torchvision_dddas.config import GroundParameters, Settings, with_parameters
 from torchvision_dddas.evaluation.metrics.boxes import iou
-from torchvision_dddas.geo.fusion import associate, estimate_places
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.plane_homography import locate_pixels
 from torchvision_dddas.geo.plane_solvers import load_solver
@@ -323,87 +321,9 @@ def locate_others(
     return np.array(far), np.array(inside)
 
 
-# -- fusion ----------------------------------------------------------------------------------------------------------
-
-PARAMETERS = GroundParameters()
-RING_M = 15.0
-
-
-def measure_fusion(options: bench.Options) -> tuple[str, Any]:
-    """Mean error of one vehicle, of equal averages, and of fusing by covariances; wrong: shares of wrong associations.
-
-    Vehicles in a ring about a crowd, 15 m off, each with a GPS of 3.5 m in 95 %, a compass of 2° and boxes as noisy as
-    the defaults say. The association is given for the errors, and counted apart.
-    """
-    rows = []
-    for vehicles, people in ((2, 1), (4, 1), (2, 6), (4, 3), (4, 6), (4, 12)):
-        rng = np.random.default_rng(7)
-        found = zip(*(fuse_scene(vehicles, people, rng) for _ in range(options.scenes)), strict=True)
-        alone, equal, fused, inside, wrong = (float(np.mean([v for part in parts for v in part])) for parts in found)
-        shares = f"{100 * inside:.1f} %", f"{100 * wrong:.1f} %"
-        rows.append([vehicles, people, *(f"{v:.2f}" for v in (alone, equal, fused)), *shares])
-    head = ["vehicles", "people", "alone, m", "averaged, m", "fused, m", "in the 95 % ellipse", "wrong"]
-    return bench.format_table(head, rows, words=0), rows
-
-
-def see_people(people: np.ndarray, tall: np.ndarray, turn: float, rng: np.random.Generator) -> Sightings:
-    """What the vehicle at that side of the crowd sees, with errors drawn from all that its camera says of itself."""
-    place, n = RING_M * np.array([np.sin(turn), np.cos(turn)]), len(people)
-    known = Camera("", (4000, 2000), (1000.0, 1000.0), (1999.5, 999.5), heading_rad=turn + np.pi, height_m=1.2)
-    true = replace(
-        known,
-        place=tuple(place + rng.normal(0, known.position_sigma_m, 2)),
-        heading_rad=known.heading_rad + rng.normal(0, known.heading_sigma_rad),
-        pitch_rad=rng.normal(0, known.pitch_sigma_rad),
-        height_m=known.height_m + rng.normal(0, known.height_sigma_m),
-        focal_px=(known.focal_px[0] * (1 + rng.normal(0, known.focal_sigma)),) * 2,
-    )
-    away = people - true.place
-    ahead = away @ [np.sin(true.heading_rad), np.cos(true.heading_rad)]
-    aside = away @ [np.cos(true.heading_rad), -np.sin(true.heading_rad)]
-
-    def row(down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        depth = ahead * np.cos(true.pitch_rad) + down * np.sin(true.pitch_rad)
-        y = (down * np.cos(true.pitch_rad) - ahead * np.sin(true.pitch_rad)) / depth
-        return aside / depth * true.focal_px[0] + 1999.5, y * true.focal_px[1] + 999.5
-
-    (u, feet), (_, head) = row(np.full(n, true.height_m)), row(true.height_m - tall)
-    height = feet - head
-    moved = [
-        rng.normal(0, np.hypot(s * height, 0.5))
-        for s in (PARAMETERS.feet_sigma, PARAMETERS.feet_sigma, PARAMETERS.height_sigma)
-    ]
-    u, feet, height = u + moved[0], feet + moved[1], height + moved[2]
-    box = np.stack([u + 0.5 - 0.2 * height, feet + 0.5 - height, 0.4 * height, height], axis=1)
-    poses = Poses(np.tile(place, (n, 1)), np.full(n, known.heading_rad), np.zeros(n))
-    return range_people(box, np.zeros(n, bool), known, poses, poses.place, PARAMETERS)
-
-
-def fuse_scene(vehicles: int, people: int, rng: np.random.Generator) -> tuple[list[float], ...]:
-    """Errors of one vehicle, of equal averages and of fusing; whether each ellipse holds; shares that are wrong."""
-    where, tall = (
-        rng.normal(0, 4, (people, 2)),
-        PARAMETERS.body_height_m + rng.normal(0, PARAMETERS.body_height_sigma_m, people),
-    )
-    team = [see_people(where, tall, 2 * np.pi * v / vehicles + rng.normal(0, 0.3), rng) for v in range(vehicles)]
-    team = [seen for seen in team if (seen.by != "bearing").all()]
-    fused, joint, _ = estimate_places(team, np.tile(np.arange(people)[:, None], len(team)))
-    own, off = joint[np.arange(people), :, np.arange(people)], fused - where
-    inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(own), off) < 5.991
-    groups = [row[row >= 0] for row in associate(team)]
-    return (
-        np.concatenate([np.linalg.norm(seen.east_north_m - where, axis=1) for seen in team]).tolist(),
-        np.linalg.norm(np.mean([seen.east_north_m for seen in team], axis=0) - where, axis=1).tolist(),
-        np.linalg.norm(off, axis=1).tolist(),
-        inside.tolist(),
-        [sum(len(g) - np.bincount(g).max() for g in groups) / sum(len(g) for g in groups)],
-    )
-
-
 if __name__ == "__main__":
     studies = {
         "ranging": (measure_ranging, {"data": Path}),
         "landmarks": (measure_landmarks, {"data": Path, "--seeds": 10, "--every": 1}),
-        "fusion": (measure_fusion, {"--scenes": 200}),
     }
     bench.main(__doc__, studies)
