@@ -10,7 +10,7 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
-from torchvision_dddas.evaluation.studies.jobs import FrameCounter, Job, do_job, find_cached, make_keys
+from torchvision_dddas.evaluation.studies.jobs import Job, do_job, find_cached, make_keys
 from torchvision_dddas.evaluation.studies.spec import Source, Task
 from torchvision_dddas.evaluation.studies.storage import Cache
 
@@ -120,13 +120,3 @@ def test_a_fault_of_the_program_is_a_cause_with_its_trace(folder, tmp_path, monk
     monkeypatch.setattr(jobs, "find", broken)
     done = do(tmp_path, job_of(folder))
     assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
-
-
-def test_frames_are_told_in_groups_and_all_of_them(monkeypatch) -> None:
-    told: list[int] = []
-    counter = FrameCounter(told.append)
-    for _ in range(5):
-        counter()
-    counter.flush()
-    counter.flush()
-    assert told == [5]

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.pixels import Pixels
-from torchvision_dddas.evaluation.studies.results import Found, Scored
+from torchvision_dddas.evaluation.studies.results import Found
 from torchvision_dddas.evaluation.studies.storage import Cache, CarriedRecords, DamagedError, digest, pack, unpack
 
 KEY = "ab" + "0" * 62
@@ -44,11 +43,6 @@ def test_a_result_comes_back_to_the_last_digit() -> None:
         assert again.dtype == there.dtype and again.tobytes() == there.tobytes()
     assert back.masks == FOUND.masks and back.seconds == FOUND.seconds and back.notes == FOUND.notes
     assert (back.steps[4] == FOUND.steps[4]).all()
-
-
-def test_counts_come_back_as_the_kind_that_they_were() -> None:
-    back = unpack(pack(Scored(np.array([1]), {"pixels": Pixels(1, 2, 3, 4)}, {"pixels": {"tp": np.array([np.nan])}})))
-    assert type(back.counts["pixels"]) is Pixels and back.counts["pixels"] == Pixels(1, 2, 3, 4)
 
 
 @given(st.integers(0, len(WHOLE) - 1), st.integers(0, 255))

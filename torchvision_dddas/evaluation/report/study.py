@@ -23,7 +23,7 @@ from torchvision_dddas.evaluation.report.measures import (
     shown,
 )
 from torchvision_dddas.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
-from torchvision_dddas.evaluation.report.worst_frames import Worst, drawn, worst_frames
+from torchvision_dddas.evaluation.report.worst_frames import Worst, draw_pictures, find_worst_frames
 from torchvision_dddas.evaluation.studies.results import Case, Results
 from torchvision_dddas.evaluation.studies.spec import TASKS, Task
 from torchvision_dddas.evaluation.studies.summary import sum_costs
@@ -83,7 +83,7 @@ def _task(task: Task, figures: TaskFigures, cases: Sequence[Case]) -> dict[str, 
         plot, more = measure_plot(figures, group)
         note = f"the worst {len(figures.clips) - more}; {more} better ones are in the table" if more else ""
         plots += [(plot, note)] if plot else []
-    worst, n_other_faults = worst_frames(cases)
+    worst, n_other_faults = find_worst_frames(cases)
     courses = course_charts(sorted(cases, key=lambda case: _rank(case, worst)))
     return {
         "id": task,
@@ -94,7 +94,7 @@ def _task(task: Task, figures: TaskFigures, cases: Sequence[Case]) -> dict[str, 
         "n_left_out": sum(case.cause != "" for case in cases),
         "plots": [*plots, *ranked_charts(cases)],
         "tables": [(_capital(GROUPS.get(group, group)), measure_table(figures, group, frames)) for group in groups],
-        "worst": drawn(worst),
+        "worst": draw_pictures(worst),
         "n_other_faults": n_other_faults,
         "courses": courses,
         "n_courses_left_out": len(frames) - len(courses),

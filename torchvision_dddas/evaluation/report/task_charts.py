@@ -29,7 +29,7 @@ class Tally(NamedTuple):
 
 
 def main_group(scored: Scored) -> str | None:
-    """The group that tells most of where a clip goes wrong."""
+    """The group that shows best where a clip goes wrong."""
     return next((group for group in _GROUPS if group in scored.per_frame), None)
 
 
@@ -50,7 +50,7 @@ def tally(scored: Scored, group: str) -> Tally:
 
 
 MOST_CLIPS = 6
-"""Clips whose course is drawn."""
+"""Clips whose accuracy over the frames is drawn."""
 MOST_FAINT = 40
 """Curves of single clips behind that of all."""
 _BINS = 80
@@ -68,19 +68,19 @@ def ranked_charts(cases: Sequence[Case]) -> list[str]:
         if not each:
             continue
         exact, missing = [], []
-        shown = each[:MOST_FAINT]
-        several = "each clip" if len(shown) == len(each) else f"{len(shown)} of {len(each)} clips"
-        for k, (name, scored) in enumerate([*shown, (_ALL, None)] if len(each) > 1 else each):
+        some = each[:MOST_FAINT]
+        several = "each clip" if len(some) == len(each) else f"{len(some)} of {len(each)} clips"
+        for k, (name, scored) in enumerate([*some, (_ALL, None)] if len(each) > 1 else each):
             whole = scored is None or len(each) == 1
             taken = [one for _, one in each] if scored is None else [scored]
-            said = name if whole else several if k == 0 else ""
+            label = name if whole else several if k == 0 else ""
             colour = 1 if whole else 6
             precision, recall, false = _rates(taken, group)
             # Both curves go on to where nothing is found, and the second to where no more can be had.
             start, end = precision[:1], recall[-1:]
-            exact.append(Line(said, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, not whole))
+            exact.append(Line(label, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, not whole))
             ways = np.r_[_LEAST, np.maximum(false, _LEAST), _MOST], 1 - np.r_[0.0, recall, end if len(end) else 0.0]
-            missing.append(Line(said, *ways, colour, not whole, steps=True))
+            missing.append(Line(label, *ways, colour, not whole, steps=True))
         up, misses = Axis("precision", 0, 1), Axis("miss rate", 0, 1)
         across = Axis("false positives an image", _LEAST, _MOST, log=True)
         charts.append(chart("Precision and recall", Axis("recall", 0, 1), up, exact))
@@ -89,7 +89,7 @@ def ranked_charts(cases: Sequence[Case]) -> list[str]:
 
 
 def course_charts(cases: Sequence[Case]) -> list[str]:
-    """How right each clip is as it goes on, of the first MOST_CLIPS that have any course."""
+    """The accuracy over the frames of each of the first MOST_CLIPS clips that have it."""
     charts: list[str] = []
     for case in cases:
         if case.scored is None or len(charts) == MOST_CLIPS:

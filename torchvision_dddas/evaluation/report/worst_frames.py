@@ -25,7 +25,7 @@ FALSE: Colour = (0, 94, 213)
 TRUE: Colour = (66, 228, 240)
 """Sky blue, vermilion and yellow of Okabe and Ito, in blue, green, red. True is also what was missed."""
 UNSCORED: Colour = (150, 150, 150)
-MOST_WIDE, MOST_HIGH = 560, 420
+MAX_WIDTH, MAX_HEIGHT = 560, 420
 """Pixels of a picture on the page; a smaller one is enlarged up to three times."""
 _QUALITY = 80
 _SMALL, _RING = 4, 6  # px of a picture on the page
@@ -42,7 +42,7 @@ class Boxes(NamedTuple):
     """The boxes of a frame: (N, 4) true and (M, 4) found in px, what stands beside each, and which are right.
 
     of_found: (M,) the true box that each found one is, -1 for none. marked: (M,) those with a change of identity.
-    judged: (M,) those that count: where targets may be unlabelled, nobody knows what a box is.
+    judged: (M,) those that count: where targets may be unlabelled, other boxes are neither right nor false.
     """
 
     true_px: np.ndarray
@@ -97,7 +97,7 @@ def box_pair(picture: np.ndarray | None, size_px: tuple[int, int], boxes: Boxes)
 
 
 def matched(found_px: np.ndarray, true_px: np.ndarray, overlap: np.ndarray, least: float = 0.5) -> np.ndarray:
-    """(M,) the true box of each found one, -1 for none: each true box in turn takes the best left, as is counted.
+    """(M,) the true box of each found one, -1 for none: each true box in turn takes the best left, as in the counts.
 
     overlap: (N, M), the IoU of true and found boxes.
     """
@@ -111,7 +111,7 @@ def matched(found_px: np.ndarray, true_px: np.ndarray, overlap: np.ndarray, leas
 
 
 def _scale(width: int, height: int) -> float:
-    return min(MOST_WIDE / width, MOST_HIGH / height, 3.0)
+    return min(MAX_WIDTH / width, MAX_HEIGHT / height, 3.0)
 
 
 def _resized(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -131,13 +131,13 @@ def _tint(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: 
 
 
 def _outline(picture: np.ndarray, area: np.ndarray, size: tuple[int, int], colour: Colour, thick: int = 1) -> None:
-    """Lines around what is there."""
+    """Lines around areas."""
     drawn = [drawable(contour) for contour in _contours(area, size)]
     cv2.polylines(picture, drawn, True, colour, thick, cv2.LINE_AA)
 
 
 def _rings(picture: np.ndarray, true: np.ndarray, found: np.ndarray, size: tuple[int, int]) -> None:
-    """A ring around what stands alone and is so small in a reduced picture that nobody would see it."""
+    """A ring around each single area that is too small to see in the reduced picture."""
     share = np.array([size[0] / true.shape[1], size[1] / true.shape[0]])
     for contour in _contours(true | found, size):
         low, high = contour.min(axis=(0, 1)), contour.max(axis=(0, 1))
@@ -182,9 +182,9 @@ def _jpeg(picture: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", picture, how)[1].tobytes()
 
 
-MOST = 8
-"""Pictures of a task that the page shows."""
-_OF_A_CLIP = 3
+MAX_PICTURES = 8
+"""Pictures of a task on the page."""
+_MAX_OF_A_CLIP = 3
 
 
 @dataclass(frozen=True)
@@ -199,9 +199,9 @@ class Worst:
     trouble: str = ""
 
 
-def worst_frames(cases: Sequence[Case], most: int = MOST) -> tuple[list[Worst], int]:
-    """The frames that went worst, of many clips rather than of one, and in how many others something is wrong too."""
-    by_rank: list[list[Worst]] = [[] for _ in range(_OF_A_CLIP)]
+def find_worst_frames(cases: Sequence[Case], most: int = MAX_PICTURES) -> tuple[list[Worst], int]:
+    """The frames with the most faults, of many clips rather than of one, and the number of other frames with faults."""
+    by_rank: list[list[Worst]] = [[] for _ in range(_MAX_OF_A_CLIP)]
     total = 0
     for case in cases:
         chosen, wrong = _of_case(case)
@@ -213,8 +213,8 @@ def worst_frames(cases: Sequence[Case], most: int = MOST) -> tuple[list[Worst], 
     return shown, total - len(shown)
 
 
-def drawn(chosen: Sequence[Worst]) -> list[Worst]:
-    """The same with their pictures; the pictures of a clip are read once, in order."""
+def draw_pictures(chosen: Sequence[Worst]) -> list[Worst]:
+    """The same frames with their pictures; the pictures of a clip are read once, in order."""
     pairs: dict[int, Worst] = {}
     for name in dict.fromkeys(id(one.case) for one in chosen):
         mine = sorted((one for one in chosen if id(one.case) == name), key=lambda one: one.frame)
@@ -230,7 +230,7 @@ def drawn(chosen: Sequence[Worst]) -> list[Worst]:
 
 
 def _of_case(case: Case) -> tuple[list[Worst], int]:
-    """The worst frames of a clip, some way from each other, and in how many frames anything is wrong."""
+    """The worst frames of a clip, a tenth of its length apart, and the number of frames with faults."""
     scored = case.scored
     group = main_group(scored) if scored is not None else None
     if scored is None or group is None or case.found is None or not len(scored.frames):
@@ -244,14 +244,14 @@ def _of_case(case: Case) -> tuple[list[Worst], int]:
     apart = max(1.0, (scored.frames[-1] - scored.frames[0]) / 10)
     for k in np.argsort(-wrong, kind="stable").tolist():
         frame = int(scored.frames[k])
-        if wrong[k] <= 0 or len(chosen) == _OF_A_CLIP:
+        if wrong[k] <= 0 or len(chosen) == _MAX_OF_A_CLIP:
             break
         if all(abs(frame - one.frame) >= apart for one in chosen):
-            chosen.append(Worst(case, frame, float(wrong[k]), _said(counts, k)))
+            chosen.append(Worst(case, frame, float(wrong[k]), _describe(counts, k)))
     return chosen, int((wrong > 0).sum())
 
 
-def _said(counts: Tally, k: int) -> str:
+def _describe(counts: Tally, k: int) -> str:
     right, false, missed, switched = (float(x[k]) for x in counts[:4])
     named = ((right, "right"), (false, "false"), (missed, "missed"))
     found = f"{counts.unit}: " + ", ".join(f"{format_number(int(n))} {what}" for n, what in named)
@@ -303,15 +303,15 @@ def _with_pair(one: Worst, picture: np.ndarray | None) -> Worst:
 def boxes_at(case: Case, frame: int) -> Boxes:
     """The boxes of a frame, with identities where the task is about them, and which of these changed since last seen.
 
-    In a still clip all are false; where one target is labelled, of the others nobody knows.
+    In a still clip all are false; where one target is labelled, other boxes are not judged.
     """
     found, truth = case.found, case.clip.truth
     assert found is not None
     rows = np.flatnonzero(found.frame == frame)
-    found_px, nobody = found.box_px[rows], np.zeros((0, 4))
+    found_px, no_boxes = found.box_px[rows], np.zeros((0, 4))
     if truth is None:
         none = np.zeros(len(rows), bool)
-        return Boxes(nobody, found_px, np.full(len(rows), -1), [], [""] * len(rows), none, ~none)
+        return Boxes(no_boxes, found_px, np.full(len(rows), -1), [], [""] * len(rows), none, ~none)
     table = truth.tracks if case.task in ("tracking", "association") else None
     true_px, true_id = _true(table, truth.boxes, frame)
     of_found = matched(found_px, true_px, iou(true_px, found_px), 0.3 if truth.kind == "one target" else 0.5)
@@ -341,7 +341,7 @@ def _true(table: TrackTable | None, boxes: Mapping[int, np.ndarray], frame: int)
 
 
 def _last_identity(found: Found, table: TrackTable, identity: int, frame: int) -> int | None:
-    """What a target was last found as before a frame, None if it was not yet."""
+    """The identity of a target when it was last found before a frame; None if it was not."""
     mine = (table.identity == identity) & (table.frame < frame)
     for row in np.flatnonzero(mine)[np.argsort(-table.frame[mine], kind="stable")].tolist():
         there = np.flatnonzero(found.frame == table.frame[row])

@@ -81,7 +81,8 @@ class Workers:
     def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
         """Do jobs in the order given; report each one's progress and outcome. Results are in the cache afterwards.
 
-        Results do not depend on the number of workers. Raises InputError if no worker can do them.
+        Results do not depend on the number of workers, but for the last digits where BLAS runs on several threads in
+        this process. Raises InputError if no worker can do them.
         """
         if self._scheduler is None and self._jobs == 1:
             for job, keys in jobs:
