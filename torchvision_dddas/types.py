@@ -27,18 +27,18 @@ class Table:
     """A record whose arrays have one row an item each: rows can be selected, and tables of one kind joined."""
 
     def __getitem__(self, rows: np.ndarray | slice) -> Self:
-        """The rows with the given numbers, mask or slice. What is no array stays as it is."""
+        """The selected rows (indices, mask or slice); fields that are not arrays are kept."""
         return replace(self, **{name: column[rows] for name, column in _columns(self).items()})  # type: ignore[type-var]
 
     @classmethod
     def concat(cls, tables: Sequence[Self]) -> Self:
-        """One table of the rows of all. What is no array is taken from the first."""
+        """All rows in one table; fields that are not arrays come from the first."""
         columns = [_columns(table) for table in tables]
         joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
     def to_columns(self) -> dict[str, np.ndarray]:
-        """One array (N,) a column: an array (N, 2) or more is split, as box_px into x_px, y_px, width_px, height_px."""
+        """Arrays (N,) by column name; wider arrays are split: box_px into x_px, y_px, width_px, height_px."""
         columns: dict[str, np.ndarray] = {}
         for name, values in _columns(self).items():
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
@@ -98,9 +98,8 @@ class Frame:
     """One picture of a clip.
 
     number: 1-based position in the clip. time_s: seconds since the clip's first frame.
-    image: uint8, (H, W) grey or (H, W, 3) in OpenCV's BGR order.
-    skipped: how many frames just before it were left out on purpose: they are not missing.
-    taken_s: by the monotonic clock of this machine, when a camera gave it; NaN for a recording.
+    image: uint8, (H, W) grey or (H, W, 3) BGR. skipped: frames before it that were left out on purpose.
+    taken_s: capture time by the monotonic clock; NaN for a recording.
     """
 
     number: int
@@ -112,7 +111,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault that reading a clip survived: the 1-based number of the first frame it touches, and what it was."""
+    """A recoverable fault while reading a clip: the first affected frame, 1-based, and a description."""
 
     frame: int
     what: str
@@ -124,11 +123,10 @@ class Problem:
 class Source(Protocol):
     """A clip that is read frame by frame.
 
-    Iterating yields frames in order, numbered from 1. A frame that cannot be decoded is left out.
-    name: for messages. count: announced frames, None where unknown, as for a live stream. exact: whether the count is
-    more than a guess from the duration. rate_hz: frames a second. size: (width, height) of every frame, px. last: the
-    number of the last frame read; once the clip was read to its end, of the last frame in it, decoded or not. problems:
-    filled while reading; each new iteration starts at frame 1 and empties it.
+    Iterating yields frames in order, numbered from 1, without those that cannot be decoded.
+    count: announced frames, None if unknown. exact: whether the count is reliable. size: (width, height), px.
+    last: the last frame read; after the end of the clip its last frame, decoded or not.
+    problems: filled while reading; each new iteration starts at frame 1 and clears it.
     """
 
     @property
@@ -164,15 +162,13 @@ def is_sampled(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the vehicle reports of itself, one row a sample, sorted by time; NaN where it does not say.
+    """The vehicle's own reports, one row per sample, sorted by time; NaN where unknown. Arrays are (N,).
 
-    time_s: (N,) float64 since the clip's first frame. altitude_m: (N,) above ground. speed_m_s: (N,) over ground.
+    time_s: since the clip's first frame. altitude_m: above ground. speed_m_s: over ground.
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
-    above_sea_m: (N,). heading_rad, pitch_rad, roll_rad: (N,) how the camera looks, as in Camera; straight down is a
-    pitch of pi/2, where the heading is that of the picture's upper edge. hfov_rad: (N,) width of its field of view.
-    vehicle_heading_rad: (N,) of the vehicle's nose, which need not be the camera's.
-    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known. origin: what it was read from.
-    notes: what the user should know of it: what was cut off, left out, or derived.
+    heading_rad, pitch_rad, roll_rad: of the camera, as in Camera; straight down the pitch is pi/2 and the heading that
+    of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
+    start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
     """
 
     time_s: np.ndarray
@@ -201,10 +197,10 @@ class Telemetry:
         return len(self.time_s)
 
     def at(self, time_s: float, tolerance_s: float = 1.0) -> "Flight | None":
-        """The flight at a time, linear between samples, angles and longitudes the short way round.
+        """The state at a time by linear interpolation, angles and longitudes the short way round.
 
-        A field is NaN where either neighbouring sample does not say it. Up to tolerance_s outside the span the nearest
-        sample holds; beyond that nothing is known: None.
+        A field is NaN if it is in either neighbour. Up to tolerance_s outside the span the nearest sample is used;
+        beyond that the result is None.
         """
         times, time_s = self.time_s, float(time_s)
         count = len(times)
@@ -269,7 +265,7 @@ COLUMNS_OF_TELEMETRY = (
 
 @dataclass(frozen=True)
 class Flight:
-    """What the telemetry says at one moment; the fields as in Telemetry, NaN where it does not say."""
+    """Telemetry at one moment; fields as in Telemetry, NaN where unknown."""
 
     altitude_m: float
     speed_m_s: float = float("nan")
@@ -284,12 +280,11 @@ class Flight:
 
 @dataclass(frozen=True)
 class Registration:
-    """How the background moved between a frame and a later one.
+    """The background's motion from one frame to a later one.
 
     later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
-    tracked, inliers: keypoints tracked and those that agree with the homography.
-    error_px: median distance of the inliers from it. flow_px: median background displacement over the image.
-    reliable: whether anything may be concluded from it; otherwise `cause` says in words why not.
+    tracked, inliers: numbers of keypoints tracked, and of those that fit the homography.
+    error_px: median error of the inliers. flow_px: median background displacement. cause: why it is not reliable.
     """
 
     later_from_earlier: np.ndarray
@@ -303,13 +298,12 @@ class Registration:
 
 @dataclass(frozen=True)
 class Detections(Boxes):
-    """The moving targets of one frame, one row a target.
+    """The targets detected in one frame, one row per target; row i has value i + 1 in the frame's mask.
 
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
-    area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion over the ground, image axes
-    (0 = right, pi/2 = down). speed_px: (N,) pixels a frame relative to the background. Both NaN when unknown.
-    kind: what it was found to be. Row i has value i + 1 in the frame's mask. middle_px: (N, 2) u, v of the mean of the
-    foreground pixels; NaN where it is not known.
+    area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
+    (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
+    middle_px: (N, 2) u, v of the foreground's centroid. Unknown values are NaN.
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -355,13 +349,12 @@ _STRAYS, _ENOUGH_ROWS = 3, 30
 
 @dataclass(frozen=True)
 class DetectionTable:
-    """Boxes by frame, sorted by frame; rows of one frame keep the file's order.
+    """Boxes of a clip, sorted by frame; rows of one frame keep the file's order.
 
-    frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, 1 where none was.
-    line: (N,) int64, where the row stands in the file, from 1. own: whether `dddas detect` says that all were moving.
-    identity: (N,) int64 from 1, -1 for a row without one. cut: (N,) bool, whether the picture's border cuts the target;
-    None where the table does not say. feet_px: (N, 2) u, v of the point between the feet, likewise.
-    ours: whether `dddas detect` or `dddas track` wrote it: its boxes are about whole bodies.
+    frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, else 1.
+    line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
+    cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
+    own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
     """
 
     path: str
@@ -395,18 +388,15 @@ class DetectionTable:
 
     @property
     def certain(self) -> bool:
-        """Whether every row is as good as certain: scores are on another scale, or grade the contrast of own targets.
-
-        An own target was confirmed over several frames before it was written, however faint it is.
-        """
+        """Whether every row counts as certain: own targets, confirmed over frames, or scores of another scale."""
         return self.own or not self.probable
 
     @cached_property
     def extent(self) -> tuple[float, float] | None:
-        """(width, height) that holds nearly all boxes, the best guess at the picture's size; None with too few rows.
+        """(width, height) estimated from the boxes; None with too few rows.
 
-        The farthest right and bottom edge but _STRAYS: one stray row would move the border, and with it what counts as
-        leaving the picture, for all. Rows that are likelier false than true (score below 0.5) have no say.
+        The right and bottom edges without the _STRAYS farthest, so that a stray box does not move the picture's border.
+        Rows with a score below 0.5 are ignored.
         """
         likely = self.box_px if self.certain else self.box_px[self.score >= 0.5]
         if len(likely) < _ENOUGH_ROWS:
@@ -420,9 +410,9 @@ class DetectionTable:
 
     @cached_property
     def targets(self) -> np.ndarray:
-        """(N,) int64, the identity of each row; where it has none, its place in the frame, after those of the table.
+        """(N,) int64 identity of each row; rows without one are numbered within the frame, above all identities.
 
-        Raises InputError where a frame has one identity twice.
+        Raises InputError if a frame has an identity twice.
         """
         identity = self.identity if self.identity is not None else np.full(len(self), -1)
         order = np.lexsort((self.line, identity, self.frame))
@@ -447,7 +437,7 @@ class DetectionTable:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A parameter that the feedback loop moved at a frame, and why, so that a run can be explained afterwards."""
+    """A parameter changed by feedback at a frame, and the reason."""
 
     frame: int
     parameter: str
@@ -458,9 +448,9 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class LinearSvm:
-    """What tells a person from anything else: score = weights . descriptor + bias.
+    """A person classifier: score = weights . descriptor + bias.
 
-    weights: (F,) float32 in OpenCV's order: blocks and cells column by column, bins fastest. origin: whence they are.
+    weights: (F,) float32 in OpenCV's order: blocks and cells column by column, bins fastest. origin: file or name.
     """
 
     weights: np.ndarray
@@ -470,10 +460,9 @@ class LinearSvm:
 
 @dataclass(frozen=True)
 class Part:
-    """A rectangle of a level of the pyramid, in pixels of that level: the windows that lie in it are scored.
+    """A rectangle of a pyramid level whose windows are scored, in that level's pixels.
 
-    level: (width, height) that the picture is resized to. x, y: of the top left pixel, multiples of the window stride
-    from -padding on. width, height: of the part.
+    level: (width, height) of the resized picture. x, y: top left pixel, multiples of the window stride from -padding.
     """
 
     level: tuple[int, int]
@@ -485,11 +474,11 @@ class Part:
 
 @dataclass(frozen=True)
 class People(Table):
-    """The people recognized in one frame, one row a person.
+    """The people recognized in one frame, one row per person.
 
-    box_px: (N, 4) float64, the body: x, y of the top left pixel, width, height. score: (N,) probability in [0, 1].
-    margin: (N,) the classifier's own score. cut: (N,) bool, the picture's border cuts the body: its height is not to be
-    trusted. window_px: (N, 4) the window that was recognized; it has a margin around the body.
+    box_px: (N, 4) float64 of the body: x, y of the top left pixel, width, height. score: (N,) probability.
+    margin: (N,) the classifier's score. cut: (N,) bool, the border cuts the body: its height is unreliable.
+    window_px: (N, 4) the classifier's window around the body.
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -509,12 +498,10 @@ class People(Table):
 
 @dataclass(frozen=True)
 class PeopleFrame:
-    """All that is known of one frame after it was searched for people.
+    """The result of searching one frame for people.
 
-    frame: the picture. people: whom it shows. regions_px: (R, 4) where it was searched, beside the levels of the
-    pyramid whose turn it was; None: everywhere.
-    share: windows scored, as a share of all that a search everywhere scores.
-    cause: why nothing could be concluded; empty where all is well. adjustments, seconds: as in Scene.
+    regions_px: (R, 4) the regions searched in addition to the scheduled pyramid levels; None: the whole picture.
+    share: windows scored, relative to a full search. cause: why there is no result. adjustments, seconds: as in Scene.
     """
 
     frame: Frame
@@ -528,13 +515,12 @@ class PeopleFrame:
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that looks at the ground from a height, and how well that is known; sigma: one standard deviation.
+    """A camera above the ground, with standard deviations (sigma).
 
-    size_px: (width, height). focal_px: along u and v. centre_px: u, v of the optical axis. k1, k2: radial distortion
-    as OpenCV has it. roll_rad: turned clockwise, seen from behind. height_m: above the ground; NaN where unknown.
-    place: its point on the ground: longitude and latitude in degrees if geographic, else local metres east and north.
-    heading_rad: clockwise from true north. pitch_rad: how far the optical axis points below the horizon.
-    focal_sigma: as a share of the focal length. position_sigma_m: of the place, along east and along north each.
+    size_px: (width, height). focal_px: along u and v. centre_px: u, v of the optical axis. k1, k2: OpenCV's radial
+    distortion. place: longitude and latitude in degrees if geographic, else local metres east and north.
+    heading_rad: clockwise from true north. pitch_rad: below the horizon. roll_rad: clockwise, seen from behind.
+    height_m: above ground, NaN if unknown. focal_sigma: relative. position_sigma_m: east and north each.
     """
 
     name: str
@@ -558,10 +544,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Poses(Table):
-    """Where a camera stood and looked, one row a picture or a sighting; the angles as in Camera.
-
-    place: (N, 2), in the camera's own kind. heading_rad, pitch_rad: (N,).
-    """
+    """Poses of a camera, one row per picture or sighting: place (N, 2), heading_rad and pitch_rad (N,) as in Camera."""
 
     place: np.ndarray
     heading_rad: np.ndarray
@@ -570,10 +553,10 @@ class Poses(Table):
 
 @dataclass(frozen=True)
 class PoseTable:
-    """What a CSV says of a camera at some frames or times, sorted. at: (N,) frames, or seconds if timed.
+    """A camera's poses from a CSV, sorted. at: (N,) frames, or seconds if timed.
 
-    values: column -> (N,), heading_deg, pitch_deg and a place in longitude_deg,
-    latitude_deg or east_m, north_m; a column that is not there stays as the camera's own file has it.
+    values: arrays (N,) by column: heading_deg, pitch_deg, longitude_deg and latitude_deg or east_m and north_m; the
+    camera file's values hold for columns that are not there.
     """
 
     path: str
@@ -584,14 +567,13 @@ class PoseTable:
 
 @dataclass(frozen=True)
 class Sightings(Table):
-    """People as cameras on the ground saw them, one row a person in a picture; metres are local.
+    """People seen by ground cameras, one row per person and picture, in local metres.
 
-    east_north_m: (N, 2), NaN where no distance is known. distance_m: (N,) over the ground. bearing_rad: (N,) clockwise
-    from north. by: (N,) what told the distance: both, height, feet; or bearing, where nothing did.
-    The errors are split by whom they are common to: own_m2 (N, 2, 2) is the covariance of what is new in each sighting;
-    body_m (N, 2) the deviation by one sigma of the person's height, common to all that see the person; camera_m
-    (N, 2, 6) those by one sigma of the camera's east, north, heading, pitch, height and focal length, common to all
-    that the camera sees.
+    east_north_m: (N, 2), NaN if the distance is unknown. distance_m: (N,) over ground. bearing_rad: (N,) clockwise
+    from north. by: (N,) source of the distance: both, height, feet, or bearing (none).
+    The error has three parts: own_m2 (N, 2, 2), the covariance of independent errors; body_m (N, 2), the effect of one
+    sigma of body height, common to all sightings of a person; camera_m (N, 2, 6), the effect of one sigma of the
+    camera's east, north, heading, pitch, height and focal length, common to all sightings by a camera.
     """
 
     east_north_m: np.ndarray
@@ -614,13 +596,12 @@ class Sightings(Table):
 
 @dataclass(frozen=True)
 class Landmarks(Table):
-    """What is known of landmarks, ground vehicles of known place: one row a report, sorted by frame.
+    """Reports of landmarks (ground vehicles that report their position), one row per report, sorted by frame.
 
-    frame: (N,) float64 from 1; a report between two pictures has a broken number. landmark: (N,) int64, which of the
-    names. image_px: (N, 2) u, v from the first pixel's centre; NaN where the row says no place in a picture.
-    place: (N, 2), longitude and latitude in degrees if geographic, else local metres east and north; NaN in a dropout.
-    sigma_m: (N,) standard deviation of the place along east and along north each, NaN where the row does not say.
-    planned: (N,) bool, a waypoint that the vehicle means to pass, not a report. line: (N,) int64, in the file.
+    frame: (N,) float64 from 1, fractional between two pictures. landmark: (N,) int64, index into names.
+    image_px: (N, 2) u, v from the first pixel's centre, or NaN. place: (N, 2) longitude and latitude in degrees if
+    geographic, else local metres east and north; NaN in a dropout. sigma_m: (N,) per axis, or NaN.
+    planned: (N,) bool, a planned waypoint instead of a report. line: (N,) int64, in the file.
     """
 
     names: tuple[str, ...]
@@ -640,11 +621,10 @@ class Landmarks(Table):
 
 @dataclass(frozen=True)
 class LandmarkObservations(Table):
-    """The landmarks of one frame, one row each.
+    """The landmarks of one frame, one row each; NaN where unseen or unknown.
 
-    landmark: (n,) int64, which of the names. image_px: (n, 2), NaN where the picture does not show it.
-    east_north_m: (n, 2) local metres, NaN where unknown. sigma_m: (n,) of the place, along east and along north each.
-    pixel_sigma: (n,) of u and of v each. up_m: (n,) of the point seen, above the local plane.
+    landmark: (n,) int64, index into the names. image_px: (n, 2). east_north_m: (n, 2) local metres.
+    sigma_m, pixel_sigma: (n,) standard deviations per axis. up_m: (n,) height of the seen point above the local plane.
     """
 
     landmark: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -660,10 +640,10 @@ class LandmarkObservations(Table):
 
 @dataclass(frozen=True)
 class Colours:
-    """The colours that landmarks wear, one row a landmark: ranges of hue, saturation and value, ends included.
+    """Colours of the landmarks: inclusive ranges of hue, saturation and value.
 
-    low, high: (K, 3) int64 in OpenCV's units, hue 0 to 180 and the others 0 to 255; a range whose lowest hue is above
-    its highest goes over 0.
+    low, high: (K, 3) int64, hue 0 to 180, others 0 to 255 as in OpenCV; if the low hue exceeds the high one, the range
+    wraps around 0.
     """
 
     names: tuple[str, ...]
@@ -676,10 +656,10 @@ class Colours:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where a camera is and how it looks.
+    """Position and orientation of a camera.
 
-    place_m: (3,) east, north, up in local metres. axes: (3, 3), its columns are the camera's right, down and forward
-    in east, north, up. focal: its focal length as a share of what the Camera says.
+    place_m: (3,) east, north, up in local metres. axes: (3, 3), columns right, down and forward of the camera in east,
+    north, up. focal: focal length relative to the Camera's.
     """
 
     place_m: np.ndarray
@@ -688,7 +668,7 @@ class CameraPose:
 
     @property
     def angles_rad(self) -> tuple[float, float, float]:
-        """Heading in [0, 2 pi), pitch, roll, as in Camera; straight up or down all that turns is the heading."""
+        """Heading in [0, 2 pi), pitch and roll as in Camera; straight up or down the roll is 0."""
         right, down, forward = np.asarray(self.axes, float).T
         level = float(np.hypot(forward[0], forward[1]))
         pitch = float(np.arctan2(-forward[2], level))
@@ -701,16 +681,15 @@ class CameraPose:
 
 @dataclass(frozen=True)
 class Fix:
-    """How the picture of one frame lies on the ground, and how well that is known.
+    """The georeference of one frame, with its uncertainty.
 
-    by: what told it: pose, homography, paper, telemetry (no landmark could be used), or "" (nothing: see cause).
+    by: its source: pose, homography, paper, telemetry (no usable landmark), or "" (none: see cause).
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
-    image_from_ground: (3, 3) from local metres to the picture of a lens without distortion (paper: as it is), where
-    there is no pose. matrix_covariance: (8, 8) of the first eight elements, h33 = 1, of the same on metres from
-    about_m, the landmarks' middle: from afar rounding would swallow it.
-    landmark: (n,) which were seen; state: for each used, reassigned, excluded.
-    chi2, freedom: of the landmarks against what was expected of them; NaN and 0 where nothing was expected.
-    changes: what was repaired or excluded and why, in words. cause: why nothing could be concluded, or how little.
+    image_from_ground: (3, 3) from local metres to undistorted pixels (paper: distorted), if there is no pose.
+    matrix_covariance: (8, 8) of its first eight elements (h33 = 1) in metres from about_m, the landmarks' centre, for
+    numerical precision. landmark: (n,) those seen; state of each: used, reassigned or excluded.
+    chi2, freedom: consistency of the landmarks with the prediction; NaN and 0 without one.
+    changes: what was repaired or excluded, and why. cause: why there is no or only a weak result.
     """
 
     frame: int
@@ -729,16 +708,16 @@ class Fix:
 
     @property
     def is_used(self) -> tuple[bool, ...]:
-        """Of each landmark seen, whether it took part in locating the frame."""
+        """Whether each landmark seen was used."""
         return tuple(state in ("used", "reassigned") for state in self.state)
 
 
 @dataclass(frozen=True)
 class Elevation:
-    """Heights of the ground on a grid of local metres.
+    """Terrain heights on a grid in local metres.
 
     up_m: (R, C) above the local plane, rows to the north, columns to the east; NaN where unknown. corner_m: east and
-    north of the first. step_m: from one to the next. base_m: what the raster says where up is 0.
+    north of the first cell. step_m: cell size. base_m: the raster's height where up is 0.
     """
 
     up_m: np.ndarray
@@ -749,12 +728,11 @@ class Elevation:
 
 @dataclass(frozen=True)
 class Positions(Table):
-    """Where targets stand on the ground, one row a sighting, sorted by frame.
+    """Positions of targets on the ground, one row per sighting, sorted by frame.
 
-    frame: (N,) int64 from 1. target: (N,) int64, the identity where there is one, else the row in its frame, from 1.
+    frame: (N,) int64 from 1. target: (N,) int64, the identity, else the row within the frame, from 1.
     east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN where unknown. score: (N,) in [0, 1].
-    origin_deg: (longitude, latitude) of east = north = 0 on the WGS84 ellipsoid; None where there is no geographic one.
-    lonlat_deg: (N, 2) longitude, latitude; None where there is no geographic origin.
+    origin_deg: WGS84 longitude and latitude of east = north = 0. lonlat_deg: (N, 2). Both None without an origin.
     """
 
     frame: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -771,11 +749,7 @@ class Positions(Table):
 
 @dataclass(frozen=True)
 class Ortho:
-    """A photo of the ground as seen from straight above, to lie under a map.
-
-    image: (H, W, 3) uint8, OpenCV's BGR order. east_north_from_pixel: (2, 3), local metres of (u, v, 1), from the first
-    pixel's centre.
-    """
+    """An orthophoto: image (H, W, 3) uint8 BGR; east_north_from_pixel (2, 3), local metres of (u, v, 1)."""
 
     image: np.ndarray
     east_north_from_pixel: np.ndarray
@@ -783,11 +757,11 @@ class Ortho:
 
 @dataclass(frozen=True)
 class GroundLocations:
-    """All that is known of one frame after its people were located from the ground.
+    """The people of one frame located from ground cameras.
 
-    positions: the people, fused where several cameras see them. members: (P, V) which sighting of each camera is of
-    each of them, counted among those located; -1 for none. sightings: all, whether located or not, one row a box;
-    vehicle, target, cut, score (N,) and box_px (N, 4): whose camera it was, counted from 0, and what its table said.
+    positions: fused over cameras. members: (P, V) index of each camera's sighting among those located; -1: none.
+    sightings: all, one row per box; vehicle (N,), from 0, is the camera; target, cut, score (N,) and box_px (N, 4) come
+    from its table.
     """
 
     frame: int
@@ -803,12 +777,12 @@ class GroundLocations:
 
 @dataclass(frozen=True)
 class AerialLocations:
-    """All that is known of one frame after its targets were located from the air.
+    """The targets of one frame located from the air.
 
-    positions: the targets that could be located; covariance_m2 is that of the absolute place. row: (P,) which of the
-    frame's targets each is. relative_m2: (P, 2, 2) covariance of the place relative to the team of landmarks, without
-    the error that all its receivers share. velocity_m_s: (P, 2) east, north, NaN where unknown. box_px: (N, 4), all.
-    time_s: of the frame. marks: the frame's landmarks as they were used. adjustments, seconds: as in Scene.
+    positions: located targets, with absolute covariance. row: (P,) their rows among the frame's targets.
+    relative_m2: (P, 2, 2) covariance relative to the landmarks, without the error common to their receivers.
+    velocity_m_s: (P, 2) east, north, NaN if unknown. box_px: (N, 4) of all targets. marks: the landmarks as used.
+    adjustments, seconds: as in Scene.
     """
 
     frame: int
@@ -826,12 +800,12 @@ class AerialLocations:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """What vehicles on the ground say of the blobs of one frame, one row a blob.
+    """The UGVs' verdict on the blobs of one frame, one row per blob.
 
-    row: (N,) int64, its place in the blobs' table, sorted by frame. kind: human, not_human or unseen, by all looks so
-    far. probability: (N,) of being human. seen_by: the vehicles that could tell something in this frame. people: (N,)
-    int64, recognized at it in this frame, by the vehicle that recognized most. nearest_m, nearest_sigmas: (N,) to the
-    nearest person in this frame, NaN where there is none. best: (N,) highest probability of anyone at it, NaN without.
+    row: (N,) int64 in the blobs' table. kind: human, not_human or unseen, by all observations so far.
+    probability: (N,) of being human. seen_by: vehicles with an observation in this frame. people: (N,) int64, the most
+    people that a vehicle recognized at it in this frame. nearest_m, nearest_sigmas: (N,) to the nearest person, or NaN.
+    best: (N,) highest probability of a person at it, or NaN.
     """
 
     frame: int
@@ -847,10 +821,10 @@ class Confirmation:
 
 @dataclass(frozen=True)
 class Tracks(Boxes):
-    """The targets of one frame with their identities, one row a target.
+    """The targets of one frame with identities, one row per target.
 
-    frame: 1-based number. identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
-    row: (N,) int64, which of the frame's detections it is; -1 for a box that bridges a gap between two of them.
+    identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
+    row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
     """
 
     frame: int
@@ -870,14 +844,13 @@ class Tracks(Boxes):
 
 @dataclass(frozen=True)
 class Scene:
-    """All that is known of one frame after its window was observed.
+    """The result of motion detection for one frame.
 
     mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
-    reliable: False when registration could not be trusted: then the mask is empty and `cause` says why.
-    interval_frames: the detection interval in force. seconds: time spent per stage on this frame.
-    step: how the background moved since the frame before; None where there is none.
-    core: (H, W) bool, what of the mask differs from the background by itself, before gaps and hulls are filled; None:
-    all of it.
+    reliable: False if registration failed: then the mask is empty and `cause` says why.
+    interval_frames: the detection interval in force. seconds: time spent per stage.
+    step: background motion since the previous frame, or None.
+    core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.
     """
 
     frame: Frame
@@ -899,14 +872,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """All that is known of one frame after its targets were given their identities.
+    """The result of tracking for one frame.
 
-    number: 1-based position in the clip. frame: its picture; None where there is none or it could not be read.
-    detections: what was given, with the scores as given. tracks: those of them that have an identity, and the bridges.
-    now_from_before: (3, 3) pixel homography from the frame followed before; None: the camera stood still, or unknown.
-    lines: (N,) int64, where the detections stand in the file that they come from; empty for own ones.
-    cause: why nothing could be seen or concluded from the picture; empty where all is well.
-    adjustments, seconds: as in Scene.
+    number: 1-based position in the clip. frame: the picture, or None. detections: the tracker's input.
+    tracks: those with an identity, and boxes that bridge gaps.
+    now_from_before: (3, 3) pixel homography from the frame tracked before; None: no motion, or unknown.
+    lines: (N,) int64, lines of the detections in their file; empty for own ones.
+    cause: why there is no result. adjustments, seconds: as in Scene.
     """
 
     number: int
@@ -962,10 +934,10 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class Order:
-    """What a ground vehicle is asked to do: to go to a place at a speed and to look at another.
+    """An order to a ground vehicle: drive to a goal and look at a point.
 
-    vehicle: its name. goal, look_at: (2,), in the kind of place in which the vehicles report theirs, longitude and
-    latitude or local metres; look_at None: ahead. picture: whether a picture of what it sees is wanted.
+    goal, look_at: (2,) in the vehicles' own coordinates, longitude and latitude or local metres; look_at None: ahead.
+    picture: whether a picture is requested.
     """
 
     vehicle: str
@@ -977,10 +949,10 @@ class Order:
 
 @dataclass(frozen=True)
 class Command:
-    """What the instruments are asked to do from now on; a simulator flies, a recording ignores it.
+    """A command to the vehicles; a simulator executes it, a recording ignores it. None: no change.
 
-    every: of so many frames one is wanted. fly_to: (2,), where the aerial vehicle should be, and look_at: (2,), the
-    ground that should be in the middle of its picture; as in Order. None: go on as now.
+    every: process every so many frames. fly_to: (2,) position of the UAV. look_at: (2,) ground point in the picture's
+    centre. Coordinates as in Order.
     """
 
     every: int = 1
@@ -992,10 +964,7 @@ class Command:
 
 @dataclass(frozen=True)
 class GroundPicture:
-    """What a ground vehicle saw at a frame of the aerial camera.
-
-    camera: with the place, heading and pitch that the vehicle reports for this moment, and how well it knows them.
-    """
+    """A ground vehicle's picture at a frame of the aerial camera; camera has the reported pose at that moment."""
 
     vehicle: str
     frame: int
@@ -1005,13 +974,12 @@ class GroundPicture:
 
 @dataclass(frozen=True)
 class Bodies:
-    """All that can move in a simulated world, at one moment, one row a body.
+    """Everything that moves in a simulated world at one moment, one row per body.
 
-    number: (N,) int64 from 1, lasting. kind: (N,) of str: person, car or ugv. target: (N,) int64 from 1, what it is
-    part of or is: people of one crowd share it; a vehicle has its own. place_m: (N, 3) of the feet, local metres east,
-    north, up. velocity_m_s: (N, 2). facing_rad: (N,) clockwise from north. height_m: (N,) of a person. phase: (N,) of
-    the gait, in strides. colour: (N, 3) BGR, 0 to 255, of the clothes or the paint; plate: (N, 3) BGR of the marker on
-    top of a landmark, NaN where there is none. hidden: (N,) bool, the marker is covered.
+    number: (N,) int64 from 1, constant. kind: (N,) person, car or ugv. target: (N,) int64 from 1, shared by the people
+    of a crowd. place_m: (N, 3) of the feet, local east, north, up. velocity_m_s: (N, 2). facing_rad: (N,) clockwise
+    from north. height_m: (N,) of a person. phase: (N,) of the gait, in strides. colour: (N, 3) BGR, 0 to 255.
+    plate: (N, 3) BGR of a landmark's marker, or NaN. hidden: (N,) bool, the marker is covered.
     """
 
     number: np.ndarray
@@ -1032,11 +1000,10 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulated frame truly shows.
+    """Ground truth of a simulated frame.
 
-    mask: (H, W) uint16, 0 or the number of the target whose pixel it is. people: the same with the number of the body.
-    bodies: all of the world, in the picture or not. pose: of the camera in the middle of the exposure.
-    events: what happened in the world at this frame, in words: faults, crowds that joined or split.
+    mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all in the world.
+    pose: of the camera at mid-exposure. events: faults, crowds that join or split, in words.
     """
 
     frame: int

@@ -155,7 +155,7 @@ def test_a_mavlink_log_that_is_cut_or_damaged_is_read_around_the_damage(tmp_path
 
 def test_a_mavlink_log_that_tells_nothing_is_refused(tmp_path: Path) -> None:
     heartbeat = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
-    with pytest.raises(InputError, match="none of its 5 MAVLink messages tells"):
+    with pytest.raises(InputError, match="none of its 5 MAVLink messages has"):
         read_telemetry(written(tmp_path, tlog([(CLOCK_S + i, "HEARTBEAT", heartbeat) for i in range(5)]), "a.tlog"))
 
 
@@ -237,7 +237,7 @@ def test_a_px4_log_that_is_cut_is_read_as_far_as_it_goes_and_says_so(tmp_path: P
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (ulog({"battery_status": (("float voltage",), [(0, 12.0)])}), "tells no place, height or attitude"),
+        (ulog({"battery_status": (("float voltage",), [(0, 12.0)])}), "has no position, height or attitude"),
         (b"XX" + ulog({"vehicle_global_position": GLOBAL}), "does not begin as a PX4 log"),
         (ulog({"vehicle_global_position": GLOBAL})[:12], "damaged|tells no place"),
         (b"", "is empty"),

@@ -217,6 +217,7 @@ def test_a_jump_moves_what_is_said_by_its_size() -> None:
         assert off[[0, 2, 3]] == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_pictures_markers_and_telemetry_fail_while_the_fault_lasts() -> None:
     assert all((one.picture == "frozen") == within(one) for one in faulty("frozen"))
     assert all((one.picture == "dropped") == within(one) for one in faulty("dropped"))

@@ -11,6 +11,7 @@ from torchvision_dddas.cli import app
 from torchvision_dddas.simulation import film, film_clip, load_scenario
 
 
+@pytest.mark.slow
 def test_a_clip_on_disk_is_the_film_whose_masks_number_what_moves(tmp_path):
     made = list(film(load_scenario("demo"), 1, 2, (160, 120)))
     film_clip(tmp_path, 1, 2, (160, 120))

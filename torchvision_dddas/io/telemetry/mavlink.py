@@ -14,11 +14,11 @@ from torchvision_dddas.io.telemetry.log import Log, assemble
 from torchvision_dddas.types import Telemetry
 
 Said = list[tuple[float, Any, int]]
-"""Time at which each came, message, and its first byte."""
+"""Time of reception, message, first byte."""
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
-# Of a log that begins or ends outside these the clock is none: 2000 and 2200.
+# Times outside 2000 to 2200 are no clock.
 _CLOCK_US = (946_684_800_000_000, 7_258_118_400_000_000)
 _WANTED = (
     "GLOBAL_POSITION_INT",
@@ -35,23 +35,23 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 
 
 def read_tlog(path: Path, clock_offset_s: float) -> Telemetry:
-    """Positions and attitudes of the vehicle that reports most; times since the first of them.
+    """Positions and attitudes of the vehicle with the most messages; times since the first one.
 
-    Raises InputError where no vehicle reports any.
+    Raises InputError if no vehicle reports any.
     """
     log = Log(path, "MAVLink log", "byte", bridge_s=2.0)
     said = _on_vehicle_clock(log, messages(log))
     get = said.get
     places = get("GLOBAL_POSITION_INT", [])
     for time_s, m, byte in places:
-        _say_place(log, time_s, m.lon, m.lat, byte)
+        _add_place(log, time_s, m.lon, m.lat, byte)
         log.add("above_sea_m", time_s, m.alt / 1e3, byte)
         log.add("altitude_m", time_s, m.relative_alt / 1e3, byte)
         log.add("speed_m_s", time_s, math.hypot(m.vx, m.vy) / 100, byte)
     if not places:
         for time_s, m, byte in get("GPS_RAW_INT", []):
             fixed = m.fix_type >= 2
-            _say_place(log, time_s, m.lon if fixed else 0, m.lat if fixed else 0, byte)
+            _add_place(log, time_s, m.lon if fixed else 0, m.lat if fixed else 0, byte)
             log.add("above_sea_m", time_s, m.alt / 1e3 if m.fix_type >= 3 else math.nan, byte)
             log.add("speed_m_s", time_s, m.vel / 100 if fixed and m.vel != _UNKNOWN_16 else math.nan, byte)
     for time_s, m, byte in get("VFR_HUD", []) if "speed_m_s" not in log.samples else []:
@@ -60,15 +60,15 @@ def read_tlog(path: Path, clock_offset_s: float) -> Telemetry:
     yaws = yaws or [(t, math.radians(m.hdg / 100), byte) for t, m, byte in places if m.hdg != _UNKNOWN_16]
     for row in yaws:
         log.add("vehicle_heading_rad", *row)
-    _say_camera(log, said, np.array([(t, yaw) for t, yaw, _ in yaws]).reshape(-1, 2))
+    _add_camera(log, said, np.array([(t, yaw) for t, yaw, _ in yaws]).reshape(-1, 2))
     return assemble(log, clock_offset_s, 0.0, from_first=True)  # its times are since 1970
 
 
 def _on_vehicle_clock(log: Log, said: dict[str, Said]) -> dict[str, Said]:
-    """The same with the times at which the vehicle sent them, as its own clock tells.
+    """The same messages with the times at which the vehicle sent them, by its own clock.
 
-    Messages come in bursts, a second late or more; at 20 m/s that is 20 m. The least delay counts as none. A message
-    that tells no time has that of the one before. Where the clocks do not go alike, as they came.
+    Messages arrive in bursts, a second late or more; at 20 m/s that is 20 m. The smallest delay counts as zero. A
+    message without a time has that of the one before. If the clocks drift apart, the times of reception are kept.
     """
     rows = sorted(((byte, time_s, m) for of in said.values() for time_s, m, byte in of), key=lambda row: row[0])
     came = np.array([time_s for _, time_s, _ in rows])
@@ -79,22 +79,22 @@ def _on_vehicle_clock(log: Log, said: dict[str, Said]) -> dict[str, Said]:
     apart, span_s = (came - sent)[told], float(np.ptp(sent[told]))
     alike = np.abs(apart - np.median(apart)) < 5 + 0.01 * span_s
     if alike.mean() < 0.9:  # a few may be damaged: no checksum covers the times
-        log.note("the vehicle's clock and the station's do not go alike: times are those at which messages came")
+        log.note("the vehicle's clock and the station's drift apart: times are those of reception")
         return said
     sent = sent[np.maximum.accumulate(np.where(told, np.arange(len(sent)), np.argmax(told)))]
     times = dict(zip((byte for byte, *_ in rows), (sent + np.percentile(apart[alike], 1)).tolist(), strict=True))
-    log.jitter_s = math.inf  # what came out of order is put in order
+    log.jitter_s = math.inf  # messages are sorted by time
     return {name: [(times[byte], message, byte) for _, message, byte in of] for name, of in said.items()}
 
 
-def _say_place(log: Log, time_s: float, longitude: int, latitude: int, byte: int) -> None:
+def _add_place(log: Log, time_s: float, longitude: int, latitude: int, byte: int) -> None:
     known = abs(latitude) <= 90e7 and abs(longitude) <= 180e7
     log.add("longitude_deg", time_s, longitude / 1e7 if known else math.nan, byte)
     log.add("latitude_deg", time_s, latitude / 1e7 if known else math.nan, byte)
 
 
-def _say_camera(log: Log, said: dict[str, Said], yaw: np.ndarray) -> None:
-    """How the gimbal points, by the best message that there is."""
+def _add_camera(log: Log, said: dict[str, Said], yaw: np.ndarray) -> None:
+    """The gimbal's orientation, from the best kind of message in the log."""
     for time_s, m, byte in said.get("CAMERA_FOV_STATUS", []):
         if 0 < m.hfov < 180:
             log.add("hfov_rad", time_s, math.radians(m.hfov), byte)
@@ -130,7 +130,7 @@ def _say_camera(log: Log, said: dict[str, Said], yaw: np.ndarray) -> None:
 
 
 def looks_like_tlog(head: bytes) -> bool:
-    """Whether a message stands behind eight bytes of time, and the next one behind it."""
+    """Whether eight bytes of time are followed by a message, and that by the next one."""
     for place in range(min(len(head), 1024)):
         end = _end(head, place)
         if end is not None and _CLOCK_US[0] < int.from_bytes(head[place : place + 8], "big") < _CLOCK_US[1]:
@@ -139,7 +139,7 @@ def looks_like_tlog(head: bytes) -> bool:
 
 
 def messages(log: Log) -> dict[str, Said]:
-    """Those that tell something, by name: time, message and byte; of one vehicle."""
+    """The useful messages of one vehicle by name: time, message and byte."""
     try:
         from pymavlink.dialects.v20 import all as dialect
     except ImportError:
@@ -169,7 +169,7 @@ def messages(log: Log) -> dict[str, Said]:
     for (system, name), number in reports.items():
         systems[system] += number * (100 if name in ("GLOBAL_POSITION_INT", "GPS_RAW_INT") else 1)
     if not systems:
-        raise log.refuse(f"none of its {count} MAVLink messages tells a place, a height or an attitude")
+        raise log.refuse(f"none of its {count} MAVLink messages has a position, a height or an attitude")
     chosen = systems.most_common(1)[0][0]
     others = sorted({system for system, name in said if name == "GLOBAL_POSITION_INT"} - {chosen})
     if others:
@@ -178,7 +178,7 @@ def messages(log: Log) -> dict[str, Said]:
 
 
 def _frames(log: Log, content: bytes, decoder: Any) -> Iterator[tuple[int, int, int]]:
-    """Where each message's time begins, where it ends, and its number. Steps over what is none."""
+    """Start (of its time), end and number of each message; other bytes are skipped."""
     place, lost, lost_first = 0, 0, 0
     while place + 16 <= len(content):
         end = _end(content, place)
@@ -202,7 +202,7 @@ def _frames(log: Log, content: bytes, decoder: Any) -> Iterator[tuple[int, int, 
 
 
 def _end(content: bytes, place: int) -> int | None:
-    """Where a message would end that begins here; None if none does."""
+    """End of the message that begins here, or None."""
     if place + 12 > len(content):
         return None
     if content[place + 8] == _V1:
@@ -213,7 +213,7 @@ def _end(content: bytes, place: int) -> int | None:
 
 
 def _follows(content: bytes, place: int, end: int, decoder: Any) -> bool:
-    """Whether the next message begins where this one ends; else whether its checksum is right."""
+    """Whether another message follows, or the checksum is right."""
     if end == len(content) or (end + 8 < len(content) and content[end + 8] in (_V1, _V2)):
         return True
     try:

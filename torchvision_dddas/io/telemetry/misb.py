@@ -25,7 +25,7 @@ _STAMP = 2
 
 
 class LocalSet(NamedTuple):
-    """One packet. place: its first byte. tags: value by tag, as bytes. whole: its checksum is right."""
+    """A packet. place: its first byte. tags: bytes by tag. whole: its checksum is right."""
 
     place: int
     tags: dict[int, bytes]
@@ -33,11 +33,10 @@ class LocalSet(NamedTuple):
 
 
 def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float) -> Telemetry:
-    """layout: of the transport stream, as `spacing` tells it; None for local sets alone.
+    """Read MISB ST 0601 metadata. layout: the transport stream's `spacing`; None for bare local sets.
 
-    Times are those of the stream since its first picture; where it tells none, the sets' own stamps, the first of which
-    is laid on the picture sent before it.
-    Raises InputError where there is no metadata, or none of it is whole.
+    Times are the stream's, since its first picture; without them the sets' own stamps, the first of which is aligned
+    with the last picture before it. Raises InputError without intact metadata.
     """
     log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0)
     content = path.read_bytes()
@@ -82,11 +81,11 @@ def _times(log: Log, whole: list[LocalSet], belonging: list[Piece]) -> tuple[np.
         apart = (stamps - told)[clocked & np.isfinite(told)]
         return told, float(np.median(apart)) if len(apart) else math.nan
     if not clocked.any():
-        raise log.refuse("neither the stream nor its metadata tells times")
+        raise log.refuse("neither the stream nor its metadata has times")
     first = int(np.argmax(clocked))
     start = float(stamps[first]) - belonging[first].seen_s
     if belonging[first].seen_s:
-        log.note("the stream tells no times of its metadata: the first lies on the picture sent before it")
+        log.note("the stream has no times for its metadata: the first is aligned with the picture before it")
     return stamps - start, start
 
 

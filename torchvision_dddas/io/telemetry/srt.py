@@ -1,4 +1,4 @@
-"""DJI's subtitles beside a clip, in any dialect: places, heights and attitudes as keys and values in their text."""
+"""DJI's subtitle files in any dialect: positions, heights and attitudes as keys and values in text."""
 
 import math
 import re
@@ -27,7 +27,7 @@ _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", 
 
 @dataclass
 class Subtitle:
-    """One of them. line: where it begins. time_s: its own, or NaN. text: all of it, without markup."""
+    """A subtitle. line: its first line in the file. time_s: NaN without a timing. lines: its text."""
 
     line: int
     time_s: float = math.nan
@@ -35,13 +35,13 @@ class Subtitle:
 
     @cached_property
     def text(self) -> str:
-        """All of it, without markup."""
+        """The text without markup."""
         text = "\n".join(self.lines)
         return _MARKUP.sub(" ", text) if "<" in text else text
 
 
 def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
-    """Raises InputError where no subtitle says a place, a height or an attitude, or times run back."""
+    """Raises InputError without any position, height or attitude, or if times decrease."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     subtitles = list(_subtitles(text))
     parts = [_tuples(subtitle.text) for subtitle in subtitles]
@@ -49,30 +49,30 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     dates = [dated(subtitle.text) for subtitle in subtitles]
     first = next((date[0] for date in dates if date), math.nan)
     lacking: dict[str, list[int]] = {}
-    said_so_far: set[str] = set()
+    known: set[str] = set()
     for subtitle, tuples, date in zip(subtitles, parts, dates, strict=True):
         time_s = subtitle.time_s if math.isfinite(subtitle.time_s) else (date[0] - first if date else math.nan)
         if math.isnan(time_s):
             log.note(f"line {subtitle.line}: a subtitle without time is left out")
             continue
-        said = _said(log, subtitle.text, tuples, swapped)
+        said = _quantities(log, subtitle.text, tuples, swapped)
         log.moments.append((time_s, subtitle.line))
         for quantity, value in said.items():
             log.add(quantity, time_s, value, subtitle.line)
-        for name in said_so_far - set(said):
+        for name in known - set(said):
             lacking.setdefault(name, []).append(subtitle.line)
             log.add(name, time_s, math.nan, subtitle.line)
-        said_so_far |= set(said)
+        known |= set(said)
     _note_lacking(log, lacking, subtitles)
     zoned = next((date for date in dates if date), (math.nan, False))
     if not zoned[1] and math.isfinite(zoned[0]):
-        log.note("the dates are in an unknown zone of time, so the clock is not known")
+        log.note("the dates are in an unknown time zone, so the clock is not known")
     start = zoned[0] - log.moments[0][0] if zoned[1] and log.moments else math.nan
     return assemble(log, clock_offset_s, start)
 
 
 def _subtitles(text: str) -> Iterator[Subtitle]:
-    """Blocks that begin with a timing, or, where there are no timings at all, blocks between blank lines."""
+    """Blocks that begin with a timing; in a file without timings, blocks between blank lines."""
     lines = text.splitlines()
     timed = any(_TIMING.match(line.strip()) for line in lines)
     now: Subtitle | None = None
@@ -98,7 +98,7 @@ def _subtitles(text: str) -> Iterator[Subtitle]:
 
 
 def _tuples(text: str) -> dict[str, list[tuple[float, str]]]:
-    """What stands in brackets behind a name: numbers, each with the letters beside it."""
+    """Numbers in brackets by the name before them, each with the letters beside it."""
     found: dict[str, list[tuple[float, str]]] = {}
     if "(" not in text:
         return found
@@ -116,9 +116,9 @@ def _tuples(text: str) -> dict[str, list[tuple[float, str]]]:
 
 
 def _latitude_first(log: Log, gps: list[list[tuple[float, str]]], home: list[list[tuple[float, str]]]) -> bool:
-    """Whether latitude stands before longitude in GPS(...): by values that can be no latitude, else by dialect.
+    """Whether GPS(...) has the latitude first: by values beyond 90 degrees, else by dialect.
 
-    DJI writes longitude, latitude and the number of satellites; where the third is metres, latitude comes first.
+    DJI writes longitude, latitude and the number of satellites; if the third is in metres, latitude comes first.
     """
     pairs = np.array([[a[0][0], a[1][0]] for a in gps + home if len(a) > 1 and not a[0][1] and not a[1][1]])
     if not len(pairs):
@@ -134,8 +134,8 @@ def _latitude_first(log: Log, gps: list[list[tuple[float, str]]], home: list[lis
     return metres
 
 
-def _said(log: Log, text: str, tuples: dict[str, list[tuple[float, str]]], swapped: bool) -> dict[str, float]:
-    """The quantities of one subtitle."""
+def _quantities(log: Log, text: str, tuples: dict[str, list[tuple[float, str]]], swapped: bool) -> dict[str, float]:
+    """Values of one subtitle by quantity."""
     said: dict[str, float] = {}
     if gps := tuples.get("gps"):
         said |= _place(gps, swapped)
@@ -149,7 +149,7 @@ def _said(log: Log, text: str, tuples: dict[str, list[tuple[float, str]]], swapp
             plain[key] = number
         if quantity_of(key) is None:
             continue
-        if key.lower() == "h" and not unit:  # a letter may be anything; with metres it is the height
+        if key.lower() == "h" and not unit:  # only with a unit the letter means the height
             continue
         if (found := understood(key, float(number.replace(",", ".")), unit)) and found[0] not in said:
             said[found[0]] = found[1]
@@ -181,7 +181,7 @@ def _place(gps: list[tuple[float, str]], swapped: bool) -> dict[str, float]:
 
 
 def _note_lacking(log: Log, lacking: dict[str, list[int]], subtitles: list[Subtitle]) -> None:
-    """What some subtitles do not say though others before them do."""
+    """Note quantities that some subtitles lack and earlier ones have."""
     together: dict[tuple[int, ...], list[str]] = {}
     for name, lines in lacking.items():
         together.setdefault(tuple(lines), []).append(name)

@@ -1,4 +1,4 @@
-"""MPEG transport streams: the metadata that travels beside the video, and when."""
+"""MPEG transport streams: metadata packets and their times."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,10 +15,7 @@ _HZ = 90_000
 
 @dataclass
 class Piece:
-    """The payload of one metadata packet. time_s: since the first picture, NaN unless it is told.
-
-    seen_s: time of the video that was last sent before it.
-    """
+    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the video before it."""
 
     time_s: float
     seen_s: float
@@ -27,7 +24,7 @@ class Piece:
 
 @dataclass
 class Stream:
-    """What was found. damaged: the first byte that is out of step, and how often one is. cut: ends within a packet."""
+    """Contents of a stream. damaged: first byte out of sync, and the count. cut: ends within a packet."""
 
     pieces: list[Piece] = field(default_factory=list)
     video: int | None = None
@@ -38,7 +35,7 @@ class Stream:
 
 
 def spacing(head: bytes) -> tuple[int, int] | None:
-    """Bytes from packet to packet and to the first one's sync byte; None if it is no transport stream."""
+    """Packet spacing and offset of the first sync byte, bytes; None if it is no transport stream."""
     for size, before in _SPACINGS:
         # A recording may begin within a packet.
         for first in range(before, min(before + size, len(head))):
@@ -62,7 +59,7 @@ def read_stream(content: bytes, size: int, first: int) -> Stream:
         elif pid == stream.video and starts:
             stamp = _stamp(payload)
             if stamp is not None:
-                # The first pictures are not sent in the order in which they are shown.
+                # Pictures are not sent in display order.
                 earliest = stamp if earliest is None else min(earliest, _near(stamp, earliest))
                 last_video = stamp
         elif pid == stream.metadata:
@@ -78,12 +75,12 @@ def read_stream(content: bytes, size: int, first: int) -> Stream:
 
 
 def _near(stamp: int, other: int) -> int:
-    """A time stamp of 33 bits, next to another."""
+    """A 33-bit time stamp, unwrapped to be near another."""
     return other + (stamp - other + _WRAP // 2) % _WRAP - _WRAP // 2
 
 
 def _packets(content: bytes, size: int, first: int, stream: Stream) -> Iterator[tuple[int, bool, bytes]]:
-    """Stream number, whether something begins in it, and payload of each packet that has one and is not scrambled."""
+    """Stream number, whether a unit starts, and payload of each unscrambled packet."""
     place = first
     while place + _PACKET <= len(content):
         if content[place] != _SYNC:
@@ -112,7 +109,7 @@ def _resynchronized(content: bytes, place: int, size: int) -> int | None:
 
 
 def _programmes(payload: bytes) -> set[int]:
-    """Where the tables of the programmes are."""
+    """Stream numbers of the programme tables."""
     table = payload[1 + payload[0] :] if payload else b""
     length = ((table[1] & 0x0F) << 8 | table[2]) if len(table) > 8 else 0
     entries = table[8 : min(3 + length - 4, len(table))]
@@ -121,7 +118,7 @@ def _programmes(payload: bytes) -> set[int]:
 
 
 def _streams(payload: bytes, stream: Stream) -> None:
-    """Which streams of a programme are video and which is MISB metadata."""
+    """Find the video and the MISB metadata among a programme's streams."""
     table = payload[1 + payload[0] :] if payload else b""
     if len(table) < 12 or table[0] != 0x02:
         return
@@ -140,7 +137,7 @@ def _streams(payload: bytes, stream: Stream) -> None:
 
 
 def _stamp(payload: bytes) -> int | None:
-    """The presentation time of a packetized elementary stream, 33 bits of 90 kHz."""
+    """The presentation time of a PES packet, 33 bits at 90 kHz."""
     if payload[:3] != b"\0\0\1" or len(payload) < 14 or not payload[7] & 0x80:
         return None
     a, b, c, d, e = payload[9:14]

@@ -1,4 +1,4 @@
-"""PX4's ULog: topics, each with times of its own."""
+"""PX4's ULog: topics with their own time stamps."""
 
 import contextlib
 import io
@@ -31,30 +31,26 @@ Topic = dict[str, np.ndarray]
 
 @np.errstate(invalid="ignore")  # where a log is damaged a number may be any bits
 def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
-    """Places, heights and attitudes of a PX4 log; times since the first of them.
-
-    Raises InputError where it has none.
-    """
+    """Positions, heights and attitudes of a PX4 log; times since the first. Raises InputError if it has none."""
     log = Log(path, "PX4 log", "sample", bridge_s=1.0)
     topics = _topics(log)
     local = topics.get("vehicle_local_position")
-    _say_place(log, topics, local)
+    _add_place(log, topics, local)
     if local is not None:
-        _say_local(log, local, topics.get("home_position"))
+        _add_local(log, local, topics.get("home_position"))
     yaw = np.zeros((0, 2))
     if (attitude := topics.get("vehicle_attitude")) is not None:
         heading, _, _ = angles(axes_of_quaternion(_rows(attitude, "q", 4)))
         yaw = np.stack([_seconds(attitude), heading], axis=1)[np.isfinite(heading)]
-        _say(log, "vehicle_heading_rad", yaw[:, 0], yaw[:, 1])
-    _say_camera(log, topics, yaw)
+        _add(log, "vehicle_heading_rad", yaw[:, 0], yaw[:, 1])
+    _add_camera(log, topics, yaw)
     return assemble(log, clock_offset_s, _clock(topics), from_first=True)
 
 
 class _Onwards(io.BufferedReader):
-    """A file in which a step back is no longer than what was read.
+    """A file that seeks back by no more than was read.
 
-    pyulog 1.3 steps back by as much as a damaged message says that it is long; where the file ended before, it would
-    come to the same place for ever.
+    pyulog 1.3 seeks back by the announced length of a damaged message; at the end of the file it would loop forever.
     """
 
     _short = 0
@@ -93,12 +89,12 @@ def _topics(log: Log) -> dict[str, Topic]:
         if topic.name not in topics and len(topic.data.get("timestamp", ())):
             topics[topic.name] = topic.data
     if not topics:
-        raise log.refuse("the PX4 log tells no place, height or attitude")
+        raise log.refuse("the PX4 log has no position, height or attitude")
     return topics
 
 
 def _cut(content: bytes) -> int | None:
-    """Where the last message begins if it does not end; messages follow a header of 16 bytes, length first."""
+    """Start of an incomplete last message, or None; messages follow a header of 16 bytes, length first."""
     place = 16
     while place < len(content):
         end = place + 3 + int.from_bytes(content[place : place + 2], "little")
@@ -122,20 +118,20 @@ def _column(topic: Topic, name: str) -> np.ndarray:
 
 
 def _valid(topic: Topic, name: str) -> np.ndarray:
-    """A flag; true where the log does not have it."""
+    """A flag; true if the log lacks it."""
     if name not in topic:
         return np.ones(len(topic["timestamp"]), bool)
     return topic[name].astype(bool)
 
 
-def _say(log: Log, quantity: str, times: np.ndarray, values: np.ndarray) -> None:
+def _add(log: Log, quantity: str, times: np.ndarray, values: np.ndarray) -> None:
     log.samples.setdefault(quantity, []).extend(
         zip(times.tolist(), np.asarray(values, float).tolist(), range(1, len(times) + 1), strict=True)
     )
 
 
-def _say_place(log: Log, topics: dict[str, Topic], local: Topic | None) -> None:
-    """The place by the best topic: the estimate, the local one laid around its origin, the receiver's own."""
+def _add_place(log: Log, topics: dict[str, Topic], local: Topic | None) -> None:
+    """The position from the best topic: global estimate, local estimate about its origin, GPS receiver."""
     fused, gps = topics.get("vehicle_global_position"), topics.get("vehicle_gps_position", topics.get("sensor_gps"))
     if fused is not None:
         times, longitude, latitude, height = (
@@ -166,11 +162,11 @@ def _say_place(log: Log, topics: dict[str, Topic], local: Topic | None) -> None:
         return
     known &= (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
     for name, values in (("longitude_deg", longitude), ("latitude_deg", latitude), ("above_sea_m", height)):
-        _say(log, name, times, np.where(known, values, np.nan))
+        _add(log, name, times, np.where(known, values, np.nan))
 
 
-def _say_local(log: Log, local: Topic, home: Topic | None) -> None:
-    """Height above the take-off, or above the ground where a range finder looks down all the while; speed."""
+def _add_local(log: Log, local: Topic, home: Topic | None) -> None:
+    """Height above take-off, or above ground if a range finder measures it throughout; speed."""
     times = _seconds(local)
     height = -_column(local, "z")
     if home is not None and np.isfinite(home_z := float(_column(home, "z")[-1])):
@@ -180,12 +176,12 @@ def _say_local(log: Log, local: Topic, home: Topic | None) -> None:
     if ranged.mean() > 0.95:
         height = np.where(ranged, _column(local, "dist_bottom"), np.nan)
         log.note("the altitude above ground is that of the range finder")
-    _say(log, "altitude_m", times, height)
+    _add(log, "altitude_m", times, height)
     speed = np.hypot(_column(local, "vx"), _column(local, "vy"))
-    _say(log, "speed_m_s", times, np.where(_valid(local, "v_xy_valid"), speed, np.nan))
+    _add(log, "speed_m_s", times, np.where(_valid(local, "v_xy_valid"), speed, np.nan))
 
 
-def _say_camera(log: Log, topics: dict[str, Topic], yaw: np.ndarray) -> None:
+def _add_camera(log: Log, topics: dict[str, Topic], yaw: np.ndarray) -> None:
     if (gimbal := topics.get("gimbal_device_attitude_status")) is not None:
         heading, pitch, roll = angles(axes_of_quaternion(_rows(gimbal, "q", 4)))
         flags = gimbal.get("device_flags", np.zeros(len(heading), int)).astype(int)
@@ -199,14 +195,14 @@ def _say_camera(log: Log, topics: dict[str, Topic], yaw: np.ndarray) -> None:
         return
     heading = np.where(turned, heading, heading + heading_at(times, yaw[:, 0], yaw[:, 1]))
     for name, values in (("heading_rad", heading), ("pitch_rad", pitch), ("roll_rad", roll)):
-        _say(log, name, times, values)
+        _add(log, name, times, values)
 
 
 def _clock(topics: dict[str, Topic]) -> float:
-    """Seconds since 1970 when the autopilot started, by the satellites' clock."""
+    """Seconds since 1970 at the autopilot's start, by GPS time."""
     gps = topics.get("vehicle_gps_position", topics.get("sensor_gps"))
     if gps is None or "time_utc_usec" not in gps:
         return math.nan
     utc_s = _column(gps, "time_utc_usec") / 1e6
-    told = utc_s > 946_684_800
-    return float(np.median((utc_s - _seconds(gps))[told])) if told.any() else math.nan
+    is_known = utc_s > 946_684_800
+    return float(np.median((utc_s - _seconds(gps))[is_known])) if is_known.any() else math.nan
