@@ -15,7 +15,7 @@ _HZ = 90_000
 
 @dataclass
 class Piece:
-    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the video before it."""
+    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the last video."""
 
     time_s: float
     seen_s: float
