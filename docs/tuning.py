@@ -9,12 +9,10 @@ from pathlib import Path
 
 from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.simulation import film_clip
-from torchvision_dddas.tuning.descent import Plan, Step, descend
-from torchvision_dddas.tuning.family import prepare
-from torchvision_dddas.tuning.verdict import judge
+from torchvision_dddas.tuning import Plan, Step, descend, judge, prepare
 
 
-def told(step: Step) -> None:
+def show_step(step: Step) -> None:
     if step.watched is not None:
         print(f"step {step.step}: {step.parameters['difference.threshold']:.2f}, watched {step.watched:.3f}")
 
@@ -31,7 +29,7 @@ def main(folder: Path) -> None:
 
     # 3. Twelve steps down the slope of 1 - F of soft masks.
     found = descend(
-        ready.family, ready.parameters, ready.examples, Plan(steps=12, batch=4, rate=0.2, look_every=3), tell=told
+        ready.family, ready.parameters, ready.examples, Plan(steps=12, batch=4, rate=0.2, look_every=3), tell=show_step
     )
     print(f"difference.threshold: 12 -> {found.settings.difference.threshold:g} ({found.ended})")
 

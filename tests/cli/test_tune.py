@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.tuning import costing, family
+from torchvision_dddas.tuning import family, time_cost
 
 THRESHOLD = "difference.threshold"
 ASKED = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
@@ -36,7 +36,7 @@ def asked(clips: Path, *words: str, bowl: Bowl | None = None):
     with pytest.MonkeyPatch.context() as here:
         # Fewer samples than in earnest: what is tested here is no interval.
         here.setattr(bootstrap, "effects", partial(bootstrap.effects, resamples=40, most=40))
-        here.setattr(family, "family_of", lambda name: bowl or Bowl(place=math.log(6)))
+        here.setattr(family, "load_family", lambda name: bowl or Bowl(place=math.log(6)))
         return CliRunner().invoke(app, ["tune", str(clips), "--cache", str(clips.parent / "cache"), *words])
 
 
@@ -106,7 +106,7 @@ def test_a_pull_holds_the_parameter_where_it_began(clips, tuned, tmp_path) -> No
     moved = [abs(steps[-1]["knobs"][THRESHOLD] - steps[0]["knobs"][THRESHOLD]) for steps in (held, free)]
     assert moved[0] < moved[1] / 2
     wrong = asked(clips, *ASKED, "--pull", "-1", "--out", str(tmp_path / "wrong"))
-    assert wrong.exit_code == 2 and "the pull is -1; wanted 0 or more" in wrong.output
+    assert wrong.exit_code == 2 and "pull must be 0 or more, got -1" in wrong.output
 
 
 def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_path, monkeypatch) -> None:
@@ -116,7 +116,7 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
         calls.append(settings.difference.threshold)
         return settings.difference.threshold
 
-    monkeypatch.setattr(costing, "_timer", lambda *_: timed)
+    monkeypatch.setattr(time_cost, "_timer", lambda *_: timed)
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
     assert asked(clips, *words).exit_code == 0
     count = len(calls)
@@ -128,7 +128,7 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
 
 
 def test_another_weight_of_the_cost_is_not_taken_for_the_one_before(clips, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: settings.difference.threshold)
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     assert asked(clips, *words, "--cost", "0.5").exit_code == 0
     result = asked(clips, *words, "--cost", "2", "--resume", "--quiet")
@@ -150,9 +150,6 @@ class Choosy(Bowl):
 
     losses: tuple[str, ...] = ("round", "square")
     loss_name: str = "round"
-
-    def by(self, loss_name: str) -> "Choosy":
-        return replace(self, loss_name=loss_name)
 
 
 def test_the_loss_that_was_chosen_is_recorded_and_no_checkpoint_of_another_is_taken(clips, tmp_path) -> None:
@@ -244,9 +241,9 @@ def test_an_unfinished_descent_that_was_set_aside_can_be_gone_on_with_at_its_own
             return super().loss(parameters, batch, softness)
 
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
-    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: settings.difference.threshold)
     assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
-    monkeypatch.setattr(costing, "_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
     assert asked(clips, *words).exit_code == 0
     for name in ("checkpoint", "cost"):
         end = "pt" if name == "checkpoint" else "json"
@@ -281,14 +278,14 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         (("--knobs", "registration.keypoints"), "is no parameter that can be tuned"),
         (("--knobs", ""), "names no parameter"),
         (("--knobs", f"{THRESHOLD},track.speed"), "several families"),
-        (("--knobs", THRESHOLD, "--steps", "0"), "steps is 0"),
+        (("--knobs", THRESHOLD, "--steps", "0"), "steps must be 1 or more, got 0"),
         (("--knobs", THRESHOLD, "--holdout", "none*"), "fits no clip"),
         (("--knobs", THRESHOLD, "--holdout", "*"), "leaves no clip"),
         (("--knobs", THRESHOLD, "--cost", "-1"), "--cost must be 0 or more"),
         (("--knobs", THRESHOLD, "--device", "nowhere"), "--device nowhere"),
         (("--knobs", THRESHOLD, "--device", "meta"), "--device meta"),
         (("--knobs", THRESHOLD, "--minutes", "0"), "--minutes must be more than 0"),
-        (("--knobs", THRESHOLD, "--loss", "f"), "is no loss of the family motion; it has one of its own"),
+        (("--knobs", THRESHOLD, "--loss", "f"), "is no loss of the family motion; it has one only"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels"), "is no measure"),
         (("--knobs", THRESHOLD, "--measure", "motion.pixels.iou"), "no measure of motion.pixels; wanted accuracy, "),
         (("--knobs", THRESHOLD, "--measure", "motion.target.hit"), "no clip has truth for motion.target.hit"),

@@ -153,7 +153,7 @@ def test_a_watched_loss_that_is_no_number_stops_it_too() -> None:
 
 def test_a_slope_that_is_no_number_names_clip_frame_and_parameter() -> None:
     found = descend(Bowl(steep=("one", 2)), parameters(), pieces(), replace(QUICK, batch=99))
-    assert f"slope of the loss in {THRESHOLD}" in found.failed and "one, frame 2" in found.failed
+    assert f"gradient of the loss in {THRESHOLD}" in found.failed and "one, frame 2" in found.failed
     assert found.best == 0
 
 
@@ -225,7 +225,7 @@ def test_without_examples_there_is_one_line() -> None:
     "wrong", [{"steps": 0}, {"batch": 0}, {"rate": 0.0}, {"watched": 1.0}, {"patience": 0}, {"pull": -1.0}]
 )
 def test_a_plan_that_will_not_do_is_refused(wrong: dict) -> None:
-    with pytest.raises(InputError, match="wanted"):
+    with pytest.raises(InputError, match="must be"):
         replace(QUICK, **wrong)
 
 

@@ -14,8 +14,8 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.tuning.aerial_examples import Look
-from torchvision_dddas.tuning.places import family
+from torchvision_dddas.tuning.aerial_location import AerialView
+from torchvision_dddas.tuning.location import LocationFamily
 
 
 def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:
@@ -47,18 +47,18 @@ def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:
     )
 
 
-def looks(clip: Clip, settings: Settings | None = None) -> list[Look]:
-    return [example.content.look for example in family().examples([clip], settings or Settings())]
+def looks(clip: Clip, settings: Settings | None = None) -> list[AerialView]:
+    return [example.content.view for example in LocationFamily().examples([clip], settings or Settings())]
 
 
 @pytest.mark.parametrize("geographic", [False, True])
 def test_looks_of_an_exact_flight_have_no_errors(tmp_path, geographic):
     clip = flown(tmp_path, Overflight(frames=3, geographic=geographic))
-    examples = family().examples([clip], Settings())
+    examples = LocationFamily().examples([clip], Settings())
     assert [example.frame for example in examples] == [1, 2, 3]
-    assert [len(example.content.look.true_m) for example in examples] == [4, 4, 4]
-    wide = family().loss({"aerial.target_sigma_px": torch.tensor(1.0)}, examples, 1.0)
-    fine = family().loss({"aerial.target_sigma_px": torch.tensor(0.05)}, examples, 1.0)
+    assert [len(example.content.view.true_m) for example in examples] == [4, 4, 4]
+    wide = LocationFamily().loss({"aerial.target_sigma_px": torch.tensor(1.0)}, examples, 1.0)
+    fine = LocationFamily().loss({"aerial.target_sigma_px": torch.tensor(0.05)}, examples, 1.0)
     assert (fine < wide - 1).all()  # no errors: the smaller the ellipses the better
 
 
@@ -84,14 +84,14 @@ def test_a_frame_whose_landmarks_are_swapped_is_left_out(tmp_path):
     one, other = (next(cells for cells in lines if cells[:2] == ["2", name]) for name in ("ugv0", "ugv1"))
     one[2:4], other[2:4] = other[2:4], one[2:4]
     (tmp_path / "landmarks.csv").write_text("\n".join(",".join(cells) for cells in lines) + "\n")
-    assert [example.frame for example in family().examples([clip], Settings())] == [1, 3]
+    assert [example.frame for example in LocationFamily().examples([clip], Settings())] == [1, 3]
 
 
 def test_a_clip_without_true_places_is_refused(tmp_path):
     clip = flown(tmp_path, Overflight(frames=1))
     assert clip.truth is not None
-    with pytest.raises(InputError, match="flown has no true places"):
-        family().examples([replace(clip, truth=replace(clip.truth, positions=None))], Settings())
+    with pytest.raises(InputError, match="flown has no true positions"):
+        LocationFamily().examples([replace(clip, truth=replace(clip.truth, positions=None))], Settings())
 
 
 def test_places_in_metres_beside_landmarks_in_degrees_are_refused(tmp_path):
@@ -99,5 +99,5 @@ def test_places_in_metres_beside_landmarks_in_degrees_are_refused(tmp_path):
     assert clip.truth is not None
     assert clip.truth.positions is not None
     places = replace(clip.truth.positions, lonlat_deg=None)
-    with pytest.raises(InputError, match="give both in one kind"):
-        family().examples([replace(clip, truth=replace(clip.truth, positions=places))], Settings())
+    with pytest.raises(InputError, match="give both in one unit"):
+        LocationFamily().examples([replace(clip, truth=replace(clip.truth, positions=places))], Settings())

@@ -7,7 +7,7 @@ import pytest
 from tests.evaluation.studies.world import filmed, followed, study
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.tuning.family import FAMILIES, family_of, prepare
+from torchvision_dddas.tuning.family import FAMILIES, load_family, prepare
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +42,12 @@ def test_knobs_of_several_families_are_told_apart(clips) -> None:
 
 def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
     with pytest.raises(InputError, match="wanted one of motion"):
-        family_of("weather")
+        load_family("weather")
 
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_every_family_is_there_and_says_what_it_is(name: str) -> None:
-    family = family_of(name)
+    family = load_family(name)
     assert family.name == name
     assert family.measure.split(".")[0] == family.task
     first, last = family.softness

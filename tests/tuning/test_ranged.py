@@ -14,9 +14,9 @@ from torchvision_dddas.evaluation.metrics.truth import Positions
 from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.ground_examples import KNOBS, sighted, sightings_of
+from torchvision_dddas.tuning.ground_location import PARAMETERS, build_ground_view
+from torchvision_dddas.tuning.location import UNPLACED, LocationFamily
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.places import UNPLACED, family
 from torchvision_dddas.types import Camera
 
 CAMERA = Camera(
@@ -31,6 +31,7 @@ CAMERA = Camera(
     heading_sigma_rad=1e-4,
     position_sigma_m=0.01,
 )
+FAMILY = LocationFamily()
 
 
 def people(seed: int, count: int = 12, feet: float = 0.03, tall: float = 0.05, body: float = 0.1):
@@ -49,7 +50,7 @@ def people(seed: int, count: int = 12, feet: float = 0.03, tall: float = 0.05, b
 
 def example(seed: int, settings: Settings, count: int = 12, **errors: float) -> Example:
     box, true = people(seed, count, **errors)
-    return Example("ground", seed, (sighted(CAMERA, box, np.zeros(len(box), bool), true), settings))
+    return Example("ground", seed, (build_ground_view(CAMERA, box, np.zeros(len(box), bool), true), settings))
 
 
 def test_the_loss_is_that_of_the_hard_places():
@@ -60,21 +61,21 @@ def test_the_loss_is_that_of_the_hard_places():
     off, covariance = found.east_north_m - seen.true_m, found.covariance_m2
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
     wanted = (squared + np.log(np.linalg.det(covariance))) / 2 + np.log(2 * np.pi)
-    assert float(family().loss({}, [one], 1.0)) == pytest.approx(wanted.mean())
+    assert float(FAMILY.loss({}, [one], 1.0)) == pytest.approx(wanted.mean())
 
 
 def test_the_gradient_is_that_of_the_hard_loss():
     settings = Settings()
-    parameters = Parameters(settings, KNOBS)
+    parameters = Parameters(settings, PARAMETERS)
     batch = [example(seed, settings) for seed in range(3)]
-    family().loss(parameters.values(), batch, 1.0).sum().backward()
+    FAMILY.loss(parameters.values(), batch, 1.0).sum().backward()
     for free in parameters.free:
         assert free.grad is not None
         wanted = []
         for step in (1e-3, -1e-3):
             with torch.no_grad():
                 free += step
-                wanted.append(float(family().loss(parameters.values(), batch, 1.0).sum()))
+                wanted.append(float(FAMILY.loss(parameters.values(), batch, 1.0).sum()))
                 free -= step
         assert float(free.grad) == pytest.approx((wanted[0] - wanted[1]) / 2e-3, rel=0.01, abs=0.01)
 
@@ -84,7 +85,7 @@ def test_ellipses_hold_as_many_places_as_they_say_on_people_not_tuned_on():
     thought = with_parameters(Settings(), {"ground.feet_sigma": 0.05, "ground.height_sigma": 0.03})
     parameters = Parameters(thought, ["ground.feet_sigma", "ground.height_sigma"])
     batch = [example(seed, thought, 120, **errors) for seed in range(3)]
-    tuned = descend(family(), parameters, batch, Plan(steps=40, batch=3, rate=0.2, look_every=20, watched=0)).settings
+    tuned = descend(FAMILY, parameters, batch, Plan(steps=40, batch=3, rate=0.2, look_every=20, watched=0)).settings
 
     def held(settings: Settings) -> float:
         shares = []
@@ -102,9 +103,9 @@ def test_people_without_a_place_cost_and_have_no_slope():
     settings = Settings()
     box, true = people(0, 1)
     box[:, 1] -= 400  # above the horizon
-    seen = sighted(CAMERA, box, np.ones(1, bool), true)
+    seen = build_ground_view(CAMERA, box, np.ones(1, bool), true)
     parameters = Parameters(settings, ["ground.feet_sigma"])
-    found = family().loss(parameters.values(), [Example("ground", 1, (seen, settings))], 1.0)
+    found = FAMILY.loss(parameters.values(), [Example("ground", 1, (seen, settings))], 1.0)
     found.sum().backward()
     assert float(found.detach()) == UNPLACED
     assert float(parameters.free[0].grad or 0) == 0
@@ -132,13 +133,13 @@ def written(folder: Path) -> Clip:
 
 def test_sightings_of_a_clip_are_those_of_people_whose_places_are_known(tmp_path):
     clip = written(tmp_path)
-    found = family().examples([clip], Settings())
+    found = FAMILY.examples([clip], Settings())
     assert [one.frame for one in found] == [1, 2]
     assert [len(one.content[0].true_m) for one in found] == [5, 5]
-    assert float(family().loss({}, found, 1.0).mean()) < 5
+    assert float(FAMILY.loss({}, found, 1.0).mean()) < 5
 
 
 def test_a_clip_without_places_is_refused(tmp_path):
     clip = Clip("bare", tmp_path, given=tmp_path / "det.txt", camera=tmp_path / "camera.toml")
-    with pytest.raises(InputError, match="bare has no true places"):
-        list(sightings_of(clip, Settings()))
+    with pytest.raises(InputError, match="bare has no true positions"):
+        FAMILY.examples([clip], Settings())

@@ -15,13 +15,13 @@ from torchvision_dddas.tuning import people
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.people import Scored, family, scored
+from torchvision_dddas.tuning.people import PeopleFamily, ScoredPicture, score_picture
 
-NAMES = [f"people.{name}" for name in people.KNOBS]
+NAMES = [f"people.{name}" for name in people.PARAMETERS]
 
 
-def picture(seed: int, true: PeopleParameters) -> Scored:
-    """Detections drawn by the parameters that are true: probabilities and the shares of bodies."""
+def picture(seed: int, true: PeopleParameters) -> ScoredPicture:
+    """Detections drawn by the parameters that are true: probabilities and the shares of body_boxes_soft."""
     rng = np.random.default_rng(seed)
     margin = np.sort(rng.uniform(-0.9, 2.5, 40))[::-1].copy()
     odds = true.probability_slope * (margin - true.probability_even)
@@ -31,7 +31,7 @@ def picture(seed: int, true: PeopleParameters) -> Scored:
     window = np.column_stack([rng.uniform(0, 300, (hits, 2)), rng.uniform([60, 120], [70, 140], (hits, 2))])
     columns = margin, right, window, body_boxes(window, true) + rng.normal(0, 1, (hits, 4))
     margin_, right_, window_, body_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
-    return Scored(margin_, right_, sure, window_, body_, int(right.sum()) + 1, PeopleParameters())
+    return ScoredPicture(margin_, right_, sure, window_, body_, int(right.sum()) + 1, PeopleParameters())
 
 
 def test_knobs_that_drew_the_truth_are_found_again():
@@ -41,12 +41,12 @@ def test_knobs_that_drew_the_truth_are_found_again():
     batch = [Example("drawn", seed, picture(seed, true)) for seed in range(20)]
     parameters = Parameters(Settings(), NAMES)
     with torch.no_grad():
-        before = float(family().loss(parameters.values(), batch, 0.05).mean())
+        before = float(PeopleFamily().loss(parameters.values(), batch, 0.05).mean())
     found = descend(
-        family(), parameters, batch, Plan(steps=60, batch=10, rate=0.1, look_every=20, watched=0)
+        PeopleFamily(), parameters, batch, Plan(steps=60, batch=10, rate=0.1, look_every=20, watched=0)
     ).settings.people
     with torch.no_grad():
-        assert float(family().loss(parameters.values(), batch, 0.05).mean()) < before
+        assert float(PeopleFamily().loss(parameters.values(), batch, 0.05).mean()) < before
     for name, within in (("height_share", 0.02), ("width_share", 0.02), ("feet_share", 0.02)):
         assert getattr(found, name) == pytest.approx(getattr(true, name), abs=within)
     assert found.probability_even == pytest.approx(0.5, abs=0.15)
@@ -58,9 +58,11 @@ def test_knobs_that_drew_the_truth_are_found_again():
 def test_each_parameter_moves_its_own_part_alone():
     batch = [Example("drawn", 0, picture(0, PeopleParameters()))]
     parameters = Parameters(Settings(), ["people.threshold"])
-    family().loss(parameters.values(), batch, 0.2).sum().backward()
+    PeopleFamily().loss(parameters.values(), batch, 0.2).sum().backward()
     assert float(parameters.free[0].grad or 0) != 0
-    alone = family().loss({}, batch, 0.0) - family().loss({"people.threshold": torch.tensor(0.5)}, batch, 0.0)
+    alone = PeopleFamily().loss({}, batch, 0.0) - PeopleFamily().loss(
+        {"people.threshold": torch.tensor(0.5)}, batch, 0.0
+    )
     content = batch[0].content
     right = content.right * (content.margin > 0)
     f = 2 * right.sum() / ((content.margin > 0).sum() + content.people)
@@ -100,17 +102,17 @@ def spotted() -> tuple[np.ndarray, np.ndarray]:
 
 def test_detections_below_the_threshold_are_kept_without_a_probability():
     image, true = spotted()
-    found = scored(image, true, PeopleParameters(), Spots())
+    found = score_picture(image, true, PeopleParameters(), Spots())
     assert found.margin.tolist() == pytest.approx([1.5, 0.5, -0.5])
     assert found.right.tolist() == [1, 0, 0]
-    assert (found.sure, found.people) == (2, 1)
+    assert (found.shown, found.people) == (2, 1)
     np.testing.assert_allclose(found.true_px.numpy(), true)
     np.testing.assert_allclose(found.window_px.numpy(), [[8, 16, 64, 128]])
 
 
 def test_what_does_not_count_is_left_out():
     image, true = spotted()
-    found = scored(image, true, PeopleParameters(), Spots(), lambda box_px: box_px[:, 0] < 100)
+    found = score_picture(image, true, PeopleParameters(), Spots(), lambda box_px: box_px[:, 0] < 100)
     assert found.margin.tolist() == pytest.approx([1.5])
 
 
@@ -121,14 +123,14 @@ def test_a_clip_gives_its_labelled_pictures(tmp_path: Path, monkeypatch: pytest.
         files.append(tmp_path / f"{number}.png")
         cv2.imwrite(str(files[-1]), image)
     truth = Truth("boxes", tmp_path, {}, {1: true, 3: np.zeros((0, 4))})
-    monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", lambda parameters: Spots())
+    monkeypatch.setattr("torchvision_dddas.tuning.people.load_scorer", lambda parameters: Spots())
     clip = Clip("spots", tmp_path, tuple(files), truth=truth, shows=("people",))
-    found = family().examples([clip], Settings())
+    found = PeopleFamily().examples([clip], Settings())
     assert [(one.frame, one.content.people, one.content.right.sum()) for one in found] == [(1, 1, 1), (3, 0, 0)]
     with pytest.raises(InputError, match="spots has no boxes of people"):
-        family().examples([replace(clip, truth=None)], Settings())
+        PeopleFamily().examples([replace(clip, truth=None)], Settings())
 
 
 def test_other_suppressions_than_nms_are_refused():
     with pytest.raises(InputError, match="set it to nms"):
-        family().examples([], with_parameters(Settings(), {"people.suppression": "opencv"}))
+        PeopleFamily().examples([], with_parameters(Settings(), {"people.suppression": "opencv"}))

@@ -18,7 +18,7 @@ from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.registration import CHECK, RANSAC, Registering
+from torchvision_dddas.tuning.registration import CHECK, RANSAC, RegistrationFamily
 
 SETTINGS = Settings()
 
@@ -33,12 +33,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
 
 @pytest.fixture(scope="module")
 def examples(clip: Clip) -> list[Example]:
-    return Registering().examples([clip], SETTINGS)
+    return RegistrationFamily().examples([clip], SETTINGS)
 
 
 def lost(examples: list[Example], tolerance_px: float, check_px: float, softness: float = 0.0) -> torch.Tensor:
     parameters = {RANSAC: torch.tensor(tolerance_px).double(), CHECK: torch.tensor(check_px).double()}
-    return Registering().loss(parameters, examples, softness)
+    return RegistrationFamily().loss(parameters, examples, softness)
 
 
 def test_every_labelled_frame_that_has_a_next_one_is_an_example(clip: Clip, examples: list[Example]) -> None:
@@ -74,14 +74,14 @@ def test_knobs_of_the_family_have_finite_gradients(examples: list[Example]) -> N
     parameters = Parameters(
         SETTINGS, [name for name, parameter in TUNABLE.items() if parameter.family == "registration"]
     )
-    Registering().loss(parameters.values(), examples, 0.2).sum().backward()
+    RegistrationFamily().loss(parameters.values(), examples, 0.2).sum().backward()
     for name, free in zip(parameters.names, parameters.free, strict=True):
         assert free.grad is not None and bool(free.grad.isfinite()) and float(free.grad) != 0, name
 
 
 def test_a_tolerance_that_is_too_wide_slopes_down_to_narrower_ones(examples: list[Example]) -> None:
     parameters = Parameters(with_parameters(SETTINGS, {RANSAC: 6.0}), [RANSAC])
-    Registering().loss(parameters.values(), examples, 0.3).sum().backward()
+    RegistrationFamily().loss(parameters.values(), examples, 0.3).sum().backward()
     assert float(parameters.free[0].grad) > 0
     assert float(lost(examples, 6.0, 1.0).mean()) > float(lost(examples, 2.0, 1.0).mean())
 
@@ -100,16 +100,16 @@ def test_what_cannot_be_tuned_is_told_in_a_line(clip: Clip, examples: list[Examp
     assert clip.truth is not None
     bare, told = replace(clip, name="bare", truth=replace(clip.truth, masks={})), list[int]()
     with pytest.raises(InputError, match="bare has no masks of what moves"):
-        Registering().examples([clip, bare], SETTINGS, lambda: told.append(1))
+        RegistrationFamily().examples([clip, bare], SETTINGS, lambda: told.append(1))
     assert not told, "a clip was computed before"
     with pytest.raises(InputError, match=r"registration\.halved"):
-        Registering().check([RANSAC], with_parameters(SETTINGS, {"registration.halved": True}))
+        RegistrationFamily().check([RANSAC], with_parameters(SETTINGS, {"registration.halved": True}))
     unchecked = with_parameters(SETTINGS, {CHECK: 0.0})
-    free = Registering().examples([clip], unchecked)
-    assert bool(torch.isfinite(Registering().loss({RANSAC: torch.tensor(2.0).double()}, free, 0.1)).all())
+    free = RegistrationFamily().examples([clip], unchecked)
+    assert bool(torch.isfinite(RegistrationFamily().loss({RANSAC: torch.tensor(2.0).double()}, free, 0.1)).all())
     with pytest.raises(InputError, match="forward_backward_px = 0 leaves the check out"):
-        Registering().check([RANSAC, CHECK], unchecked)
+        RegistrationFamily().check([RANSAC, CHECK], unchecked)
     assert clip.truth.masks
     alone = replace(clip, truth=replace(clip.truth, masks={5: clip.truth.masks[5]}))
-    with pytest.raises(InputError, match="no two frames after each other"):
-        Registering().examples([alone], SETTINGS)
+    with pytest.raises(InputError, match="no two consecutive frames"):
+        RegistrationFamily().examples([alone], SETTINGS)

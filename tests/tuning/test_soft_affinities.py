@@ -12,14 +12,14 @@ from torch import Tensor
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.source_tracker import Features, associate
+from torchvision_dddas.tuning.examples import stack_padded
 from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.source_association import (
     Windows,
+    build_window,
     link_gains,
+    links_nll,
     location_weight,
-    together,
-    unlikeliness,
-    window_of,
     wrong_links,
 )
 
@@ -46,7 +46,7 @@ def looks_of(
 
 
 def windows(parameters: PaperParameters, count: int = 6, many: int = 6, **kinds: Any) -> Windows:
-    return together([window_of(*looks_of(count, seed, **kinds), parameters) for seed in range(many)])
+    return stack_padded(Windows, [build_window(*looks_of(count, seed, **kinds), parameters) for seed in range(many)])
 
 
 def paper(**values: Any) -> PaperParameters:
@@ -63,7 +63,7 @@ def test_without_softness_the_links_and_the_weight_are_those_of_the_source(value
     parameters = PaperParameters.model_validate({"window": 2} | values)
     for seed in range(5):
         looks, identities = looks_of(7, seed, pictured, hues=3)
-        one = together([window_of(looks, identities, parameters)])
+        one = stack_padded(Windows, [build_window(looks, identities, parameters)])
         hard = associate(list(looks), parameters)
         assert location_weight(parameters, one).item() == pytest.approx(hard.weight)
         wanted = {(i - 1, j - 1) for i, j in hard.rows.tolist() if i and j}
@@ -92,7 +92,7 @@ def test_slopes_are_those_of_small_changes_and_none_is_missing():
 
     def lost(*values: Tensor) -> Tensor:
         parameters = paper(**dict(zip(ALL, values, strict=True)))
-        return torch.cat([wrong_links(parameters, many, 0.1), unlikeliness(parameters, many, 0.1)])
+        return torch.cat([wrong_links(parameters, many, 0.1), links_nll(parameters, many, 0.1)])
 
     start = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (0.1, 0.6, 0.3, 0.3)]
     # Ten rounds of messages are not their fixed point, at which alone the slope is exact.
@@ -108,19 +108,23 @@ def test_slopes_are_those_of_small_changes_and_none_is_missing():
 
 def test_nobody_and_targets_that_fill_up_change_nothing_and_all_is_finite():
     parameters = paper(threshold=torch.tensor(0.1, dtype=torch.float64, requires_grad=True))
-    parts = [window_of(*looks_of(count, 3, leaving=leaving), parameters) for count, leaving in ((0, 0), (1, 1), (6, 2))]
-    both = wrong_links(parameters, together(parts), 0.05)
-    alone = torch.cat([wrong_links(parameters, together([part]), 0.05) for part in parts])
+    parts = [
+        build_window(*looks_of(count, 3, leaving=leaving), parameters) for count, leaving in ((0, 0), (1, 1), (6, 2))
+    ]
+    both = wrong_links(parameters, stack_padded(Windows, parts), 0.05)
+    alone = torch.cat([wrong_links(parameters, stack_padded(Windows, [part]), 0.05) for part in parts])
     torch.testing.assert_close(both, alone, rtol=0, atol=1e-3)
     assert both[0] == 0
     threshold: Any = parameters.threshold
-    (slope,) = torch.autograd.grad(both.sum() + unlikeliness(parameters, together(parts), 0.05).sum(), threshold)
+    (slope,) = torch.autograd.grad(
+        both.sum() + links_nll(parameters, stack_padded(Windows, parts), 0.05).sum(), threshold
+    )
     assert torch.isfinite(slope)
 
 
 def test_the_order_of_targets_does_not_matter():
     looks, identities = looks_of(6, 1)
-    plain = together([window_of(looks, identities, paper())])
+    plain = stack_padded(Windows, [build_window(looks, identities, paper())])
     order = np.array([2, 0, 1, 5, 4, 3])
     mixed = Windows(**{field.name: getattr(plain, field.name) for field in fields(Windows)})
     rows = np.append(0, order + 1)
@@ -130,7 +134,7 @@ def test_the_order_of_targets_does_not_matter():
         alternative=plain.alternative[:, :, rows],
         true=plain.true[:, order],
     )
-    for loss in (wrong_links, unlikeliness):
+    for loss in (wrong_links, links_nll):
         torch.testing.assert_close(loss(paper(), mixed, 0.05), loss(paper(), plain, 0.05))
 
 
@@ -139,7 +143,7 @@ def test_a_link_that_no_parameter_can_save_counts_no_more_than_once():
     exchanged = replace(many, true=many.true.flip(2))
     wrong = wrong_links(paper(), exchanged, 0.001)
     assert (wrong <= 4 + 1e-6).all()
-    assert (unlikeliness(paper(), exchanged, 0.001) > 10).any()
+    assert (links_nll(paper(), exchanged, 0.001) > 10).any()
 
 
 @pytest.mark.parametrize(("start", "group"), [({"threshold": 0.8}, "threshold"), ({"weight": 0.95}, "weight")])

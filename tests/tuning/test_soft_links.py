@@ -12,7 +12,7 @@ from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.scores import SceneState, association_scores
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.tracking import Looks, unlikeliness
+from torchvision_dddas.tuning.tracking import Stretches, link_nll
 
 NAMES = [
     "track.speed",
@@ -31,7 +31,7 @@ NAMES = [
 ]
 
 
-def walkers(count: int = 6, looks: int = 10, scatter: float = 0.06, hide: bool = True, seed: int = 0) -> Looks:
+def walkers(count: int = 6, looks: int = 10, scatter: float = 0.06, hide: bool = True, seed: int = 0) -> Stretches:
     """Stretches of people who walk about and are now and then not seen; one pair of walks each of two scenes."""
     draw = np.random.default_rng(seed)
     frame = np.tile(1.0 + 5 * np.arange(looks), (2, 1))
@@ -58,7 +58,7 @@ def walkers(count: int = 6, looks: int = 10, scatter: float = 0.06, hide: bool =
         "visible": np.ones((2, looks, count)),
         "own": np.zeros(2, bool),
     }
-    return Looks(**{name: torch.as_tensor(value) for name, value in parts.items()})
+    return Stretches(**{name: torch.as_tensor(value) for name, value in parts.items()})
 
 
 def track(values: dict[str, Tensor]) -> TrackParameters:
@@ -84,7 +84,7 @@ def test_tensors_are_scored_as_arrays_are():
 
 def test_every_parameter_has_a_slope_and_all_are_finite():
     values = Parameters(Settings(), NAMES).values()
-    slopes = torch.autograd.grad(unlikeliness(track(values), walkers(), 1.0).sum(), list(values.values()))
+    slopes = torch.autograd.grad(link_nll(track(values), walkers(), 1.0).sum(), list(values.values()))
     assert all(torch.isfinite(slope) for slope in slopes)
     assert [name for name, slope in zip(values, slopes, strict=True) if slope == 0] == []
 
@@ -93,7 +93,7 @@ def test_slopes_are_those_of_small_changes():
     looks = walkers(3, 5)
 
     def lost(*values: Tensor) -> Tensor:
-        return unlikeliness(track(dict(zip(NAMES, values, strict=True))), looks, 1.0)
+        return link_nll(track(dict(zip(NAMES, values, strict=True))), looks, 1.0)
 
     start = [value.detach() for value in Parameters(Settings(), NAMES).values().values()]
     for place in range(len(NAMES)):
@@ -111,45 +111,43 @@ def test_true_links_are_likelier_than_exchanged_ones():
     looks = walkers(4, 6, hide=False)
     exchanged = looks.box_px.clone()
     exchanged[:, 3:] = exchanged[:, 3:].flip(2)
-    right, wrong = (
-        unlikeliness(Settings().track, replace(looks, box_px=box), 1.0) for box in (looks.box_px, exchanged)
-    )
+    right, wrong = (link_nll(Settings().track, replace(looks, box_px=box), 1.0) for box in (looks.box_px, exchanged))
     assert (right < wrong - 0.5).all()
 
 
 def test_margins_cost_most_where_links_are_in_doubt():
     """Sure links stay all but free, those that could be exchanged cost more; without margins nothing changes."""
     sure, vague = walkers(2, 6, hide=False), walkers(12, 6, hide=False, scatter=0.4)
-    of = [[unlikeliness(Settings().track, looks, 1.0, m, m).mean() for m in (0.0, 1.0)] for looks in (sure, vague)]
+    of = [[link_nll(Settings().track, looks, 1.0, m, m).mean() for m in (0.0, 1.0)] for looks in (sure, vague)]
     assert of[0][1] > of[0][0]
     assert of[1][1] - of[1][0] > 2 * (of[0][1] - of[0][0])
-    torch.testing.assert_close(unlikeliness(Settings().track, sure, 1.0, 0.0, 0.0).mean(), of[0][0])
+    torch.testing.assert_close(link_nll(Settings().track, sure, 1.0, 0.0, 0.0).mean(), of[0][0])
 
 
 def test_cold_margins_are_a_hinge_that_is_zero_where_the_true_links_are_best_by_far():
     looks = walkers(2, 6, hide=False, scatter=0.01)
-    assert unlikeliness(Settings().track, looks, 0.01, 1.0, 1.0).abs().max() < 0.02
+    assert link_nll(Settings().track, looks, 0.01, 1.0, 1.0).abs().max() < 0.02
 
 
 def test_neither_the_order_of_targets_nor_empty_places_matter():
     looks = walkers()
-    wanted = unlikeliness(Settings().track, looks, 1.0)
+    wanted = link_nll(Settings().track, looks, 1.0)
     order = torch.tensor([3, 1, 5, 0, 2, 4])
     of_targets = ("box_px", "there", "certain", "begins", "visible")
     mixed = {name: getattr(looks, name)[:, :, order] for name in of_targets}
-    torch.testing.assert_close(unlikeliness(Settings().track, replace(looks, **mixed), 1.0), wanted)
+    torch.testing.assert_close(link_nll(Settings().track, replace(looks, **mixed), 1.0), wanted)
     wider = {name: torch.cat([getattr(looks, name)] * 2, 2) for name in of_targets}
     for name in ("there", "certain", "begins"):
         wider[name][:, :, 6:] = False
     wider["likeness"] = torch.full((2, 10, 12, 12), torch.nan, dtype=torch.float64)
-    torch.testing.assert_close(unlikeliness(Settings().track, replace(looks, **wider), 1.0), wanted)
+    torch.testing.assert_close(link_nll(Settings().track, replace(looks, **wider), 1.0), wanted)
 
 
 def test_a_stretch_has_the_same_loss_in_any_company():
     looks = walkers()
-    alone = Looks(**{field.name: getattr(looks, field.name)[:1] for field in fields(Looks)})
-    both = unlikeliness(Settings().track, looks, 1.0)
-    torch.testing.assert_close(unlikeliness(Settings().track, alone, 1.0)[0], both[0], rtol=0, atol=1e-3)
+    alone = Stretches(**{field.name: getattr(looks, field.name)[:1] for field in fields(Stretches)})
+    both = link_nll(Settings().track, looks, 1.0)
+    torch.testing.assert_close(link_nll(Settings().track, alone, 1.0)[0], both[0], rtol=0, atol=1e-3)
 
 
 def test_a_pan_that_is_known_costs_nothing():
@@ -160,7 +158,7 @@ def test_a_pan_that_is_known_costs_nothing():
     moved[..., 0] += 150.0 * torch.arange(6)[None, :, None]
     size = torch.full((2, 2), 1e6, dtype=torch.float64)
     still, unknown, known = (
-        unlikeliness(Settings().track, replace(looks, size=size, **changed), 1.0)
+        link_nll(Settings().track, replace(looks, size=size, **changed), 1.0)
         for changed in ({}, {"box_px": moved}, {"box_px": moved, "step": pan})
     )
     torch.testing.assert_close(known, still)
@@ -174,7 +172,7 @@ def test_own_targets_are_scored_with_their_own_scatter():
     as_own = shipped.model_copy(
         update={"scatter": shipped.own_scatter, "size_scatter": shipped.own_size_scatter, "births": shipped.own_births}
     )
-    torch.testing.assert_close(unlikeliness(shipped, own, 1.0), unlikeliness(as_own, looks, 1.0))
+    torch.testing.assert_close(link_nll(shipped, own, 1.0), link_nll(as_own, looks, 1.0))
 
 
 def test_a_wrong_scatter_is_brought_back_by_a_few_steps():
@@ -185,7 +183,7 @@ def test_a_wrong_scatter_is_brought_back_by_a_few_steps():
     adam = torch.optim.Adam(parameters.parameters(), lr=0.3)
     losses = []
     for _ in range(12):
-        loss = unlikeliness(
+        loss = link_nll(
             TrackParameters.model_construct(**(dict(parameters.base.track) | track_of(parameters))), looks, 1.0
         ).mean()
         adam.zero_grad()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.tuning.soft_places import Linear, Spread, gauss_newton_step, gaussian_nll, project_to_ground
+from torchvision_dddas.tuning.aerial_location import Linear, Spread, gauss_newton_step, gaussian_nll, project_to_ground
 
 
 def test_a_spread_is_the_sum_of_what_knobs_add_to_it():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, chosen
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, expand_names
 
 
 @pytest.mark.parametrize("name", TUNABLE)
@@ -72,7 +72,7 @@ def test_a_parameter_that_moved_changes_its_setting_alone() -> None:
 
 
 def test_a_group_stands_for_its_tunable_parameters() -> None:
-    assert chosen(["morphology.*", "morphology.erode_px"]) == ["morphology.erode_px", "morphology.close_px"]
+    assert expand_names(["morphology.*", "morphology.erode_px"]) == ["morphology.erode_px", "morphology.close_px"]
 
 
 @pytest.mark.parametrize("name", ["difference.kind", "difference.treshold", "nonsense", "registration.levels"])

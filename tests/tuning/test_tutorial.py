@@ -11,18 +11,18 @@ import pytest
 
 from tests.synthetic_clip import film_into
 from tests.tuning.test_colours import scene
+from torchvision_dddas import tuning
 from torchvision_dddas.io.colour_files import read_colours
-from torchvision_dddas.tuning import descent
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
 def test_the_script_runs_and_says_what_tuning_was_worth(tmp_path, monkeypatch, capsys) -> None:
-    plan = descent.Plan
+    plan = tuning.Plan
     monkeypatch.setattr(
         "torchvision_dddas.simulation.film_clip", lambda folder, seed, **_: film_into(folder, seed, 6, (160, 120))
     )
-    monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2, look_every=1))
+    monkeypatch.setattr(tuning, "Plan", lambda **_: plan(steps=2, batch=2, look_every=1))
     runpy.run_path(str(DOCS / "tuning.py"))["main"](tmp_path)
     told = capsys.readouterr().out
     assert "step 2: " in told and "difference.threshold: 12 -> " in told
@@ -55,8 +55,8 @@ def test_the_ten_lines_of_the_text_run_as_they_are(tmp_path, monkeypatch, capsys
     for seed, name in enumerate(("one", "held")):
         film_into(tmp_path / "clips" / name, seed, frames=6, size=(160, 120))
     (tmp_path / "study.toml").write_text('[[dataset]]\nkind = "folder"\nfolder = "clips"\n')
-    plan = descent.Plan
-    monkeypatch.setattr(descent, "Plan", lambda **_: plan(steps=2, batch=2))
+    plan = tuning.Plan
+    monkeypatch.setattr(tuning, "Plan", lambda **_: plan(steps=2, batch=2))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ten.py").write_text(code)

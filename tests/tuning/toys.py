@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from torchvision_dddas.evaluation.studies.spec import Task
-from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.family import Example, Family
 
 
 @dataclass
-class Bowl:
+class Bowl(Family):
     """Least where the logarithm of the threshold is `place` and more of each example, of the noise 0.
 
     wrong_above: of the threshold, from which on the loss of the example `wrong` is no number. steep_at: an example
@@ -28,9 +28,9 @@ class Bowl:
     measure: str = "motion.pixels.f"
     softness: tuple[float, float] = (1.0, 0.1)
 
-    def examples(self, clips, settings, tick=lambda: None) -> list[Example]:
+    def clip_examples(self, clip, settings):
         """Two of each clip."""
-        return [Example(clip.name, frame, torch.tensor(0.0)) for clip in clips for frame in (1, 2)]
+        return [(frame, torch.tensor(0.0)) for frame in (1, 2)]
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """A bowl, a little deeper for what is soft."""

@@ -1,4 +1,4 @@
-"""The state of a descent on disk, whole or not at all, and whether it is that of the descent that is asked for."""
+"""The state of a descent on disk, with what it depends on, so that only the same descent is resumed."""
 
 import hashlib
 import io
@@ -13,21 +13,21 @@ import torch
 from torchvision_dddas.config import changes
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, save_file
-from torchvision_dddas.tuning.family import Family, loss_of
+from torchvision_dddas.tuning.family import Family
 from torchvision_dddas.tuning.parameters import Parameters
 
 FORMAT = 3
 
 
-def facts(
+def describe_descent(
     family: Family, parameters: Parameters, plan: Mapping[str, Any], seen: Sequence[str], cost: object
 ) -> dict[str, Any]:
-    """What a descent depends on, in words and numbers. seen: its examples, in order."""
+    """What a descent depends on, in texts and numbers. seen: its examples, in order."""
     return {
         "family": family.name,
         "task": family.task,
-        "interval": getattr(family, "interval", 1),
-        "loss": loss_of(family),
+        "interval": family.interval,
+        "loss": family.loss_name,
         "knobs": ", ".join(parameters.names),
         "settings": json.dumps(changes(parameters.base), default=str),
         **plan,
@@ -36,44 +36,41 @@ def facts(
     }
 
 
-def write(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write a state. Raises InputError where the disk refuses."""
+def write_checkpoint(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    """Write a state. asked: as `describe_descent` returns it. Raises InputError where the disk refuses."""
     content = io.BytesIO()
     torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
     save_file(place, content.getvalue())
 
 
-def read(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The state. Raises InputError where the file is none, or is of a descent that was asked for otherwise."""
+def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """The state. Raises InputError for a file that is no checkpoint, or that of a descent with other facts."""
     try:
-        # No code is run: a checkpoint is tensors, numbers and words.
-        found = torch.load(place, weights_only=True, map_location="cpu")
-        told, state = dict(found["asked"]), dict(found["state"])
-        form = found["format"]
+        found = _load(place)
+        written, state, form = dict(found["asked"]), dict(found["state"]), found["format"]
     except OSError as error:
         raise InputError(f"{place} cannot be read: {error.strerror}") from None
-    except Exception:  # of bytes that are no checkpoint torch's reader raises nearly anything
+    except Exception:  # for bytes that are no checkpoint torch's reader raises nearly anything
         raise InputError(f"{place} is no checkpoint, or is damaged; begin again without --resume") from None
     if form != FORMAT:
         raise InputError(f"{place} is a checkpoint of another version; begin again without --resume")
     for name, value in asked.items():
-        if told.get(name) != value:
+        if written.get(name) != value:
             raise InputError(
-                f"{place} is of a descent with other {name.replace('_', ' ')}, {_short(told.get(name))} and not "
+                f"{place} is of a descent with other {name.replace('_', ' ')}, {_short(written.get(name))} and not "
                 f"{_short(value)}; ask for the same, or begin again without --resume"
             )
     return state
 
 
 def set_aside(place: Path, aside: Path, more: Mapping[Path, Path] = MappingProxyType({})) -> int:
-    """Keep a checkpoint that a new descent would overwrite; how many steps it took, 0 where nothing is kept.
+    """Keep an unfinished checkpoint that a new descent would overwrite; return its steps, 0 if none was kept.
 
-    Kept is what could still be gone on with: a descent that did not come to its end, of more steps than one that lies
-    there already. more: files that belong to it, and where to, as far as they are there. Raises InputError where the
-    disk refuses.
+    One of more steps that lies at `aside` already is left there. more: files that belong to it, and where they go.
+    Raises InputError where the disk refuses.
     """
-    steps = _unfinished(place)
-    if steps == 0 or steps < _unfinished(aside):
+    steps = _unfinished_steps(place)
+    if steps == 0 or steps < _unfinished_steps(aside):
         return 0
     for here, there in {**more, place: aside}.items():
         try:
@@ -84,13 +81,17 @@ def set_aside(place: Path, aside: Path, more: Mapping[Path, Path] = MappingProxy
     return steps
 
 
-def _unfinished(place: Path) -> int:
-    """Steps of a descent that did not come to its end; 0 where there is none that can be read."""
+def _unfinished_steps(place: Path) -> int:
     try:
-        state = torch.load(place, weights_only=True, map_location="cpu")["state"]
+        state = _load(place)["state"]
         return 0 if state["ended"] or state["failed"] else int(state["history"][-1]["step"])
-    except Exception:  # as above: what cannot be read cannot be gone on with
+    except Exception:  # what cannot be read cannot be resumed
         return 0
+
+
+def _load(place: Path) -> Any:
+    # weights_only: a checkpoint is tensors, numbers and texts, and runs no code.
+    return torch.load(place, weights_only=True, map_location="cpu")
 
 
 def _short(value: object) -> str:

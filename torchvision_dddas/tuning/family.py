@@ -1,13 +1,14 @@
-"""Families of parameters that can be tuned by gradient, and the preparation of a study for them."""
+"""What can be tuned: the base class of all families of parameters, and the preparation of a study for one of them."""
 
 import glob
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Self, cast
 
+import torch
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, load_config
@@ -17,135 +18,113 @@ from torchvision_dddas.evaluation.studies.goals import Goal, check_possible, par
 from torchvision_dddas.evaluation.studies.runner import plan_study
 from torchvision_dddas.evaluation.studies.spec import Spec, Task
 from torchvision_dddas.evaluation.studies.sweep import split_clips
-from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, chosen
+from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, expand_names
 
 Tick = Callable[[], object]
 
-FAMILIES: Mapping[str, str] = {
-    "motion": "motion",
-    "registration": "registration",
-    "tracking": "tracking",
-    "paper": "source_association",
-    "people": "people",
-    "location": "places",
+FAMILIES = {
+    "motion": "motion.MotionFamily",
+    "registration": "registration.RegistrationFamily",
+    "tracking": "tracking.TrackingFamily",
+    "paper": "source_association.SourceFamily",
+    "people": "people.PeopleFamily",
+    "location": "location.LocationFamily",
 }
-"""Family, as `modules.tunable` names it -> the module of this folder whose function `family()` makes it."""
+"""Family -> its module and class in this package; a module is loaded when its family is used."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One piece of what is true. clip, frame: what messages name. content: what the family's loss takes, on the CPU."""
+    """One labelled piece of a clip. clip, frame: named in messages. content: what the loss takes, on the CPU."""
 
     clip: str
     frame: int
     content: Any
 
 
-class Family(Protocol):
-    """A stage of the pipeline, as far as it can be tuned."""
+class Family(ABC):
+    """A stage of the pipeline whose parameters can be tuned: examples of what is true, and a loss on them.
 
-    @property
-    def name(self) -> str:
-        """One of FAMILIES."""
-        ...
+    name: a key of FAMILIES. task: of a study, whose clips are used. measure: judged before and after, such as
+    motion.pixels.f. softness: of the loss at the first and at the last step. losses: names to choose from, the first is
+    the default; empty where there is one loss only. loss_name: the chosen one. interval: frames between examples.
+    """
 
-    @property
-    def task(self) -> Task:
-        """The task of a study that its knobs matter for: its clips are tuned on, and it measures before and after."""
-        ...
+    name: str
+    task: Task
+    measure: str
+    softness: tuple[float, float]
+    losses: tuple[str, ...] = ()
+    loss_name: str = ""
+    interval: int = 1
+    empty = ""
+    """Why a clip may give no example; a clip without any is an error where this is set."""
 
-    @property
-    def measure(self) -> str:
-        """What is told before and after, as `dddas sweep --measure` takes it: motion.pixels.f. Hard operations."""
-        ...
+    @abstractmethod
+    def clip_examples(self, clip: Clip, settings: Settings) -> Iterable[tuple[int, Any]]:
+        """Frame number and content of each example of a clip, in the order of its frames.
 
-    @property
-    def softness(self) -> tuple[float, float]:
-        """At the first and the last step; the steps between go evenly in the logarithm. No unit: 1 is very soft."""
-        ...
+        Raises InputError where the clip lacks the truth that the loss needs.
+        """
+
+    def check(self, names: Sequence[str], settings: Settings) -> None:  # noqa: B027
+        """Raises InputError, with what to set, where a parameter has no effect under these settings."""
+
+    def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:  # noqa: B027
+        """Raises InputError, before anything is computed, for clips that cannot be used."""
+
+    def at(self, interval_frames: int, task: Task) -> Self:
+        """The family for a study's interval and for the task of the measure."""
+        return self
+
+    def with_loss(self, name: str) -> Self:
+        """The family with another of its losses. Raises InputError where it has no such loss."""
+        if name not in self.losses:
+            wanted = f"wanted one of {', '.join(self.losses)}" if self.losses else "it has one only; leave --loss out"
+            raise InputError(f"'{name}' is no loss of the family {self.name}; {wanted}")
+        return cast(Self, replace(cast(Any, self), loss_name=name))
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """What is true of some clips, each clip's in the order of its frames, prepared once by the hard operations.
-
-        tick: called once an example. Raises InputError in one line where a clip lacks the truth that the loss needs.
-        """
-        ...
+        """The examples of all clips. tick is called once an example. Raises InputError for a clip without any."""
+        self.check_clips(clips, settings)
+        found: list[Example] = []
+        for clip in clips:
+            before = len(found)
+            for frame, content in self.clip_examples(clip, settings):
+                found.append(Example(clip.name, frame, content))
+                tick()
+            if self.empty and len(found) == before:
+                raise InputError(f"{clip.name}: {self.empty}")
+        return found
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """How wrong each example is: (B,), least is best, with a gradient in the parameters; on the knobs' device.
+        """(B,) how wrong each example is, with a gradient in the parameters, on their device.
 
-        parameters: values in the units of `settings`, scalars or (n,), by name: those tuned alone; what is not tuned is
-        as in the settings that the examples were prepared with. The result depends on nothing but the arguments.
+        parameters: the tuned values by name, in the units of the settings; all others are as the examples were prepared
+        with. The result depends on nothing else. Unless a family overrides this, it computes on the CPU.
         """
-        ...
+        device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
+        values = {name: value.cpu() for name, value in parameters.items()}
+        return torch.stack(self._losses([example.content for example in batch], values, softness)).to(device)
+
+    def _losses(self, contents: Sequence[Any], values: dict[str, Tensor], softness: float) -> list[Tensor]:
+        raise NotImplementedError
 
 
-@runtime_checkable
-class Timed(Protocol):
-    """A family whose examples depend on how far apart the looks are."""
-
-    def at(self, interval_frames: int, task: Task) -> Family:
-        """The family for a study's interval and for the task that its measure is of."""
-        ...
-
-
-@runtime_checkable
-class Particular(Protocol):
-    """A family whose parameters have a say under some settings alone."""
-
-    def check(self, names: Sequence[str], settings: Settings) -> None:
-        """Raises InputError in one line, with what to set, where one of its parameters would be tuned for nothing."""
-        ...
-
-
-@runtime_checkable
-class Choosing(Protocol):
-    """A family that offers several losses."""
-
-    @property
-    def losses(self) -> tuple[str, ...]:
-        """Their names, the first the one that is taken unless said."""
-        ...
-
-    @property
-    def loss_name(self) -> str:
-        """The one that is taken."""
-        ...
-
-    def by(self, loss_name: str) -> Family:
-        """The family with one of its losses."""
-        ...
-
-
-def with_loss(family: Family, name: str) -> Family:
-    """A family with one of its losses. Raises InputError, with what there is, where it has no such."""
-    offered = family.losses if isinstance(family, Choosing) else ()
-    if isinstance(family, Choosing) and name in offered:
-        return family.by(name)
-    there = f"wanted one of {', '.join(offered)}" if offered else "it has one of its own; leave --loss out"
-    raise InputError(f"'{name}' is no loss of the family {family.name}; {there}")
-
-
-def loss_of(family: Family) -> str:
-    """The name of a family's loss; empty where it has no choice."""
-    return family.loss_name if isinstance(family, Choosing) else ""
-
-
-def family_of(name: str) -> Family:
+def load_family(name: str) -> Family:
     """The family of a name. Raises InputError where there is none."""
-    module = f"{__package__}.{FAMILIES[name]}" if name in FAMILIES else ""
-    if not module or find_spec(module) is None:
-        known = [known for known, file in FAMILIES.items() if find_spec(f"{__package__}.{file}") is not None]
-        raise InputError(f"'{name}' is no family of parameters that can be tuned; wanted one of {', '.join(known)}")
-    found: Family = import_module(module).family()
+    if name not in FAMILIES:
+        raise InputError(f"'{name}' is no family of parameters that can be tuned; wanted one of {', '.join(FAMILIES)}")
+    module, kind = FAMILIES[name].split(".")
+    found: Family = getattr(import_module(f"{__package__}.{module}"), kind)()
     return found
 
 
 @dataclass
 class Prepared:
-    """What there is to tune. spec: the study with the family's task alone. tuned, held: names of clips.
+    """A study that is ready for tuning. spec: the study with the family's task alone. tuned, held: names of clips.
 
-    clips: those tuned on. goal: what is told before and after.
+    clips: those tuned on. goal: the measure that is judged before and after.
     """
 
     spec: Spec
@@ -169,39 +148,37 @@ def prepare(
     loss: str | None = None,
     tick: Tick = lambda: None,
 ) -> Prepared:
-    """Read a study's clips, and prepare the examples of those that are not held out.
+    """Read a study's clips and prepare the examples of those that are not held out.
 
-    names: of parameters, as `tunable.chosen` takes them. holdout, clips: patterns of clips' names. measure: in place of
-    the family's. loss: one of those that the family offers. tick: called once an example. Raises InputError for a
-    parameter that cannot be tuned or has no say under the settings, parameters of several families, a loss that the
-    family has not, clips without the truth that is needed, and as `running.plan` does.
+    names: of parameters, as `expand_names` takes them. holdout, clips: patterns of clips' names. measure, loss: in
+    place of the family's. tick: called once an example. Raises InputError for a parameter that cannot be tuned or has
+    no effect under the settings, parameters of several families, an unknown loss, clips without the needed truth, and
+    as `plan_study` does.
     """
     settings = load_config(spec.config, spec.overrides)
-    family = _family(names)
+    family = _common_family(names)
     parameters = Parameters(settings, names)
-    if isinstance(family, Particular):
-        family.check(parameters.names, settings)
+    family.check(parameters.names, settings)
     goal = parse_goal(measure or family.measure)
-    if isinstance(family, Timed):
-        family = family.at(spec.interval, goal.task)
+    family = family.at(spec.interval, goal.task)
     if loss is not None:
-        family = with_loss(family, loss)
+        family = family.with_loss(loss)
     spec = replace(spec, tasks=(goal.task,))
     tuned, held = split_clips(spec, base, clips, holdout)
-    seen = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)
-    check_possible(goal, seen)
-    examples = family.examples(seen, settings, tick)
-    return Prepared(spec, base, family, parameters, seen, tuned, held, goal, examples)
+    used = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)
+    check_possible(goal, used)
+    examples = family.examples(used, settings, tick)
+    return Prepared(spec, base, family, parameters, used, tuned, held, goal, examples)
 
 
-def _family(names: Sequence[str]) -> Family:
-    """The one family of all parameters. Raises InputError where they have several."""
+def _common_family(names: Sequence[str]) -> Family:
     by_family: dict[str, list[str]] = {}
-    for name in chosen(names):
+    for name in expand_names(names):
         by_family.setdefault(TUNABLE[name].family, []).append(name)
     if len(by_family) > 1:
-        told = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
+        groups = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
         raise InputError(
-            f"the knobs are of several families, {told}; tune one of them, and then the next with --config tuned.toml"
+            f"the parameters are of several families, {groups}; tune one of them, then the next with --config "
+            "tuned.toml"
         )
-    return family_of(next(iter(by_family)))
+    return load_family(next(iter(by_family)))

@@ -1,35 +1,36 @@
-"""Knobs as parameters: which ones gradients can move, and the transforms that keep them in their ranges."""
+"""Which parameters gradients can move, and the transforms that keep them in their ranges."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import torch
+from pydantic import BaseModel
 from torch import Tensor, nn
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 
-Family = Literal["motion", "registration", "tracking", "paper", "people", "location"]
+FamilyName = Literal["motion", "registration", "tracking", "paper", "people", "location"]
 Rounding = Literal["none", "whole", "odd"]
 
-# A value on the very edge of its range has no slope; it starts this share of the range away from it.
+# A value at the very end of its range has no gradient; it starts this share of the range away from it.
 _EDGE = 1e-3
 _DIGITS = 4
 
 
 @dataclass(frozen=True)
 class Tunable:
-    """One parameter that gradients can move, between low and high of its field in `settings`.
+    """One parameter that gradients can move between the limits of its field in `Settings`.
 
-    log: steps are factors, not amounts; with an offset, of the value plus this, so that 0 can be reached.
-    rounding: what the parameter is once it is a setting; while it is tuned any number between will do.
+    log: steps are factors, not amounts, of the value plus offset, so that 0 can be reached. rounding: of the final
+    value; during descent the parameter is continuous.
     """
 
     name: str
-    family: Family
+    family: FamilyName
     low: float
     high: float
     unit: str = "-"
@@ -38,19 +39,19 @@ class Tunable:
     rounding: Rounding = "none"
 
     def value(self, free: Tensor) -> Tensor:
-        """The knob's value for an unconstrained number; mid-range, one free unit is a factor e (or 1)."""
+        """The value for an unconstrained number; mid-range, one free unit is about a factor e (or an amount of 1)."""
         low, span = self._scaled(self.low), self._span
         scaled = low + span * torch.sigmoid(free * (4.0 / span))
         return scaled.exp() - self.offset if self.log else scaled
 
     def free(self, value: float) -> float:
-        """The unconstrained number of a value; one on the edge of the range is moved in by a thousandth of it."""
+        """The unconstrained number for a value; a value at the end of the range is moved in by a thousandth of it."""
         share = (self._scaled(value) - self._scaled(self.low)) / self._span
         share = min(max(share, _EDGE), 1.0 - _EDGE)
         return math.log(share / (1.0 - share)) * self._span / 4.0
 
     def rounded(self, value: float) -> float | int:
-        """As the settings want it: whole, odd, or with four digits; within the range."""
+        """The value as the settings take it: whole, odd, or with four digits, within the range."""
         value = min(max(value, self.low), self.high)
         if self.rounding == "none":
             return min(max(float(f"{value:.{_DIGITS}g}"), self.low), self.high)
@@ -60,7 +61,7 @@ class Tunable:
 
     @property
     def range(self) -> str:
-        """In words: `0.1 to 255`, `1 to 31, odd`."""
+        """Such as `0.1 to 255` or `1 to 31, odd`."""
         return f"{self.low:g} to {self.high:g}" + (", odd" if self.rounding == "odd" else "")
 
     @property
@@ -72,9 +73,8 @@ class Tunable:
 
 
 def _from_settings(
-    family: Family, group: str, names: str, log: bool = True, offset: float = 0.0, rounding: Rounding = "none"
+    family: FamilyName, group: str, names: str, log: bool = True, offset: float = 0.0, rounding: Rounding = "none"
 ) -> dict[str, Tunable]:
-    """Tunables with the ranges and units of their fields."""
     found = {}
     for key in names.split():
         field = type(Settings.model_fields[group].default).model_fields[key]
@@ -87,9 +87,8 @@ def _from_settings(
     return found
 
 
-# Not here: switches and choices; scores from which detections count, which decide what there is to link; what decides
-# how many points, levels or frames are looked at, which changes the graph; and what acts on single blobs by counting
-# (persistence), for which a mask's pixels give no slope.
+# Not tunable: switches and choices; scores that decide which detections there are; numbers of points, levels or frames,
+# which change the graph; and what counts single blobs (persistence), as a mask's pixels give no gradient for it.
 TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "noise_levels threshold"),
     **_from_settings("motion", "difference", "gradient_share", offset=0.02),
@@ -118,10 +117,10 @@ TUNABLE: dict[str, Tunable] = {
 }
 
 
-def chosen(names: Iterable[str]) -> list[str]:
-    """The names of tunable parameters, where `difference.*` stands for all of a group; in the order given, each once.
+def expand_names(names: Iterable[str]) -> list[str]:
+    """The names of tunable parameters, each once, in the order given; `difference.*` stands for all of a group.
 
-    Raises InputError for a name that is none, with all that are and their ranges.
+    Raises InputError, with all tunable parameters and their ranges, for an unknown name.
     """
     found: dict[str, None] = {}
     for name in names:
@@ -136,42 +135,37 @@ def chosen(names: Iterable[str]) -> list[str]:
 
 
 class Parameters(nn.Module):
-    """The parameters that are tuned, as parameters without bounds; the others stay as the settings have them."""
+    """The tuned parameters as torch parameters without bounds; all others stay as the settings have them."""
 
     def __init__(self, settings: Settings, names: Iterable[str]) -> None:
-        """names: as `chosen` takes them. Raises InputError for one that cannot be tuned."""
+        """names: as `expand_names` takes them. Raises InputError for one that cannot be tuned."""
         super().__init__()
         self.base = settings
-        self.names = chosen(names)
-        starts = [TUNABLE[name].free(float(_of(settings, name))) for name in self.names]
+        self.names = expand_names(names)
+        starts = [TUNABLE[name].free(value_of(settings, name)) for name in self.names]
         # In double precision, for geometry; a number without axes leaves a picture's own precision alone.
         self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in starts])
         self._starts = starts
 
     def values(self, whole: bool = False) -> dict[str, Tensor]:
-        """Each knob's value with its gradient: numbers without axes, float64.
+        """Each parameter's value: a float64 tensor without axes, with its gradient.
 
-        whole: sizes as the settings round them, without a gradient; where all parameters are sizes they go on as they
-        are.
+        whole: sizes are rounded and without a gradient, unless all parameters are sizes.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
-        if whole and self._held:
+        if whole and self._fixed_sizes:
             settled = self.settled()
-            found |= {name: settled[name] for name in self._held}
+            found |= {name: settled[name] for name in self._fixed_sizes}
         return found
 
     @property
-    def _held(self) -> tuple[str, ...]:
-        """What is without a gradient where sizes are whole: they, beside others."""
+    def _fixed_sizes(self) -> tuple[str, ...]:
         sizes = tuple(name for name in self.names if TUNABLE[name].rounding != "none")
         return sizes if len(sizes) < len(self.names) else ()
 
     def moved(self, whole: bool = False) -> Tensor:
-        """The sum of the squares of how far the knobs are from where they began, without bounds; with its gradient.
-
-        whole: without that of sizes, as in `values`.
-        """
-        held = self._held if whole else ()
+        """The sum of squares of the unconstrained steps from the start, with its gradient. whole: as in `values`."""
+        held = self._fixed_sizes if whole else ()
         ways = [
             ((free.detach() if name in held else free) - start) ** 2
             for name, free, start in zip(self.names, self.free, self._starts, strict=True)
@@ -179,22 +173,34 @@ class Parameters(nn.Module):
         return torch.stack(ways).sum()
 
     def settled(self) -> dict[str, Tensor]:
-        """Each knob's value as the settings would have it, without a gradient: as `values` else."""
+        """The values as the settings round them, without a gradient; otherwise as `values`."""
         settings = self.settings()
         return {
-            name: free.new_tensor(float(_of(settings, name))) for name, free in zip(self.names, self.free, strict=True)
+            name: free.new_tensor(value_of(settings, name)) for name, free in zip(self.names, self.free, strict=True)
         }
 
     def settings(self) -> Settings:
-        """The settings with these values, whole and odd ones rounded; knobs that have not moved stay as they were."""
+        """The settings with these values rounded; parameters that have not moved keep their exact values."""
         moved = {
             name: TUNABLE[name].rounded(float(value.detach()))
             for (name, value), free, start in zip(self.values().items(), self.free, self._starts, strict=True)
             if float(free.detach()) != start
         }
-        return with_parameters(self.base, moved, origin="the tuned knobs")
+        return with_parameters(self.base, moved, origin="the tuned parameters")
 
 
-def _of(settings: Settings, name: str) -> float:
+def value_of(settings: Settings, name: str) -> float:
+    """The value of a parameter as a float; name: group.parameter."""
     group, key = name.split(".")
     return float(getattr(getattr(settings, group), key))
+
+
+_Group = TypeVar("_Group", bound=BaseModel)
+
+
+def with_tensors(group: _Group, prefix: str, values: Mapping[str, Tensor]) -> _Group:
+    """A group of parameters in which those named `prefix.key` are tensors; nothing is checked."""
+    mine: dict[str, Any] = {
+        name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{prefix}.")
+    }
+    return type(group).model_construct(**(dict(group) | mine))

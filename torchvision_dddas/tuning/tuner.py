@@ -17,10 +17,10 @@ from torchvision_dddas.evaluation.studies.spec import Spec
 from torchvision_dddas.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.io.atomic_files import cannot_write, save_file
 from torchvision_dddas.io.output.run_record import finite, versions
-from torchvision_dddas.tuning import costing
+from torchvision_dddas.tuning import time_cost
 from torchvision_dddas.tuning.checkpoint import set_aside
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
-from torchvision_dddas.tuning.family import Prepared, loss_of, prepare
+from torchvision_dddas.tuning.family import Prepared, prepare
 from torchvision_dddas.tuning.parameters import TUNABLE
 from torchvision_dddas.tuning.report import tuning_report
 from torchvision_dddas.tuning.verdict import Shown, Verdict, count_clips, judge
@@ -160,26 +160,26 @@ class Tuner:
         except OSError as error:
             raise cannot_write(self._folder / RUN, error) from error
 
-    def _measure_cost(self, ready: Prepared, weight: float) -> costing.TimeCost:
+    def _measure_cost(self, ready: Prepared, weight: float) -> time_cost.TimeCost:
         """The time that the parameters cost on the shortest clip; a resumed descent keeps what was measured for it."""
         place = self._folder / COST
         if self._resume and place.is_file() and (self._folder / CHECKPOINT).is_file():
             # Another weight is another descent, which the checkpoint refuses.
-            return replace(costing.read(place), weight=weight)
+            return replace(time_cost.read_cost(place), weight=weight)
         clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
         names, settings = ready.parameters.names, ready.parameters.base
-        count = costing.REPEATS * len(costing.points(settings, names))
+        count = time_cost.REPEATS * len(time_cost.timed_points(settings, names))
         with self._timed("cost"), self._display.progress("what time costs", count) as tick:
-            return costing.measured(clip, ready.goal.task, settings, names, weight, ready.spec.backend, tick=tick)
+            return time_cost.measure_cost(clip, ready.goal.task, settings, names, weight, ready.spec.backend, tick=tick)
 
-    def _begin_record(self, ready: Prepared, cost: costing.TimeCost | None) -> None:
+    def _begin_record(self, ready: Prepared, cost: time_cost.TimeCost | None) -> None:
         """Called with the first step, so that a refused run leaves the files of an earlier one alone."""
         if not self._resume:
             place, aside = self._folder / CHECKPOINT, self._folder / OLD
             if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
                 self._display.message(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
         if cost is not None:
-            costing.write(self._folder / COST, cost)
+            time_cost.write_cost(self._folder / COST, cost)
         state = {"state": "running", "study": ready.spec.name}
         self._write(RUN, _json(state))
         self._state = state
@@ -192,7 +192,7 @@ class Tuner:
         self,
         ready: Prepared,
         found: Descended,
-        cost: costing.TimeCost | None,
+        cost: time_cost.TimeCost | None,
         before: Mapping[str, Any],
         verdict: Verdict,
     ) -> dict[str, Any]:
@@ -208,7 +208,7 @@ class Tuner:
             "versions": versions(),
             "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
             "family": ready.family.name,
-            "loss": loss_of(ready.family) or None,
+            "loss": ready.family.loss_name or None,
             "plan": asdict(self._plan),
             "examples": len(ready.examples),
             "knobs": {

@@ -1,4 +1,4 @@
-"""What a frame's time is expected to be, knob by knob: measured once by the hard pipeline, then a term of the loss."""
+"""The time of a frame as a term of the loss: measured once for each parameter with the hard pipeline."""
 
 import json
 import math
@@ -18,26 +18,26 @@ from torchvision_dddas.evaluation.studies.results import Found
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import find, upstream_task
 from torchvision_dddas.io.atomic_files import save_file
-from torchvision_dddas.tuning.parameters import TUNABLE
+from torchvision_dddas.tuning.parameters import TUNABLE, value_of
 
 FACTORS = (0.5, 2.0)
-"""A parameter is measured at its value, and at these parts and multiples of it, within its range."""
+"""A parameter is measured at its value and at these multiples of it, within its range."""
 
 REPEATS = 3
 NOISE = 2.0
-"""A change of the time that is no larger than so many times what repeats differ by is none."""
+"""A change of the time counts where it is larger than this many times the spread of repeats."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """How many times as long a frame takes at some values of a parameter, which ascend; 1 at the value that it has."""
+    """times: the factor on a frame's time at each of `values`, which ascend; 1 at the parameter's own value."""
 
     parameter: str
     values: tuple[float, ...]
     times: tuple[float, ...]
 
     def factor(self, value: Tensor) -> Tensor:
-        """Between the values in straight lines over the knob's scale, beyond them as at the last."""
+        """The factor: linear between the values on the parameter's scale, constant beyond them."""
         tunable = TUNABLE[self.parameter]
         values = torch.tensor(self.values, dtype=value.dtype, device=value.device)
         places, here = (((x + tunable.offset).log() if tunable.log else x) for x in (values, value))
@@ -50,23 +50,23 @@ class Curve:
 
 @dataclass(frozen=True)
 class TimeCost:
-    """A loss of `weight` for every more time of the seconds that a frame takes with the settings as they are."""
+    """Charges a loss of `weight` where a frame takes twice the `seconds` that it takes with the original settings."""
 
     weight: float
     seconds: float
     curves: tuple[Curve, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Plain numbers and texts, as `read` takes them."""
+        """The content of cost.json, as `read_cost` takes it."""
         curves = [{"knob": c.parameter, "values": list(c.values), "times": list(c.times)} for c in self.curves]
         return {"weight": self.weight, "seconds": self.seconds, "curves": curves}
 
     def term(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Weight × (expected seconds / seconds with the settings as they are − 1)."""
+        """Weight × (expected / seconds − 1), to be added to a loss."""
         return self.weight * (self.expected(parameters) / self.seconds - 1)
 
     def expected(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Seconds a frame: the knobs' factors multiplied, as if none changed what another costs."""
+        """Seconds a frame: the factors of all parameters multiplied, as if they did not interact."""
         found = torch.tensor(self.seconds, dtype=torch.float64)
         for curve in self.curves:
             if curve.parameter in parameters:
@@ -74,7 +74,7 @@ class TimeCost:
         return found
 
 
-def measured(
+def measure_cost(
     clip: Clip,
     task: Task,
     settings: Settings,
@@ -85,12 +85,13 @@ def measured(
     timed: Callable[[Settings], float] | None = None,
     tick: Callable[[], object] = lambda: None,
 ) -> TimeCost:
-    """Time a task on a clip with each knob in turn at other values, in turns. timed: in place of the hard pipeline.
+    """Time a task on a clip with each parameter at other values, in interleaved turns.
 
-    tick: called after each of `points` × repeats. Raises InputError as the task does.
+    timed: seconds a frame for some settings, in place of the hard pipeline. tick: called after each of `timed_points` ×
+    repeats. Raises InputError as the task does.
     """
     timed = timed or _timer(clip, task, settings, backend)
-    todo = points(settings, names)
+    todo = timed_points(settings, names)
     took: dict[tuple[str, float], list[float]] = {point: [] for point in todo}
     for turn in range(repeats):
         for point in todo if turn % 2 == 0 else reversed(todo):
@@ -101,7 +102,7 @@ def measured(
     spread = median(stdev(map(math.log, ts)) for ts in took.values()) if repeats > 1 else 0.0
     curves = []
     for name in names:
-        start = _value(settings, name)
+        start = value_of(settings, name)
         known = {value: median(ts) / base for (of, value), ts in took.items() if of == name}
         if any(abs(math.log(factor)) > NOISE * spread for factor in known.values()):
             both = sorted({**known, start: 1.0}.items())
@@ -109,11 +110,11 @@ def measured(
     return TimeCost(weight, base, tuple(curves))
 
 
-def points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
-    """What is timed: a parameter and its value, and first no parameter at all."""
+def timed_points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
+    """The parameters and values that are timed; first ("", 0.0), the settings as they are."""
     found = [("", 0.0)]
     for name in names:
-        tunable, start = TUNABLE[name], _value(settings, name)
+        tunable, start = TUNABLE[name], value_of(settings, name)
         for factor in FACTORS:
             value = tunable.rounded((start + tunable.offset) * factor - tunable.offset)
             point = (name, float(value))
@@ -122,24 +123,24 @@ def points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
     return found
 
 
-def write(place: Path, cost: TimeCost) -> None:
-    """Keep what was measured: another time it would be a little other. Raises InputError where the disk refuses."""
+def write_cost(place: Path, cost: TimeCost) -> None:
+    """Keep the measured times for a resumed run. Raises InputError where the disk refuses."""
     save_file(place, (json.dumps(cost.as_json(), indent=2) + "\n").encode())
 
 
-def read(place: Path) -> TimeCost:
-    """Read it back. Raises InputError where it is damaged."""
+def read_cost(place: Path) -> TimeCost:
+    """Read what `write_cost` wrote. Raises InputError where it is damaged."""
     try:
-        told = json.loads(place.read_text(encoding="utf-8"))
+        content = json.loads(place.read_text(encoding="utf-8"))
         curves = [
             Curve(TUNABLE[c["knob"]].name, tuple(map(float, c["values"])), tuple(map(float, c["times"])))
-            for c in told["curves"]
+            for c in content["curves"]
         ]
         if any(len(curve.values) != len(curve.times) for curve in curves):
             raise ValueError
-        return TimeCost(float(told["weight"]), float(told["seconds"]), tuple(curves))
+        return TimeCost(float(content["weight"]), float(content["seconds"]), tuple(curves))
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        raise InputError(f"{place} does not tell the cost of the parameters; begin again without --resume") from None
+        raise InputError(f"{place} does not hold the cost of parameters; begin again without --resume") from None
 
 
 def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
@@ -150,7 +151,7 @@ def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable
         found = find(clip, task, changed, backend, before=before)
         return sum(found.seconds.values()) / max(len(found.looked), 1)
 
-    timed(settings)  # what is only slow the first time
+    timed(settings)  # warm up
     return timed
 
 
@@ -165,8 +166,3 @@ def _possible(settings: Settings, point: tuple[str, float]) -> bool:
     except InputError:
         return False
     return True
-
-
-def _value(settings: Settings, name: str) -> float:
-    group, key = name.split(".")
-    return float(getattr(getattr(settings, group), key))

@@ -8,7 +8,7 @@ import torch
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.tuning.costing import Curve, TimeCost, measured, points, read, write
+from torchvision_dddas.tuning.time_cost import Curve, TimeCost, measure_cost, read_cost, timed_points, write_cost
 
 THRESHOLD, CLOSE, BLUR = "difference.threshold", "morphology.close_px", "difference.blur_px"
 CLIP = Clip("one", Path("one"))
@@ -43,7 +43,7 @@ def test_as_the_settings_are_the_term_is_nothing_and_twice_the_time_costs_the_we
 
 def test_the_points_are_allowed_values_on_either_side_of_the_knobs_own() -> None:
     settings = with_parameters(Settings(), {THRESHOLD: 200.0, BLUR: 5})
-    assert points(settings, [THRESHOLD, BLUR]) == [
+    assert timed_points(settings, [THRESHOLD, BLUR]) == [
         ("", 0.0),
         (THRESHOLD, 100.0),
         (THRESHOLD, 255.0),
@@ -59,7 +59,7 @@ def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() 
     def timed(changed: Settings) -> float:
         return 0.1 * 8 / changed.difference.threshold * next(noise)
 
-    cost = measured(CLIP, "motion", settings, [THRESHOLD, CLOSE], 1.0, timed=timed)
+    cost = measure_cost(CLIP, "motion", settings, [THRESHOLD, CLOSE], 1.0, timed=timed)
     (curve,) = cost.curves
     assert curve.parameter == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
     assert curve.times == pytest.approx((2, 1, 0.5), rel=0.05) and cost.seconds == pytest.approx(0.1, rel=0.05)
@@ -67,8 +67,8 @@ def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() 
 
 def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     cost = TimeCost(0.1, 1 / 3, (Curve(THRESHOLD, (2.0, 4.0), (1.1, 1.0)),))
-    write(tmp_path / "cost.json", cost)
-    assert read(tmp_path / "cost.json") == cost
+    write_cost(tmp_path / "cost.json", cost)
+    assert read_cost(tmp_path / "cost.json") == cost
 
 
 @pytest.mark.parametrize(
@@ -85,5 +85,5 @@ def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
 )
 def test_a_damaged_file_is_told_in_a_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "cost.json").write_text(content)
-    with pytest.raises(InputError, match="does not tell the cost"):
-        read(tmp_path / "cost.json")
+    with pytest.raises(InputError, match="does not hold the cost"):
+        read_cost(tmp_path / "cost.json")

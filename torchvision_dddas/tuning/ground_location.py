@@ -1,8 +1,7 @@
-"""What clips tell of places of people seen from the ground, and how surprising their errors are.
+"""Examples and loss of people located from the ground.
 
-`targets.ranging.sight` weighs height and foot row by parameters, and settles where they disagree: it is smooth in its
-three noise parameters, and so quick for a whole table that its slope is taken by differences of the hard function
-itself.
+`geo.ranging.range_people` is smooth in its three noise parameters and fast for a whole table, so that its gradient is
+taken by differences of the hard function itself.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -17,22 +16,24 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.scoring import whose_places
+from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.geo.ranging import range_people
-from torchvision_dddas.tuning.family import Example
-from torchvision_dddas.tuning.soft_places import gaussian_nll
+from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.detection_tables import read_detections
+from torchvision_dddas.tuning.aerial_location import gaussian_nll
 from torchvision_dddas.types import Camera, Poses
 
-KNOBS = ("ground.body_height_sigma_m", "ground.height_sigma", "ground.feet_sigma")
+PARAMETERS = ("ground.body_height_sigma_m", "ground.height_sigma", "ground.feet_sigma")
 
 _STEP = 1e-4
-"""Of a difference, as a share of the parameter, or of the least that counts."""
+"""Of a difference, as a share of the parameter or of _LEAST."""
 
 _LEAST = 1e-3
 
 
 @dataclass(frozen=True)
-class Sighted:
-    """People whom one camera saw in a picture. box_px: (N, 4). cut: (N,). true_m: (N, 2) in the camera's metres."""
+class GroundView:
+    """The people in a picture. box_px: (N, 4). cut: (N,). true_m: (N, 2) in the camera's metres. here_m: the camera."""
 
     camera: Camera
     box_px: np.ndarray
@@ -42,25 +43,20 @@ class Sighted:
     true_m: np.ndarray
 
 
-def sightings_of(clip: Clip, settings: Settings) -> Iterator[Example]:
-    """Those of a clip with a camera on the ground and detections, frame by frame; metres alone.
+def ground_examples(clip: Clip, settings: Settings) -> Iterator[tuple[int, tuple[GroundView, Settings]]]:
+    """The frames of a clip with a camera on the ground and detections, in local metres.
 
-    Raises InputError where the clip lacks them or true places, and for ground.mode = paper, which knows no errors.
+    Raises InputError where the clip lacks these, and for ground.mode = paper, which has no error model.
     """
-    from torchvision_dddas.geo.ground_locator import GroundLocator
-    from torchvision_dddas.io.camera_files import read_camera
-    from torchvision_dddas.io.detection_tables import read_detections
-
     truth = clip.truth
-    if truth is None or truth.positions is None:
-        raise InputError(f"{clip.name} has no true places; ellipses cannot be tuned on it. Give clips with positions")
+    assert truth is not None and truth.positions is not None
     if settings.ground.mode == "paper":
-        raise InputError("ground.mode = paper knows no errors that could be tuned; take ground.mode = default")
+        raise InputError("ground.mode = paper has no error model to tune; set ground.mode = default")
     if clip.given is None or clip.camera is None:
         raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
     camera = read_camera(clip.camera)
     if camera.geographic:
-        raise InputError(f"{clip.name}: the camera stands at degrees; wanted local metres, as the true places are")
+        raise InputError(f"{clip.name}: the camera is given in degrees; wanted local metres, as the true positions are")
     table = read_detections(clip.given)
     (view,) = GroundLocator(camera, settings, rate_hz=clip.rate_hz).place_tables([table])
     places = truth.positions
@@ -70,20 +66,20 @@ def sightings_of(clip: Clip, settings: Settings) -> Iterator[Example]:
         rows = np.flatnonzero((table.frame == frame) & (whose >= 0))
         if len(rows):
             true_m = places.east_north_m[whose[rows]]
-            yield Example(clip.name, frame, (sighted(camera, table.box_px[rows], view.cut[rows], true_m), settings))
+            yield frame, (build_ground_view(camera, table.box_px[rows], view.cut[rows], true_m), settings)
 
 
-def sighted(camera: Camera, box_px: np.ndarray, cut: np.ndarray, true_m: np.ndarray) -> Sighted:
-    """People in a picture of a camera that stands still."""
+def build_ground_view(camera: Camera, box_px: np.ndarray, cut: np.ndarray, true_m: np.ndarray) -> GroundView:
+    """People in a picture of a fixed camera."""
     n = len(box_px)
     place = np.tile(camera.place, (n, 1))
     poses = Poses(place, np.full(n, camera.heading_rad), np.full(n, camera.pitch_rad))
-    return Sighted(camera, box_px, cut, poses, place, true_m)
+    return GroundView(camera, box_px, cut, poses, place, true_m)
 
 
-def person_lost(seen: Sighted, settings: Settings, parameters: Mapping[str, Tensor], unplaced: float) -> Tensor:
-    """() nats a person; those whom the parameters leave without a place cost `unplaced`, without a slope."""
-    values = {name: parameters[name] for name in KNOBS if name in parameters}
+def ground_loss(seen: GroundView, settings: Settings, parameters: Mapping[str, Tensor], unplaced: float) -> Tensor:
+    """() nats a person; those who get no position cost `unplaced`, without a gradient."""
+    values = {name: parameters[name] for name in PARAMETERS if name in parameters}
 
     def hard(*given: float) -> np.ndarray:
         changed = dict(zip((name.partition(".")[2] for name in values), given, strict=True))
@@ -95,13 +91,13 @@ def person_lost(seen: Sighted, settings: Settings, parameters: Mapping[str, Tens
 
     rows: Tensor = _ByDifferences.apply(hard, *values.values())
     known = torch.isfinite(rows).all(dim=1)
-    told = rows[known]
-    total = gaussian_nll(told[:, :2], told[:, 2:].reshape(-1, 2, 2)).sum() + unplaced * (~known).sum()
+    placed = rows[known]
+    total = gaussian_nll(placed[:, :2], placed[:, 2:].reshape(-1, 2, 2)).sum() + unplaced * (~known).sum()
     return total / len(rows)
 
 
 class _ByDifferences(torch.autograd.Function):
-    """A function of numbers in NumPy, with the slope of its central differences."""
+    """A NumPy function of numbers, with the gradient of its central differences."""
 
     @staticmethod
     def forward(ctx: Any, hard: Callable[..., np.ndarray], *values: Tensor) -> Tensor:
