@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from torchvision_dddas.evaluation.report.comparison import MEANING, comparison_section
 from torchvision_dddas.evaluation.report.measures import GROUPS, measure
@@ -53,7 +53,7 @@ def _side(anchor: str, heading: str, side: Mapping[str, Any] | None, group: str,
     tasks = list(changes.get("tasks", {}).values())
     sections = [comparison_section(anchor, title, mine, "before", "after") for mine in tasks]
     if not sections:
-        sections = [f'<h2 id="{anchor}">{escape(title)}</h2><p>Nothing to compare.</p>']
+        sections = [Markup('<h2 id="{}">{}</h2><p>Nothing to compare.</p>').format(anchor, title)]
     return {
         "anchor": anchor,
         "heading": heading,
