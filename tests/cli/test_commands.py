@@ -78,3 +78,10 @@ def test_progress_on_a_terminal_shows_frames_a_second(capsys, monkeypatch):
     with progress_module.progress("a [b] clip", None, quiet=False) as tick:
         tick()
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_clip_names_are_telling_and_different():
+    names = progress_module.clip_names(
+        ["a/walk/frames", "b/walk/frames/", "x.mp4", "run/*.png", "camera:0", "rtsp://host/cam.1", "frames"]
+    )
+    assert names == ["walk", "walk-2", "x", "run", "camera-0", "cam", "frames"]

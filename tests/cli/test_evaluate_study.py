@@ -77,6 +77,7 @@ def test_a_study_that_could_score_nothing_fails_and_says_why(dddas, tmp_path) ->
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_the_command_line_changes_the_study(dddas, study, tmp_path) -> None:
     words = ("--clips", "ta*", "--set", "track.memory_frames=7", "--interval", 2, "--jobs", 1, "--quiet")
     done = dddas("evaluate", "--dataset", study, *words, "--out", tmp_path / "out", "--cache", tmp_path / "cache")

@@ -11,6 +11,7 @@ pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 
+@pytest.mark.slow
 def test_the_shipped_graphs_can_be_made_again_and_open(dddas, tmp_path: Path):
     out = tmp_path / "own"
     result = dddas("export", "--graph", "homography", "--graph", "people", "--out", str(out))

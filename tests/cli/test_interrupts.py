@@ -40,9 +40,9 @@ PROGRAM = textwrap.dedent("""
 @pytest.mark.parametrize(
     ("line", "table"),
     [
-        ("detect {clip} --config fast", "detections.txt"),
+        pytest.param("detect {clip} --config fast", "detections.txt", marks=pytest.mark.slow),
         ("track {clip} --detections {folder}/det.txt", "tracks.txt"),
-        ("people {clip} --set people.enlarge=4", "detections.txt"),
+        pytest.param("people {clip} --set people.enlarge=4", "detections.txt", marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path, line, table):

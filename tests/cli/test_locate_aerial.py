@@ -71,6 +71,7 @@ def test_a_landmark_without_reports_is_where_its_waypoints_say(aerial, tmp_path)
     assert flight.errors(found).max() < 0.001
 
 
+@pytest.mark.slow
 def test_warnings_and_repairs_are_reported_at_the_end(aerial):
     flight = Overflight()
     assert "note: repaired" not in aerial(flight).stdout
@@ -131,6 +132,7 @@ def test_the_error_that_all_receivers_share_is_in_the_absolute_covariance_alone(
     assert shared[0]["east_m"] == alone[0]["east_m"]
 
 
+@pytest.mark.slow
 def test_ellipses_hold_the_truth_where_receivers_err(aerial, tmp_path):
     """Each flight has receivers of its own; in all of them together about 95 % of the ellipses hold."""
     inside = []

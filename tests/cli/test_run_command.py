@@ -75,6 +75,7 @@ def missed_by(found):
     return np.array(apart), np.array(which)
 
 
+@pytest.mark.slow
 def test_targets_are_located_to_some_decimetres(whole):
     result, out = whole
     assert result.exit_code == 0, result.output
@@ -86,6 +87,7 @@ def test_targets_are_located_to_some_decimetres(whole):
     assert set(which.tolist()) == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_position_is_that_of_its_own_frame(whole):
     """Identities are settled some frames later than pictures are laid on the ground."""
     _, out = whole
@@ -98,6 +100,7 @@ def test_a_position_is_that_of_its_own_frame(whole):
     assert away[0] < 0.3 * min(away[-4], away[4])
 
 
+@pytest.mark.slow
 def test_landmarks_are_no_targets(whole):
     """All but never: a blob that looks too large for its landmark alone stays among the targets."""
     _, out = whole
@@ -112,6 +115,7 @@ def test_landmarks_are_no_targets(whole):
     assert at_landmarks < 0.1 * len(found)
 
 
+@pytest.mark.slow
 def test_landmarks_are_where_they_were_seen_and_can_be_read_again(whole, dddas, flown, tmp_path):
     _, out = whole
     flight = over()
@@ -137,6 +141,7 @@ def test_landmarks_are_where_they_were_seen_and_can_be_read_again(whole, dddas, 
         assert float(same["east_m"]) == pytest.approx(float(row["east_m"]), abs=0.1)
 
 
+@pytest.mark.slow
 def test_everything_is_written_and_recorded(whole):
     result, out = whole
     names = {path.name for path in out.iterdir()}
@@ -154,6 +159,7 @@ def test_everything_is_written_and_recorded(whole):
     assert "positions; of the frames" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_overlay_names_the_landmarks_frame_by_frame(whole):
     _, out = whole
     film = cv2.VideoCapture(str(out / "overlay.mp4"))
@@ -166,6 +172,7 @@ def test_the_overlay_names_the_landmarks_frame_by_frame(whole):
     assert (np.abs(patch - [90, 230, 90]).max(axis=1) < 40).any()
 
 
+@pytest.mark.slow
 def test_the_tables_own_pixels_do_without_colours_and_only_frames_followed_are_located(dddas, flown, tmp_path):
     words = given(flown, "pictured.csv", None)
     result = dddas(*words, *FLAT, "--interval", 3, "--save", "none", "--out", tmp_path / "out")
@@ -186,6 +193,7 @@ def test_without_landmarks_it_says_that_nothing_is_located(dddas, clip, engine, 
     assert not (tmp_path / "out" / "positions.csv").exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_done(dddas, flown, tmp_path, monkeypatch):
     from torchvision_dddas.pipeline import Pipeline
 

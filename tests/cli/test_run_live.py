@@ -116,6 +116,7 @@ def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frame
     assert session(tmp_path)[1]["state"] == "failed"
 
 
+@pytest.mark.slow
 def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
     # At a hundredth of its speed the clip would take minutes.
     main = "from torchvision_dddas.cli import main; main()"

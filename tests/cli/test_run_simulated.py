@@ -85,6 +85,7 @@ def test_the_record_says_how_good_it_was(made):
     assert "crowds: " in said
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dddas, monkeypatch):
     from torchvision_dddas.simulation import SimulatedRunRecorder
 
@@ -105,6 +106,7 @@ def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dd
     assert len(rows(out / "fixes.csv")) == 6
 
 
+@pytest.mark.slow
 def test_truth_that_is_not_asked_for_goes_with_the_earlier_run(made, dddas, tmp_path):
     path = scenario(tmp_path / "tiny.toml", clip={"seconds": 0.5})
     for save, there in (("truth", True), ("none", False)):

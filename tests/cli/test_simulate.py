@@ -154,6 +154,7 @@ def test_the_record_tells_what_happened(made):
     assert f"dddas run {folder / 'frames'} --landmarks {folder / 'landmarks.csv'}" in said
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_files_and_another_does_not(made, dddas, tmp_path):
     folder, _ = made
     scenario = folder / "scenario.toml"
@@ -168,6 +169,7 @@ def test_the_same_seed_gives_the_same_files_and_another_does_not(made, dddas, tm
     assert tomllib.loads((tmp_path / "other" / "scenario.toml").read_text())["seed"] == 9
 
 
+@pytest.mark.slow
 def test_a_shorter_run_leaves_nothing_of_a_longer_one(made, dddas, tmp_path):
     folder, _ = made
     out = tmp_path / "out"
