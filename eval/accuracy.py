@@ -23,7 +23,7 @@ from torchvision_dddas.evaluation.metrics import boxes as box_metrics
 from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
-from torchvision_dddas.evaluation.metrics.pixels import Pixels
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.io.sources import open_source
 
 Found = tuple[np.ndarray, np.ndarray]
@@ -63,7 +63,7 @@ def run_plain(place: Path) -> Iterator[Found]:
 
 def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
     """The figures of one clip: of masks, of one labelled target, or of a clip where nothing moves."""
-    truth = truths.load(place) if truths.find(place) else None
+    truth = truths.load_truth(place) if truths.find_truth(place) else None
     pixels, boxes, target, blobs, frames = Pixels(), Boxes(), OneTarget(), 0, 0
     for number, (mask, found) in enumerate(chain(place), 1):
         frames, blobs = number, blobs + len(found)
@@ -71,10 +71,10 @@ def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
             continue
         if number in truth.masks:
             labels = truths.read_mask(truth.masks[number])
-            pixels = pixels.plus(pixel_metrics.count(mask, labels))
-            boxes = boxes.plus(box_metrics.match(found, box_metrics.boxes_of(labels)))
+            pixels = add_counts(pixels, pixel_metrics.count(mask, labels))
+            boxes = add_counts(boxes, box_metrics.match(found, box_metrics.boxes_of(labels)))
         elif number in truth.boxes:
-            target = target.plus(box_metrics.one_target(mask, found, truth.boxes[number][0]))
+            target = add_counts(target, box_metrics.one_target(mask, found, truth.boxes[number][0]))
     if truth is None:
         return {"frames": frames, "still": blobs / frames}
     if truth.masks:

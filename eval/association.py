@@ -26,7 +26,9 @@ from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics import accuracy_ratio as ratio_metrics
 from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.matching import pair
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.functional import affinity
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking import CameraMotion, FrameTracker, source_affinity
@@ -84,7 +86,8 @@ def score_phases(truth: TrackTable, tracks: list[TrackTable], interval: int) -> 
     for phase, found in enumerate(tracks):
         both = pair(truth.at((truth.frame - 1) % interval == phase), found)
         links = [
-            known.plus(ratio_metrics.count(both, interval, size)) for known, size in zip(links, (2, 3), strict=True)
+            add_counts(known, ratio_metrics.count(both, interval, size))
+            for known, size in zip(links, (2, 3), strict=True)
         ]
         switches.append(tracking.count_clear(both, SAME_IOU).switches)
         idf1.append(100 * tracking.identity_measures(tracking.count_identity(both, SAME_IOU))["idf1"])

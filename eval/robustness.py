@@ -19,7 +19,7 @@ from clips import clips_in, read_frames
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, count, measures
+from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts, count, measures
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.types import Frame
@@ -42,7 +42,7 @@ def measure_exposure(options: bench.Options) -> tuple[str, Any]:
     for clip in clips_in(options.data, options.only):
         if not (clip / "masks").is_dir():
             continue
-        truth, frames = truths.load(clip), list(open_source(clip / "frames"))
+        truth, frames = truths.load_truth(clip), list(open_source(clip / "frames"))
         found[clip.name] = {
             kind: score(change_exposure(frames, draw_gains(len(frames), kind, options.seed)), truth, settings)
             for kind in KINDS
@@ -86,7 +86,7 @@ def score(frames: Sequence[Frame], truth: truths.Truth, settings: Settings) -> t
     for scene in detect_motion(frames, settings, "onboard"):
         unreliable += not scene.reliable
         if path := truth.masks.get(scene.frame.number):
-            pixels = pixels.plus(count(scene.mask, truths.read_mask(path)))
+            pixels = add_counts(pixels, count(scene.mask, truths.read_mask(path)))
     return measures(pixels)["f"], unreliable
 
 

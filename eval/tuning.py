@@ -27,6 +27,7 @@ from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.evaluation.datasets import folder
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
@@ -154,7 +155,7 @@ def measure_f(clip: Clip, settings: Settings) -> float:
     """F of pixels of the hard pipeline."""
     total = segmentation.Pixels()
     for scene in detect_motion(open_clip(clip), settings, "onboard"):
-        total = total.plus(segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
+        total = add_counts(total, segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
     return float(np.nan_to_num(segmentation.measures(total)["f"]))
 
 

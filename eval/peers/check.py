@@ -158,7 +158,7 @@ def studied(folder: Path, result: str, truths: Tables, found: dict[str, Tables],
     """The figures of a study by sequence, from tables that it holds."""
     scored = {}
     for name, truth in truths.items():
-        known = replace(true_boxes.load(folder / "ours" / name / "gt.txt"), ignoring=ignoring)
+        known = replace(true_boxes.load_truth(folder / "ours" / name / "gt.txt"), ignoring=ignoring)
         table = thinned_only(found[name][result], interval)
         count = len(table)
         held = Found(

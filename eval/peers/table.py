@@ -27,8 +27,10 @@ from clips import sequences
 from torchvision_dddas.evaluation.datasets import motchallenge
 from torchvision_dddas.evaluation.metrics import tracking, truth
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.matching import pair
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 
 ROOT = Path(__file__).resolve().parents[2]
 TRACKERS, NORFAIR = ROOT / ".venv-peers/bin/python", ROOT / ".venv-norfair/bin/python"
@@ -223,7 +225,7 @@ def pooled(sequences: list[Sequence], tracks: list[TrackTable]) -> dict:
         clip = pair(sequence.truth.tracks, found)
         counts = TrackCounts(tracking.count_clear(clip), tracking.count_identity(clip), tracking.count_hota(clip))
         clips[sequence.name] = figures_of(counts)
-        total = total.plus(counts)
+        total = add_counts(total, counts)
     return {**figures_of(total), "clips": clips}
 
 

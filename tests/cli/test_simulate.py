@@ -134,10 +134,10 @@ def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
 
 def test_the_truth_is_read_by_its_judges(made):
     folder, _ = made
-    boxes = judges.load(folder / "truth" / "gt.txt")
+    boxes = judges.load_truth(folder / "truth" / "gt.txt")
     assert boxes.tracks is not None
     assert set(boxes.tracks.identity.tolist()) == {1}
-    masks = judges.load(folder / "truth")
+    masks = judges.load_truth(folder / "truth")
     assert masks.kind == "masks"
     assert masks.frames == list(range(1, 21))
     assert judges.read_mask(masks.masks[10]).max() >= 1

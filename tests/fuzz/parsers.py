@@ -21,9 +21,10 @@ from torchvision_dddas.cli.colours import parse_box, parse_names
 from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError
 from torchvision_dddas.evaluation.datasets import kinds
+from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import clip, truth
-from torchvision_dddas.evaluation.studies.spec import Source, read_spec
+from torchvision_dddas.evaluation.studies.spec import read_spec
 from torchvision_dddas.geo.site import looks_swapped
 from torchvision_dddas.geometry import poses_at
 from torchvision_dddas.io.camera_files import (
@@ -141,7 +142,7 @@ def _detections(path: Path) -> None:
 
 
 def _truth(path: Path) -> None:
-    _ = truth.load(path).frames
+    _ = truth.load_truth(path).frames
     clip.load(path)
 
 

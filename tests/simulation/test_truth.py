@@ -66,7 +66,7 @@ def test_boxes_of_targets_leave_the_landmarks_out(tmp_path):
         [1, 2, 30, 20, 10, 5, 1],
         [2, 1, 10, 5, 12, 7, 1],
     ]
-    found = read.load(folder / "gt.txt")
+    found = read.load_truth(folder / "gt.txt")
     assert found.kind == "boxes"
     assert found.tracks is not None
     assert found.tracks.identity.tolist() == [1, 2, 1]

@@ -10,8 +10,7 @@ import torch
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import track_table
 from torchvision_dddas.tracking.score_tracker import ScoreTracker

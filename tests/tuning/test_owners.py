@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth
 from torchvision_dddas.tuning.examples import match_owners
 from torchvision_dddas.types import DetectionTable
 

@@ -34,7 +34,7 @@ def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:
     where = np.concatenate([flight.targets(frame) for frame in flight.numbers()])
     frames, who = np.repeat(list(flight.numbers()), 4), np.tile(np.arange(1, 5), flight.frames)
     places = Positions(frames, who, where, lonlat(where, ORIGIN) if flight.geographic else None)
-    truth = replace(truths.load(folder / "gt.txt"), positions=places)
+    truth = replace(truths.load_truth(folder / "gt.txt"), positions=places)
     return Clip(
         "flown",
         folder,

@@ -127,7 +127,7 @@ def written(folder: Path) -> Clip:
     )
     numbers = np.repeat([1, 2], 5), np.tile(np.arange(1, 6), 2)
     where = Positions(*numbers, np.concatenate([people(frame, 5, 0, 0, 0)[1] for frame in (1, 2)]))
-    truth = replace(truths.load(folder / "gt.txt"), positions=where)
+    truth = replace(truths.load_truth(folder / "gt.txt"), positions=where)
     return Clip("ground", folder, truth=truth, given=folder / "det.txt", camera=folder / "camera.toml")
 
 

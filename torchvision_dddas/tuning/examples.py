@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, TrackTable, pair
-from torchvision_dddas.evaluation.metrics.truth import Truth, labels_of
+from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, pair
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth, labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.types import DetectionTable

@@ -15,7 +15,7 @@ from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.boxes import SAME, areas, iou, judged
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
+from torchvision_dddas.evaluation.metrics.matching import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from torchvision_dddas.evaluation.metrics.registry import title_of_group
 from torchvision_dddas.evaluation.report.comparison import MEANING, comparison_section
-from torchvision_dddas.evaluation.report.measures import GROUPS, measure
 from torchvision_dddas.io.report import (
     Axis,
     Cell,
@@ -35,7 +35,7 @@ def tuning_report(run: Mapping[str, Any]) -> str:
         title=f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient",
         run={"loss": None, **run},
         measure=measure(name),
-        group=GROUPS.get(group, group),
+        group=title_of_group(group),
         sides=[_side(side, heading, verdict[side], group, name) for side, heading in SIDES.items() if verdict],
         charts=_charts(run),
         parameters=_parameter_table(parameters),

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.functional.soft import step

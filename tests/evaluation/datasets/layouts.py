@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.evaluation.datasets import kinds
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset
-from torchvision_dddas.evaluation.studies.spec import Source
+from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, Source
 
 SIZE = (32, 24)
 """Of pictures and masks, px."""

@@ -18,7 +18,7 @@ WHOLE = '1 2 3.5 "Person_sitting" 9\n\n2 2 -1e2 Car\n'
 def test_both_ways_read_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str) -> None:
     path = text(tmp_path / "a.txt", content)
     quick = read_rows(path, COLUMNS, "kind")
-    monkeypatch.setattr(annotations, "_quickly", lambda *_: None)
+    monkeypatch.setattr(annotations, "_read_fast", lambda *_: None)
     slow = read_rows(path, COLUMNS, "kind") if content else quick
     assert np.array_equal(quick.values, slow.values, equal_nan=True)
     assert quick.word.tolist() == slow.word.tolist() == (["Person_sitting", "Car"] if content else [])

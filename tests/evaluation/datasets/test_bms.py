@@ -8,7 +8,7 @@ import pytest
 
 from tests.evaluation.datasets.layouts import clip, colours, complaint, mask, pictures, read, text
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.bms_definition import read as read_definition
+from torchvision_dddas.evaluation.datasets.bms import read_definition
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 
 CAR, MAN = (2, 2, 8, 8), (20, 10, 6, 10)
@@ -106,7 +106,7 @@ def test_of_two_clips_of_one_name_the_second_is_told(tmp_path: Path) -> None:
     mask(tmp_path / "cars1" / "masks" / "1.png", {CAR: 7})
     found = read("bms", tmp_path)
     assert len(found.clips) == 1
-    assert found.missing[0].endswith("are there; the latter is left out")
+    assert found.missing[0].endswith("of the same name is not")
 
 
 def test_a_clip_without_its_definition_is_told(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_clip_that_is_not_whole_is_told(tmp_path: Path) -> None:
 
 def test_labels_that_are_not_there_are_told(tmp_path: Path) -> None:
     (fbms(tmp_path) / "GroundTruth" / "cars1_0020_gt.ppm").unlink()
-    assert "cars1_0020_gt.ppm is not there; the definition beside it names it" in complaint("bms", tmp_path)
+    assert "cars1_0020_gt.ppm does not exist; the definition beside it names it" in complaint("bms", tmp_path)
 
 
 def test_labels_of_another_size_are_told(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_labels_of_another_size_are_told(tmp_path: Path) -> None:
         ("", "is no definition of a clip; wanted two regions or more"),
         (definition([0], 3, {"a.ppm": "a.pgm"}), "is no definition of a clip"),
         (definition([0, 9], 3, {}), "names 0 labelled frames, 0 files and 0 pictures; wanted as many of each"),
-        (definition([0, 9], 3, {"a.ppm": "a.pgm"}).replace("\n9\n", "\nnine\n"), "'nine' will not do; wanted a whole"),
+        (definition([0, 9], 3, {"a.ppm": "a.pgm"}).replace("\n9\n", "\nnine\n"), "wanted a whole number, got 'nine'"),
         (definition([0, 9], 3, {"a.ppm": "a.pgm"}).replace("File name:\na.pgm\n", "", 1), "1 labelled frames, 0 files"),
     ],
 )

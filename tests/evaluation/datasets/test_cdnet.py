@@ -68,7 +68,7 @@ def test_a_temporal_region_that_is_none_is_told(tmp_path: Path, region: str) -> 
 
 def test_a_temporal_region_without_masks_is_told(tmp_path: Path) -> None:
     cdnet(tmp_path, region="90 99")
-    assert "labels none of the frames 90 to 99; there belong masks" in complaint("cdnet", tmp_path)
+    assert "labels none of the frames 90 to 99; wanted masks" in complaint("cdnet", tmp_path)
 
 
 def test_masks_of_other_frames_or_sizes_are_told_and_the_others_go_on(tmp_path: Path) -> None:

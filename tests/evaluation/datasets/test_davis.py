@@ -72,7 +72,7 @@ def test_a_listed_clip_that_is_not_there_is_told_and_the_others_go_on(tmp_path: 
     found = read("davis", tmp_path, subset="val")
     assert [c.name for c in found.clips] == ["bear"]
     assert found.missing == (
-        f"boat: {tmp_path / 'JPEGImages/480p/boat'} holds no pictures; there belong the frames of the clip",
+        f"boat: {tmp_path / 'JPEGImages/480p/boat'} holds no pictures; wanted the frames of the clip",
     )
 
 
@@ -85,7 +85,7 @@ def test_an_unknown_subset_lists_those_there_are(tmp_path: Path) -> None:
 def test_parts_that_are_not_there_are_told_with_their_place(tmp_path: Path) -> None:
     davis(tmp_path, "bear")
     (tmp_path / "Annotations").rename(tmp_path / "elsewhere")
-    expected = f"{tmp_path / 'Annotations/480p'} is not there; there belong the masks, a folder a clip"
+    expected = f"{tmp_path / 'Annotations/480p'} does not exist; wanted the masks, a folder a clip"
     assert complaint("davis", tmp_path) == expected
 
 
@@ -96,9 +96,9 @@ def test_frames_without_masks_and_masks_without_frames_are_told(tmp_path: Path) 
     found = read("davis", tmp_path)
     assert [c.name for c in found.clips] == ["bear"]
     assert "car: " in found.missing[0]
-    assert "holds no masks; there belongs the truth of the clip" in found.missing[0]
+    assert "holds no masks; wanted the truth of the clip" in found.missing[0]
     assert "dog: " in found.missing[1]
-    assert "holds no pictures; there belong the frames of the clip" in found.missing[1]
+    assert "holds no pictures; wanted the frames of the clip" in found.missing[1]
 
 
 def test_more_masks_than_frames_are_told(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from tests.evaluation.datasets.layouts import complaint, read, text, video
 from tests.evaluation.datasets.numbered import line_of, numbered
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
+from torchvision_dddas.evaluation.metrics.matching import counted
 
 # -- VisDrone ----------------------------------------------------------------------------------------------------------
 
@@ -54,7 +54,7 @@ def test_true_boxes_in_a_region_or_of_other_categories_neither_count_nor_harm(tm
     ("rows", "said"),
     [
         ("1,1,2,3,4,5,1\n", "line 1: 7 columns; wanted frame,identity,left"),
-        ("1,1,2,3,4,5,1,12,0,0\n", "line 1: the category is 12; wanted 0 to 11"),
+        ("1,1,2,3,4,5,1,12,0,0\n", "line 1: the category is '12'; wanted 0 to 11"),
         ("3,1,2,3,4,5,1,1,0,0\n", "labels frame 3, but the clip has 2"),
         (SKY, "holds no box that counts"),
         ("", "holds no box that counts"),
@@ -116,7 +116,7 @@ def test_categories_and_attributes_of_uavdt_can_be_asked_for(tmp_path: Path) -> 
     ("rows", "said"),
     [
         ("1,1,2,3,4,5,1,1\n", "8 columns"),
-        ("1,1,2,3,4,5,1,1,4\n", "category is 4"),
+        ("1,1,2,3,4,5,1,1,4\n", "category is '4'"),
         ("7,1,2,3,4,5,1,1,1", "labels frame 7"),
     ],
 )
@@ -161,7 +161,7 @@ def test_labels_can_be_asked_for_and_folders_may_be_flat(tmp_path: Path) -> None
     found = read("sdd", tmp_path / "sdd", classes=["Biker"])
     (clip,) = found.clips
     assert clip.name == "SDD-quad-video0" and found.missing == ()
-    assert "no pictures; its video belongs in" in line_of(found)
+    assert "no pictures, which belong in" in line_of(found)
     assert clip.truth and clip.truth.tracks and clip.truth.tracks.identity.tolist() == [3]
 
 

@@ -70,7 +70,7 @@ def test_a_crop_shows_one_person_in_its_middle(tmp_path: Path) -> None:
     [
         (annotation((33, 24)), "it is 32×24 pixels, but"),
         (annotation(boxes=1, announced=2), "announces 2 objects and has the boxes of 1"),
-        ("", "does not tell 'Image size'"),
+        ("", "does not hold 'Image size'"),
         (annotation().replace("(19, 21)", "(5, 21)"), "has a box whose end is before its beginning"),
         (None, "no truth, which belongs in "),
     ],

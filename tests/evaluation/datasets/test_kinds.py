@@ -19,7 +19,7 @@ def make(folder: Path, *names: str) -> None:
 @pytest.mark.parametrize("kind", kinds.KINDS)
 def test_each_kind_tells_of_a_folder_that_is_not_there_and_what_belongs_into_it(kind: str, tmp_path: Path) -> None:
     line = complaint(kind, tmp_path / "absent")
-    assert line == f"{tmp_path / 'absent'} is not there; there belongs {kinds.KINDS[kind]}"
+    assert line == f"{tmp_path / 'absent'} does not exist; wanted {kinds.KINDS[kind]}"
 
 
 @pytest.mark.parametrize("kind", kinds.KINDS)
@@ -43,7 +43,7 @@ def test_an_unknown_kind_lists_the_kinds(tmp_path: Path) -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "clips").write_text("")
-    assert "clips is no folder; there belongs" in complaint("folder", tmp_path / "clips")
+    assert "clips is no folder; wanted" in complaint("folder", tmp_path / "clips")
 
 
 def test_patterns_pick_clips_and_the_others_are_not_complained_of(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_clips_come_in_natural_order(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_relative_to_the_base(tmp_path: Path) -> None:
-    from torchvision_dddas.evaluation.studies.spec import Source
+    from torchvision_dddas.evaluation.datasets.record import Source
 
     make(tmp_path / "data", "cars1")
     found = kinds.read(Source("folder", Path("../data")), tmp_path / "studies")
@@ -78,11 +78,14 @@ def test_a_folder_is_relative_to_the_base(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "line"),
     [
-        ({"rate_hz": "fast"}, "rate_hz = 'fast' will not do for a data set of kind folder; wanted a number above 0"),
-        ({"rate_hz": 0}, "rate_hz = 0 will not do"),
-        ({"rate_hz": True}, "rate_hz = True will not do"),
-        ({"still": "cars1"}, "still = 'cars1' will not do for a data set of kind folder; wanted a list of texts"),
-        ({"still": [1]}, "still = [1] will not do"),
+        (
+            {"rate_hz": "fast"},
+            "rate_hz of a data set of kind folder must be a number above 0, at most 1000, got 'fast'",
+        ),
+        ({"rate_hz": 0}, "got 0"),
+        ({"rate_hz": True}, "got True"),
+        ({"still": "cars1"}, "still of a data set of kind folder must be a list of texts, got 'cars1'"),
+        ({"still": [1]}, "got [1]"),
     ],
 )
 def test_an_option_of_another_type_is_refused(tmp_path: Path, option: dict[str, Any], line: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 from tests.evaluation.datasets.layouts import complaint, read, text
 from tests.evaluation.datasets.numbered import line_of, numbered
 from torchvision_dddas.evaluation.datasets.kitti import EARTH_RADIUS_M
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
+from torchvision_dddas.evaluation.metrics.matching import counted
 
 # The camera looks ahead: its right is the unit's -y, its down -z, its ahead x; it sits 1 m ahead of the unit.
 CALIBRATION = (

@@ -8,7 +8,7 @@ import pytest
 from tests.evaluation.datasets.layouts import read, text, video
 from tests.evaluation.datasets.numbered import line_of, numbered
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
+from torchvision_dddas.evaluation.metrics.matching import counted
 
 INI = "[Sequence]\nname={0}\nimDir=img1\nframeRate=25\nseqLength={1}\nimWidth=32\nimHeight=24\nimExt=.png\n"
 OF_2015 = (
@@ -133,9 +133,9 @@ def test_only_what_is_asked_for_is_read(tmp_path: Path) -> None:
         ("gt.txt=0,1,10,20,30,40,1,1,1\n", "line 1: frame is '0'; wanted a whole number, 1 to"),
         ("gt.txt=1,1,10,20,30,40,0,3,1\n", "holds no pedestrian that counts"),
         ("seqinfo.ini=[Sequence]\nseqLength=4\n", "has 3 frames, but seqinfo.ini says 4"),
-        ("seqinfo.ini=nothing\n", "does not tell seqLength"),
+        ("seqinfo.ini=nothing\n", "does not hold seqLength"),
         (f"seqinfo.ini=[Sequence]\nseqLength=3\nimDir={'9' * 300}\n", "is no folder's name"),
-        ("000002.png=", "goes on with 000003.png where frame 2 belongs"),
+        ("000002.png=", "has 000003.png where frame 2 belongs"),
     ],
 )
 def test_a_spoiled_sequence_is_one_clear_line_and_the_others_go_on(tmp_path: Path, spoil: str, said: str) -> None:

@@ -95,7 +95,7 @@ def test_one_run_or_several(tmp_path: Path) -> None:
 @pytest.mark.parametrize("part", ["truth/gt.txt", "truth/positions.csv"])
 def test_a_run_that_was_not_finished_is_told(tmp_path: Path, part: str) -> None:
     (run(tmp_path) / part).unlink()
-    assert "is not there; the run was not finished, simulate it again" in complaint("simulated", tmp_path)
+    assert "does not exist; the run was not finished, simulate it again" in complaint("simulated", tmp_path)
 
 
 def test_an_interrupted_run_is_told_and_the_others_go_on(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_positions_of_another_kind_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"clip": 3, "state": "complete"}'])
 def test_a_damaged_record_of_the_run_is_told(tmp_path: Path, content: str) -> None:
     text(run(tmp_path) / "run.json", content)
-    assert "run.json does not tell the frames a second" in complaint("simulated", tmp_path)
+    assert "run.json does not hold the frames a second" in complaint("simulated", tmp_path)
 
 
 def test_more_masks_than_pictures_are_told(tmp_path: Path) -> None:

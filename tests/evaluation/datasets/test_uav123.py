@@ -51,7 +51,7 @@ def test_a_whole_sequence_needs_no_configuration(tmp_path: Path) -> None:
 def test_a_part_without_the_configuration_is_told(tmp_path: Path) -> None:
     text(uav123(tmp_path) / "car6_2.txt", "\n".join(BOXES))
     line = complaint("uav123", tmp_path)
-    assert "or configSeqs.m, which tells of what sequence car6_2 is a part" in line
+    assert "or configSeqs.m, which says of what sequence car6_2 is a part" in line
 
 
 @pytest.mark.parametrize(("variant", "rate_hz"), [("UAV123", 30.0), ("UAV20L", 30.0), ("UAV123_10fps", 10.0)])
@@ -101,7 +101,7 @@ def test_a_sequence_that_is_not_whole_is_told(tmp_path: Path) -> None:
     assert "holds 3 of the frames 6 to 9 of car6_2; wanted all of them" in complaint("uav123", tmp_path)
 
 
-@pytest.mark.parametrize(("content", "line"), [("", "is empty"), ("a,b,c,d\n", "is no table of boxes")])
+@pytest.mark.parametrize(("content", "line"), [("", "is empty"), ("a,b,c,d\n", "a box is a,b,c,d")])
 def test_damaged_boxes_are_told(tmp_path: Path, content: str, line: str) -> None:
     text(uav123(tmp_path, sequence="bike1", frames=1) / "bike1.txt", content)
     assert line in complaint("uav123", tmp_path)
@@ -115,7 +115,7 @@ def test_an_unknown_variant_is_refused(tmp_path: Path) -> None:
 def test_parts_that_are_not_there_are_told_with_their_place(tmp_path: Path) -> None:
     uav123(tmp_path)
     line = complaint("uav123", tmp_path)
-    assert line == f"{tmp_path / 'anno'} is not there; there belong the boxes, CLIP.txt"
+    assert line == f"{tmp_path / 'anno'} does not exist; wanted the boxes, CLIP.txt"
 
 
 def test_the_long_variant_may_share_its_sequences_with_the_short_one(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_clip_without_truth_is_told_and_the_others_go_on(tmp_path: Path) -> No
 
 def test_truth_without_pictures_is_told(tmp_path: Path) -> None:
     text(tmp_path / "egtest01" / "egtest01_truth.csv", CSV)
-    assert "holds no pictures; there belong frame00000.jpg and so on" in complaint("vivid", tmp_path)
+    assert "holds no pictures; wanted frame00000.jpg and so on" in complaint("vivid", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -91,14 +91,14 @@ def test_truth_without_pictures_is_told(tmp_path: Path) -> None:
     [
         ("egtest01_truth.csv", CSV + "car,99,7,1,2,8,5\n", "line 5: there is no picture 99; the clip has 0 to 20"),
         ("egtest01_truth.csv", CSV + "car,1,7\n", "line 5: 3 columns; wanted name,frame,identity,x,y,width,height"),
-        ("egtest01_truth.csv", CSV + "car,1,7,a,2,8,5\n", "line 5: 'a' will not do; wanted a number"),
-        ("egtest01_truth.csv", CSV + "car,1,7,1,2,-8,5\n", "a box has no width or height; wanted more than 0"),
-        ("egtest01_truth.csv", CSV + "car,10,7,1,2,8,5\n", "an identity stands twice in a frame"),
+        ("egtest01_truth.csv", CSV + "car,1,7,a,2,8,5\n", "line 5: got 'a'"),
+        ("egtest01_truth.csv", CSV + "car,1,7,1,2,-8,5\n", "the box is -8×5 pixels; wanted more than 0"),
+        ("egtest01_truth.csv", CSV + "car,10,7,1,2,8,5\n", "lines 4 and 5: identity 7 twice in frame 11"),
         ("egtest01_truth.csv", CSV + "car,1,7.5,1,2,8,5\n", "7.5 is no identity; wanted whole numbers"),
         ("egtest01_truth.csv", "name,frame,id,x,y,w,h\n", "holds no boxes"),
         ("egtest01.txt", "", "is empty; wanted frame,x,y,width,height"),
         ("egtest01.txt", "1,2\n", "has 2 columns; wanted frame,x,y,width,height"),
-        ("egtest01.txt", "0,1,2,8,5\n0,1,2,8,5\n", "line 2: frame 0 stands there twice"),
+        ("egtest01.txt", "0,1,2,8,5\n0,1,2,8,5\n", "line 2: frame 0 is there twice"),
         ("egtest01.txt", "1,2,8,5\n", "has 1 lines, but the clip 21 frames; wanted a line a frame"),
         ("egtest01.txt", "0,1,2,8,5\n1,2,8,5\n", "line 2: 4 columns; the first line has 5"),
         ("egtest01.txt", "NaN,1,2,8,5\n", "line 1: there is no picture nan"),

@@ -166,7 +166,7 @@ def test_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_counts(tmp
         ("1,7,0,0,-10,20,1\n", r"line 1: the box is -10×20 pixels; wanted more than 0"),
         ("1,7,0,0\n", r"line 1: 4 columns; wanted frame,id,x,y,w,h"),
         ("frame,id,x,y,w,h\n", r"line 1: frame is 'frame'"),
-        ("1,-1,0,0,10,20,1\n1,3,0,0,10,20,1\n", r"line 1: identity -1 stands for none; other rows have one"),
+        ("1,-1,0,0,10,20,1\n1,3,0,0,10,20,1\n", r"line 1: identity -1 means none, but other rows have one"),
         ("101,7,0,0,10,20,1\n", r"share no frame: truth 1 to 2, result 101 to 101"),
     ],
 )
@@ -191,5 +191,5 @@ def test_a_mistake_in_the_truth_is_told_with_file_and_line(tmp_path, truth, says
 def test_a_seqinfo_without_a_length_is_named(tmp_path):
     places = clip(tmp_path, tracks__txt=FOUND)
     (tmp_path / "seqinfo.ini").write_text("[Sequence]\nname=x\n")
-    with pytest.raises(InputError, match=r"seqinfo\.ini does not tell seqLength"):
+    with pytest.raises(InputError, match=r"seqinfo\.ini does not hold seqLength"):
         evaluate(*places)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.evaluation.metrics import metres
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
 from torchvision_dddas.evaluation.metrics.metres import INSIDE
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 
 
 def samples(error, inside):

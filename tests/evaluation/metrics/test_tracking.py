@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.matching import pair
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 
 BOX = {"a": (0, 0, 10, 20), "b": (100, 0, 10, 20), "c": (0, 300, 10, 20)}
 
@@ -131,12 +133,12 @@ def test_pooled_counts_are_those_of_one_long_clip():
         TrackTable(np.r_[a.frame, b.frame + 100], np.r_[a.identity, b.identity + 1000], np.r_[a.box_px, b.box_px])
         for a, b in ((truth, later), (found, other))
     )
-    pooled = tracking.count(truth, found).plus(tracking.count(later, other))
+    pooled = add_counts(tracking.count(truth, found), tracking.count(later, other))
     together, apart = scores(long_truth, long_found), tracking.measures(pooled)
     assert {k: v for k, v in apart.items() if k[:3] != "ar_"} == pytest.approx(
         {k: v for k, v in together.items() if k[:3] != "ar_"}
     )
-    assert tracking.measures(TrackCounts().plus(pooled)) == pytest.approx(apart)
+    assert tracking.measures(add_counts(TrackCounts(), pooled)) == pytest.approx(apart)
 
 
 @settings(max_examples=20)

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.metrics.matching import counted, pair
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth
 
 
 def table(*boxes: tuple[float, float, float, float]) -> TrackTable:

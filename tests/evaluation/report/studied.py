@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
 from torchvision_dddas.evaluation.studies.results import Case, Found, Results, Scored
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Source, Spec, Task
+from torchvision_dddas.evaluation.studies.spec import Spec, Task
 
 SIZE = (160, 120)
 FRAMES = 6

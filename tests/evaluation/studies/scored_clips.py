@@ -70,7 +70,7 @@ def masked(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
     for frame in range(1, frames + 1, 2):
         (folder / "masks" / f"{frame:06d}.png").write_bytes(png(blobs(true[true[:, 0] == frame, 2:6])))
     masks = {f: png(blobs(rows[rows[:, 0] == f, 2:6])) for f in range(1, frames + 1)}
-    return Clip(folder.name, folder, truth=truths.load(folder)), found_of(rows, frames, masks, identities=False)
+    return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames, masks, identities=False)
 
 
 def targeted(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
@@ -81,7 +81,7 @@ def targeted(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
     mine[4] = "nan,nan,nan,nan"
     (folder / "boxes_xywh.txt").write_text("\n".join(mine) + "\n")
     masks = {f: png(blobs(rows[rows[:, 0] == f, 2:6])) for f in range(1, frames + 1)}
-    return Clip(folder.name, folder, truth=truths.load(folder)), found_of(rows, frames, masks)
+    return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames, masks)
 
 
 def tracked(folder: Path, seed=0, frames=30) -> tuple[Clip, Found]:
@@ -93,7 +93,7 @@ def tracked(folder: Path, seed=0, frames=30) -> tuple[Clip, Found]:
     ]
     (folder / "gt" / "gt.txt").write_text("".join(lines))
     (folder / "seqinfo.ini").write_text(f"[Sequence]\nseqLength={frames + 3}\n")
-    return Clip(folder.name, folder, truth=truths.load(folder)), found_of(rows, frames + 3)
+    return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames + 3)
 
 
 def as_files(folder: Path, found: Found, interval=1, identities=False) -> Path:

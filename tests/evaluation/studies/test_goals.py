@@ -6,9 +6,10 @@ import pytest
 
 from tests.evaluation.studies.scored_clips import masked, targeted, tracked
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.goals import OF_TASK, check_possible, parse_goal, possible_groups
+from torchvision_dddas.evaluation.metrics.registry import groups_of_task, is_lower_better, measure_names
+from torchvision_dddas.evaluation.studies.goals import check_possible, parse_goal, possible_groups
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measure_names, measures
+from torchvision_dddas.evaluation.studies.summary import measures
 
 
 @pytest.mark.parametrize(
@@ -17,13 +18,16 @@ from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measure_nam
 def test_the_names_of_measures_are_those_that_scored_clips_have(tmp_path, make, task) -> None:
     clip, found = make(tmp_path / "clip", 0)
     having = measures([score(clip, task, found)])
-    assert set(having) == set(possible_groups(clip, task)) <= set(OF_TASK[task])
+    assert set(having) == set(possible_groups(clip, task)) <= set(groups_of_task(task))
     for group, told in having.items():
-        assert set(measure_names(group)) == {name for name in told if not name.startswith("n_") or name in BETTER_LOW}
+        assert set(measure_names(group)) == {
+            name for name in told if not name.startswith("n_") or is_lower_better(name)
+        }
 
 
 def test_every_task_has_a_group_and_every_group_a_measure() -> None:
-    for task, groups in OF_TASK.items():
+    for task in TASKS:
+        groups = groups_of_task(task)
         for group in groups:
             assert measure_names(group)
             assert parse_goal(f"{task}.{group}.{measure_names(group)[0]}").group == group

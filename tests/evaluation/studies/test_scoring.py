@@ -13,9 +13,8 @@ from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.figures import figures
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, Truth
+from torchvision_dddas.evaluation.metrics.registry import figures
+from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, TrackTable, Truth
 from torchvision_dddas.evaluation.studies.results import round_as_written
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.spec import Source, Task

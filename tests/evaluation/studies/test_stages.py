@@ -62,7 +62,7 @@ def test_motion_is_what_the_loop_finds(clips) -> None:
 def test_masks_are_kept_of_frames_that_the_truth_labels_alone(clips) -> None:
     assert (
         sorted(find(clips["masks"], "motion", load_config()).masks)
-        == truths.load(clips["masks"].place / "masks").frames
+        == truths.load_truth(clips["masks"].place / "masks").frames
     )
     assert find(clips["tracks"], "motion", load_config()).masks == {}
 

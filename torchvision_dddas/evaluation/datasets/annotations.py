@@ -1,21 +1,30 @@
 """Annotations as text, a row a box, and boxes with identities as the truth of a clip."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.ignored_regions import within
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import FARTHEST, MotRows, Positions, Truth, with_identities
+from torchvision_dddas.evaluation.metrics.matching import lie_within
+from torchvision_dddas.evaluation.metrics.truth import (
+    FARTHEST,
+    MotRows,
+    Positions,
+    TrackTable,
+    Truth,
+    read_text,
+    split_cells,
+    to_number,
+    with_identities,
+)
 
 LAST = 1_000_000
 """No frame has a larger number: nine hours at 30 Hz."""
 
 _WHOLE = ("frame", "identity")
-_AROUND = "\"' \t"
+_QUOTES = "\"' \t"
 
 
 class Rows(NamedTuple):
@@ -26,24 +35,15 @@ class Rows(NamedTuple):
     line: np.ndarray
 
 
-def text_of(path: Path) -> str:
-    """A file's text. Raises InputError where it cannot be read or is none."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InputError(f"{path} cannot be read: {reason}") from None
-
-
 def read_rows(path: Path, columns: Sequence[str], word: str = "", first: int = 1) -> Rows:
-    """Read a table by commas or blanks; columns after the named ones are left.
+    """Read a table separated by commas or blanks; columns after the named ones are ignored.
 
-    columns: what each is; "frame" and "identity" are whole, frames not below `first`. word: the one that holds a word,
-    of which quotes are taken off. Raises InputError with file and line: too few columns, no finite number.
+    columns: names; "frame" and "identity" are whole, frames not below `first`. word: the column that holds a word,
+    whose quotes are taken off. Raises InputError with file and line: too few columns, no finite number.
     """
-    lines = [(n, text) for n, text in enumerate(text_of(path).splitlines(), 1) if text.strip()]
+    lines = [(n, text) for n, text in enumerate(read_text(path).splitlines(), 1) if text.strip()]
     line, texts = np.array([n for n, _ in lines], np.int64), [text for _, text in lines]
-    values, words = _quickly(texts, columns, word) or _carefully(path, lines, columns, word)
+    values, words = _read_fast(texts, columns, word) or _read_slowly(path, lines, columns, word)
     for k, name in enumerate(columns):
         if name == word:
             continue
@@ -55,17 +55,13 @@ def read_rows(path: Path, columns: Sequence[str], word: str = "", first: int = 1
         if bad.any():
             i = int(bad.argmax())
             number = "a whole number" if name in _WHOLE else "a number"
-            cell = _cells(texts[i])[k]
+            cell = split_cells(texts[i])[k]
             raise InputError(f"{path}, line {line[i]}: {name} is '{cell}'; wanted {number}, {low:g} to {high:g}")
     return Rows(values, np.array(words, object), line)
 
 
-def _cells(text: str) -> list[str]:
-    return [cell.strip() for cell in text.split(",")] if "," in text else text.split()
-
-
-def _quickly(texts: Sequence[str], columns: Sequence[str], word: str) -> tuple[np.ndarray, list[str]] | None:
-    """Values (N, C) and words, where NumPy's own reader takes all lines, which is several times as fast; else None."""
+def _read_fast(texts: Sequence[str], columns: Sequence[str], word: str) -> tuple[np.ndarray, list[str]] | None:
+    """Values (N, C) and words by NumPy's own reader, which is several times as fast; None where it fails."""
     values, words = np.full((len(texts), len(columns)), np.nan), [""] * len(texts)
     if not texts:
         return values, words
@@ -75,32 +71,40 @@ def _quickly(texts: Sequence[str], columns: Sequence[str], word: str) -> tuple[n
         values[:, numbers] = np.loadtxt(texts, delimiter=separator, comments=None, usecols=numbers, ndmin=2)
         if word:
             at = columns.index(word)
-            words = [text.split(separator, at + 1)[at].strip(_AROUND) for text in texts]
+            words = [text.split(separator, at + 1)[at].strip(_QUOTES) for text in texts]
     except (ValueError, IndexError):
         return None
     return values, words
 
 
-def _carefully(
+def _read_slowly(
     path: Path, lines: Sequence[tuple[int, str]], columns: Sequence[str], word: str
 ) -> tuple[np.ndarray, list[str]]:
-    """The same, NaN where a cell is no number. Raises InputError where a line has too few columns."""
     rows = []
     for n, text in lines:
-        rows.append(cells := _cells(text))
+        rows.append(cells := split_cells(text))
         if len(cells) < len(columns):
             count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
             raise InputError(f"{path}, line {n}: {count}; wanted {','.join(columns)}")
-    kept = [[_number(cell) for cell in row[: len(columns)]] for row in rows]
-    words = [row[columns.index(word)].strip(_AROUND) if word else "" for row in rows]
-    return np.array(kept, float), words
+    values = [[to_number(cell) for cell in row[: len(columns)]] for row in rows]
+    words = [row[columns.index(word)].strip(_QUOTES) if word else "" for row in rows]
+    return np.array(values, float), words
 
 
-def _number(cell: str) -> float:
-    try:
-        return float(cell) if "_" not in cell else np.nan
-    except ValueError:
-        return np.nan
+def check_classes(classes: Sequence[str], known: Sequence[str], name: str) -> None:
+    """Raises InputError where a requested class is not among the known ones. name: of the data set."""
+    for one in classes:
+        if one not in known:
+            raise InputError(f"'{one}' is no class of {name}; wanted some of {', '.join(known)}")
+
+
+def check_known(path: Path, rows: Rows, values: np.ndarray, known: Collection[Any], what: str, wanted: str) -> None:
+    """Raises InputError with file and line where one of the values (N,) of rows is not among the known ones."""
+    unknown = ~np.isin(values, list(known))
+    if unknown.any():
+        i = int(unknown.argmax())
+        value = values[i] if isinstance(values[i], str) else f"{values[i]:g}"
+        raise InputError(f"{path}, line {rows.line[i]}: the {what} is '{value}'; wanted {wanted}")
 
 
 def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray, line: np.ndarray) -> TrackTable:
@@ -112,8 +116,7 @@ def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.nda
         i = int(flat.argmax())
         size = f"{box_px[i, 2]:g}×{box_px[i, 3]:g}"
         raise InputError(f"{path}, line {line[i]}: the box is {size} pixels; wanted more than 0")
-    table = TrackTable(frame.astype(np.int64), identity.astype(np.int64), box_px)
-    return with_identities(MotRows(table, np.ones(len(frame)), line), path)
+    return with_identities(MotRows(TrackTable.of(frame, identity, box_px), np.ones(len(frame)), line), path)
 
 
 def truth_of(
@@ -133,41 +136,35 @@ def truth_of(
     if length and last > length:
         raise InputError(f"{place} labels frame {last}, but the clip has {length}; is it the same clip?")
     if length > LAST:
-        raise InputError(f"{place}: the clip is said to have {length} frames; wanted at most {LAST}")
+        raise InputError(f"{place}: a clip must have at most {LAST} frames, got {length}")
     if regions is not None:
         counts = counts & ~_in_regions(table, regions)
     if not counts.any():
         raise InputError(f"{place} holds no box that counts")
     kept = table.at(counts)
-    boxes = by_frame(kept, length or last)
     ignored = table.at(~counts) if not counts.all() else None
-    said = positions if positions is not None and len(positions.frame) else None
-    return Truth("boxes", place, {}, boxes, kept, ignored, length, positions=said, ignoring="removed", regions=regions)
+    return Truth(
+        "boxes",
+        place,
+        {},
+        boxes_by_frame(kept, length or last),
+        kept,
+        ignored,
+        length,
+        positions=positions if positions is not None and len(positions.frame) else None,
+        ignoring="removed",
+        regions=regions,
+    )
 
 
-def by_frame(table: TrackTable, length: int) -> dict[int, np.ndarray]:
+def boxes_by_frame(table: TrackTable, length: int) -> dict[int, np.ndarray]:
     """The boxes (N, 4) of each frame from 1 to length, in the table's order."""
-    order = np.argsort(table.frame, kind="stable")
-    frames = table.frame[order]
-    boxes = dict.fromkeys(range(1, length + 1), np.zeros((0, 4)))
-    starts = np.flatnonzero(np.diff(frames, prepend=frames[0] - 1)) if len(frames) else np.zeros(0, int)
-    for rows in np.split(order, starts[1:]) if len(starts) else ():
-        boxes[int(table.frame[rows[0]])] = table.box_px[rows]
-    return boxes
-
-
-def asked(words: np.ndarray, wanted: Iterable[str], known: Iterable[str], what: str) -> np.ndarray:
-    """(N,) bool: whose class is wanted. Raises InputError where a wanted one is not among the known."""
-    wanted, known = list(wanted), list(known)
-    for name in wanted:
-        if name not in known:
-            raise InputError(f"'{name}' is no class of {what}; wanted some of {', '.join(known)}")
-    return np.isin(words.astype(str), wanted)
+    return {frame: np.zeros((0, 4)) for frame in range(1, length + 1)} | table.boxes_by_frame()
 
 
 def _in_regions(table: TrackTable, regions: TrackTable) -> np.ndarray:
     lies = np.zeros(len(table.frame), bool)
-    for number in np.unique(regions.frame):
+    for number, region_px in regions.boxes_by_frame().items():
         rows = np.flatnonzero(table.frame == number)
-        lies[rows] = within(table.box_px[rows], regions.box_px[regions.frame == number])
+        lies[rows] = lie_within(table.box_px[rows], region_px)
     return lies

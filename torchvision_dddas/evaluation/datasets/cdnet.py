@@ -17,10 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.files import fitted, frames_by_number, images_in, labelled, number_of
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics.truth import Labels, Truth
+from torchvision_dddas.evaluation.datasets.files import (
+    fit_clip,
+    frames_by_number,
+    images_in,
+    masks_by_frame,
+    number_of,
+)
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
+from torchvision_dddas.evaluation.metrics.truth import Labels, Truth, read_text
 
 TERMS = "whoever publishes results acknowledges changedetection.net and cites its papers"
 
@@ -31,7 +36,8 @@ PARTS = ("input", "groundtruth", "temporalROI.txt")
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """The clips of a folder of categories, `dataset` in the published archive. See `kinds.KINDS`."""
-    said = checked("cdnet", options, {"rate_hz": None})
+    rate_hz = check_options("cdnet", options, {"rate_hz": None})["rate_hz"]
+    collector = Collector("cdnet", folder, TERMS, wanted)
     if "dataset" in folders_in(folder):
         folder = folder / "dataset"
     places = {
@@ -42,32 +48,26 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
 
     def clip_of(name: str) -> Clip:
         place = places[name]
-        if lacking := [part for part in PARTS if not (place / part).exists()]:
-            raise InputError(f"{place} has no {lacking[0]}; wanted {', '.join(PARTS)}")
+        if absent := [part for part in PARTS if not (place / part).exists()]:
+            raise InputError(f"{place} has no {absent[0]}; wanted {', '.join(PARTS)}")
         pictures = images_in(place / "input")
         if not pictures:
-            raise InputError(f"{place / 'input'} holds no pictures; there belong the frames of the clip")
-        first, last = _counted(place / "temporalROI.txt")
+            raise InputError(f"{place / 'input'} holds no pictures; wanted the frames of the clip")
+        first, last = _read_temporal_region(place / "temporalROI.txt")
         masks = [p for p in images_in(place / "groundtruth") if first <= (number_of(p) or 0) <= last]
         if not masks:
-            raise InputError(f"{place / 'groundtruth'} labels none of the frames {first} to {last}; there belong masks")
-        found = labelled(masks, frames_by_number(pictures), place / "input")
+            raise InputError(f"{place / 'groundtruth'} labels none of the frames {first} to {last}; wanted masks")
+        found = masks_by_frame(masks, frames_by_number(pictures), place / "input")
         truth = Truth("masks", place / "groundtruth", found, {}, length=len(pictures), labels=LABELS)
-        return fitted(Clip(name, place, pictures, said["rate_hz"], len(pictures), truth))
+        return fit_clip(Clip(name, place, pictures, rate_hz, len(pictures), truth))
 
-    return gather("cdnet", folder, TERMS, filter(wanted, places), clip_of)
+    return collector.collect(places, clip_of)
 
 
-def _counted(path: Path) -> tuple[int, int]:
+def _read_temporal_region(path: Path) -> tuple[int, int]:
     """The first and the last frame that count. Raises InputError where the file does not say."""
-    try:
-        words = path.read_text(encoding="utf-8-sig").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
-    if (
-        len(words) != 2
-        or not all(word.isdecimal() and len(word) < 9 for word in words)
-        or int(words[0]) > int(words[1])
-    ):
+    words = read_text(path).split()
+    numbers = [int(word) for word in words if word.isdecimal() and len(word) < 9]
+    if not len(words) == len(numbers) == 2 or numbers[0] > numbers[1]:
         raise InputError(f"{path} says '{' '.join(words)[:40]}'; wanted the first and the last frame that count")
-    return int(words[0]), int(words[1])
+    return numbers[0], numbers[1]

@@ -11,8 +11,6 @@ project IST 2001 37540; the annotation of PETS 2009 by A. Milan, for research.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,39 +19,32 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.annotations import LAST, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.files import agreed, images_in, number_of, videos_in, whole
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics.truth import FARTHEST, Truth
+from torchvision_dddas.evaluation.datasets.files import check_numbering, count_frames, images_in, number_of, videos_in
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
+from torchvision_dddas.evaluation.metrics.truth import FARTHEST, Truth, to_number
 
 TERMS = "research only; cite PETS 2009 or CAVIAR"
-_DEEP = 2
-_BEGINNING = 4096
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """Options. rate_hz: frames a second of pictures; PETS 2009 has 7, CAVIAR 25."""
-    rate_hz = checked("cvml", options, {"rate_hz": None})["rate_hz"]
-    places = {path.stem: path for path in _below(folder, _DEEP) if _is_cvml(path)}
+    rate_hz = check_options("cvml", options, {"rate_hz": None})["rate_hz"]
+    collector = Collector("cvml", folder, TERMS, wanted)
+    places = {path.stem: path for path in _annotations_below(folder, 2)}
     if not places:
-        lacking = f"{folder} holds no CVML annotation; wanted NAME.xml with <dataset><frame number=...>"
-        return Dataset("cvml", folder, (), TERMS, (lacking,))
-    notes: list[str] = []
+        return collector.refuse(f"{folder} holds no CVML annotation; wanted NAME.xml with <dataset><frame number=...>")
+    parents = [path.parent for path in places.values()]
 
     def clip_of(name: str) -> Clip:
         path = places[name]
-        homes = (path.with_suffix(""), *((path.parent,) if _alone(path, places.values()) else ()))
+        homes = [path.with_suffix(""), *([path.parent] if parents.count(path.parent) == 1 else [])]
         images = next((found for home in homes if (found := images_in(home))), ())
-        pictures = whole(images, number_of(images[0]) or 0) if images else _video(homes)
-        frames = agreed(pictures, 0, "")
-        truth = read_truth(path, frames)
-        if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {homes[0]}")
-        frames = frames or truth.frames[-1]
-        return Clip(name, path, pictures, rate_hz, frames, truth, shows=("people",))
+        video = next((found[:1] for home in homes if (found := videos_in(home))), ())
+        pictures = check_numbering(images, number_of(images[0]) or 0) if images else video
+        truth = read_truth(path, count_frames(pictures))
+        return collector.label_clip(name, path, pictures, truth, homes[0], rate_hz=rate_hz, shows=("people",))
 
-    found = gather("cvml", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, notes=tuple(notes))
+    return collector.collect(places, clip_of)
 
 
 def read_truth(path: Path, length: int = 0) -> Truth:
@@ -84,34 +75,22 @@ def read_truth(path: Path, length: int = 0) -> Truth:
 
 
 def _number(path: Path, element: ElementTree.Element, key: str, where: str) -> float:
-    text = element.get(key, "")
-    try:
-        value = float(text) if "_" not in text else float("nan")
-    except ValueError:
-        value = float("nan")
-    if not (isfinite(value) and abs(value) <= FARTHEST):
+    value = to_number(text := element.get(key, ""))
+    if not abs(value) <= FARTHEST:
         raise InputError(f"{path}: {element.tag} of {where} has {key}='{text}'; wanted a number")
     return value
 
 
-def _is_cvml(path: Path) -> bool:
-    """Whether an XML file may be one: broken ones are, so that they are told; calibrations are not."""
+def _annotations_below(folder: Path, depth: int) -> list[Path]:
+    here = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".xml" and p.is_file() and _may_be_cvml(p))
+    return here + [p for name in folders_in(folder) if depth for p in _annotations_below(folder / name, depth - 1)]
+
+
+def _may_be_cvml(path: Path) -> bool:
+    """Whether an XML file may be an annotation: broken ones are, so that they are reported; calibrations are not."""
     try:
         with path.open("rb") as file:
-            beginning = file.read(_BEGINNING)
+            beginning = file.read(4096)
     except OSError:
         return True
     return b"<dataset" in beginning or b"<Camera" not in beginning
-
-
-def _below(folder: Path, deep: int) -> list[Path]:
-    here = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xml" and path.is_file())
-    return here + [path for name in folders_in(folder) if deep for path in _below(folder / name, deep - 1)]
-
-
-def _alone(path: Path, others: Any) -> bool:
-    return sum(other.parent == path.parent for other in others) == 1
-
-
-def _video(homes: tuple[Path, ...]) -> tuple[Path, ...]:
-    return next((found[:1] for home in homes if (found := videos_in(home))), ())

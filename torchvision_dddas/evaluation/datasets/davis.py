@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.files import fitted, frames_by_number, images_in, labelled
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.datasets.files import fit_clip, frames_by_number, images_in, masks_by_frame
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
+from torchvision_dddas.evaluation.metrics.truth import Truth, read_text
 
 TERMS = "2016: BSD licence; 2017: Creative Commons Attribution 4.0; some clips under terms of their own; to be cited"
 
@@ -29,50 +28,41 @@ RATE_HZ = 24.0
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """The clips of a folder that holds JPEGImages and Annotations. See `kinds.KINDS`."""
-    said = checked("davis", options, OPTIONS)
-    photos, masks = (folder / name / said["resolution"] for name in ("JPEGImages", "Annotations"))
-    told = tuple(f"{place} is not there; there belong {what}" for place, what in _parts(photos, masks).items())
-    if told:
-        return Dataset("davis", folder, (), TERMS, told)
+    given = check_options("davis", options, OPTIONS)
+    collector = Collector("davis", folder, TERMS, wanted)
+    photos, masks = (folder / name / given["resolution"] for name in ("JPEGImages", "Annotations"))
+    parts = {photos: "the frames, a folder a clip", masks: "the masks, a folder a clip"}
+    if absent := [f"{place} does not exist; wanted {what}" for place, what in parts.items() if not place.is_dir()]:
+        return collector.refuse(*absent)
     try:
-        names = _listed(folder, said) if said["subset"] else sorted({*folders_in(photos), *folders_in(masks)})
+        names = _read_list(folder, given) if given["subset"] else [*{*folders_in(photos), *folders_in(masks)}]
     except InputError as error:
-        return Dataset("davis", folder, (), TERMS, (str(error),))
+        return collector.refuse(str(error))
 
     def clip_of(name: str) -> Clip:
-        place = photos / name
-        pictures = images_in(place)
+        pictures = images_in(photos / name)
         labels = images_in(masks / name, frozenset({".png"}))
         if not pictures:
-            raise InputError(f"{place} holds no pictures; there belong the frames of the clip")
+            raise InputError(f"{photos / name} holds no pictures; wanted the frames of the clip")
         if not labels:
-            raise InputError(f"{masks / name} holds no masks; there belongs the truth of the clip")
-        found = labelled(labels, frames_by_number(pictures), place)
+            raise InputError(f"{masks / name} holds no masks; wanted the truth of the clip")
+        found = masks_by_frame(labels, frames_by_number(pictures), photos / name)
         truth = Truth("masks", masks / name, found, {}, length=len(pictures))
-        return fitted(Clip(name, place, pictures, said["rate_hz"] or RATE_HZ, len(pictures), truth))
+        return fit_clip(Clip(name, photos / name, pictures, given["rate_hz"] or RATE_HZ, len(pictures), truth))
 
-    return gather("davis", folder, TERMS, filter(wanted, names), clip_of)
-
-
-def _parts(photos: Path, masks: Path) -> dict[Path, str]:
-    parts = {photos: "the frames, a folder a clip", masks: "the masks, a folder a clip"}
-    return {place: what for place, what in parts.items() if not place.is_dir()}
+    return collector.collect(names, clip_of)
 
 
-def _listed(folder: Path, said: Mapping[str, Any]) -> list[str]:
-    """The clips of a subset. Raises InputError where no list of that name is there."""
+def _read_list(folder: Path, given: Mapping[str, Any]) -> list[str]:
+    """The clips of a subset. Raises InputError where no list of that name exists."""
     sets = folder / "ImageSets"
-    years = [said["year"]] if said["year"] else ["2017", "2016"]
-    places = [*(sets / year for year in years), *([sets / said["resolution"]] if said["year"] != "2017" else [])]
-    path = next((p for place in places if (p := place / f"{said['subset']}.txt").is_file()), None)
+    years = [given["year"]] if given["year"] else ["2017", "2016"]
+    places = [*(sets / year for year in years), *([sets / given["resolution"]] if given["year"] != "2017" else [])]
+    path = next((p for place in places if (p := place / f"{given['subset']}.txt").is_file()), None)
     if path is None:
         there = sorted({p.stem for place in places for p in place.glob("*.txt")})
         held = f"it has {', '.join(there)}" if there else "it has no lists"
-        raise InputError(f"{sets} has no list {said['subset']}.txt of {' or '.join(p.name for p in places)}; {held}")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+        raise InputError(f"{sets} has no list {given['subset']}.txt of {' or '.join(p.name for p in places)}; {held}")
     # "bear", or "/JPEGImages/480p/bear/00000.jpg /Annotations/480p/bear/00000.png"
-    first = [line.split()[0] for line in lines if line.strip()]
+    first = [line.split()[0] for line in read_text(path).split("\n") if line.strip()]
     return list(dict.fromkeys(Path(word).parent.name if "/" in word else word for word in first))

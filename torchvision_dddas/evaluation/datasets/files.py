@@ -1,7 +1,7 @@
-"""The pictures of a clip on disk: their names, numbers, sizes, and whether they fit the truth."""
+"""The pictures of a clip on disk: names, numbers, sizes; and clips whose pictures must fit their truth."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
@@ -14,36 +14,6 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".t
 
 def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> tuple[Path, ...]:
     """The images of a folder in natural order, none where it is none. Raises InputError where it cannot be read."""
-    return _files(folder, suffixes)
-
-
-def videos_in(folder: Path) -> tuple[Path, ...]:
-    """The videos of a folder in natural order, none where it is none. Raises InputError where it cannot be read."""
-    return _files(folder, VIDEO_SUFFIXES)
-
-
-def frames_of(pictures: tuple[Path, ...]) -> int:
-    """How many frames they are: of a video what it announces, 0 where it does not say exactly.
-
-    Raises InputError where the video cannot be opened.
-    """
-    if len(pictures) == 1 and is_video(pictures[0]):
-        video = VideoSource(str(pictures[0]), pictures[0].name)
-        return (video.count or 0) if video.exact else 0
-    return len(pictures)
-
-
-def frame_size(picture: Path) -> tuple[int, int]:
-    """(width, height), px, of a picture or of a video's frames. Raises InputError where it cannot be read."""
-    return VideoSource(str(picture), picture.name).size if is_video(picture) else size_of(picture)
-
-
-def is_video(path: Path) -> bool:
-    """Whether a file is one by its name."""
-    return path.suffix.lower() in VIDEO_SUFFIXES
-
-
-def _files(folder: Path, suffixes: frozenset[str]) -> tuple[Path, ...]:
     if not folder.is_dir():
         return ()
     try:
@@ -53,6 +23,31 @@ def _files(folder: Path, suffixes: frozenset[str]) -> tuple[Path, ...]:
     return tuple(sorted(files, key=lambda file: natural_order(file.name)))
 
 
+def videos_in(folder: Path) -> tuple[Path, ...]:
+    """The videos of a folder, as `images_in`."""
+    return images_in(folder, VIDEO_SUFFIXES)
+
+
+def count_frames(pictures: tuple[Path, ...], announced: int = 0, source: str = "") -> int:
+    """How many frames a clip has: those of its pictures or its video, else as its source announces; 0 where unknown.
+
+    Raises InputError where the two differ, or the video cannot be opened.
+    """
+    there = len(pictures)
+    if there == 1 and is_video(pictures[0]):
+        video = VideoSource(str(pictures[0]), pictures[0].name)
+        there = (video.count or 0) if video.exact else 0
+    if there and announced and there != announced:
+        where = pictures[0] if len(pictures) == 1 else pictures[0].parent
+        raise InputError(f"{where} has {there} frames, but {source} says {announced}; are they of the same clip?")
+    return there or announced
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is a video by its suffix."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
 def number_of(path: Path) -> int | None:
     """The last number in a file's name: 12 of frame_0012.jpg, 7 of 7.png; None where there is none."""
     found = re.findall(r"[0-9]+", path.stem)
@@ -60,10 +55,7 @@ def number_of(path: Path) -> int | None:
 
 
 def frames_by_number(pictures: Iterable[Path]) -> dict[int, int]:
-    """The number in each picture's name -> the frame that it is, from 1; empty where names lack numbers or repeat them.
-
-    pictures: in order.
-    """
+    """The number in each picture's name -> its frame from 1; empty where names lack numbers or repeat them."""
     frames: dict[int, int] = {}
     for frame, path in enumerate(pictures, 1):
         number = number_of(path)
@@ -73,8 +65,8 @@ def frames_by_number(pictures: Iterable[Path]) -> dict[int, int]:
     return frames
 
 
-def labelled(masks: Iterable[Path], frames: Mapping[int, int], place: Path) -> dict[int, Path]:
-    """The masks by frame. frames: as of `frames_by_number`. place: of the pictures, for messages.
+def masks_by_frame(masks: Iterable[Path], frames: Mapping[int, int], place: Path) -> dict[int, Path]:
+    """The masks by frame. frames: from `frames_by_number`. place: of the pictures, for messages.
 
     Raises InputError: a mask of whose number there is no picture, or two of one number.
     """
@@ -83,40 +75,58 @@ def labelled(masks: Iterable[Path], frames: Mapping[int, int], place: Path) -> d
         number = number_of(path)
         frame = frames.get(number) if number is not None else None
         if frame is None:
-            first, last = (min(frames), max(frames)) if frames else (0, 0)
-            held = f"its pictures are {first} to {last}" if frames else "it holds no numbered pictures"
-            raise InputError(f"{path} labels no picture of {place}: {held}; is it the same clip?")
+            span = f"its pictures are {min(frames)} to {max(frames)}" if frames else "it holds no numbered pictures"
+            raise InputError(f"{path} labels no picture of {place}: {span}; is it the same clip?")
         if frame in found:
             raise InputError(f"{found[frame]} and {path} label the same picture; wanted one mask a picture")
         found[frame] = path
     return found
 
 
-def whole(pictures: tuple[Path, ...], first: int) -> tuple[Path, ...]:
-    """Pictures that are numbered without a gap. Raises InputError where the first one is not `first`, or one lacks."""
+def check_numbering(pictures: tuple[Path, ...], first: int) -> tuple[Path, ...]:
+    """Pictures, if they are numbered from `first` without a gap. Raises InputError otherwise."""
     for wanted, picture in enumerate(pictures, first):
         if number_of(picture) != wanted:
-            raise InputError(
-                f"{picture.parent} goes on with {picture.name} where frame {wanted} belongs; "
-                "wanted the pictures of all frames"
-            )
+            raise InputError(f"{picture.parent} has {picture.name} where frame {wanted} belongs; wanted all frames")
     return pictures
 
 
-def agreed(pictures: Sequence[Path], said: int, by: str) -> int:
-    """How many frames a clip has: as its pictures are, else as is said, by whom; 0 where nothing says.
+def fit_clip(clip: Clip) -> Clip:
+    """The clip unchanged. Raises InputError: no truth, no pictures, other frames or sizes than those of its truth."""
+    truth, place = clip.truth, clip.place
+    if truth is None:
+        if not clip.still:
+            raise InputError(f"{place} has no truth; nothing in it can be scored")
+        if not clip.pictures:
+            raise InputError(f"{place} holds no pictures")
+        return clip
+    if not clip.pictures and (truth.kind != "boxes" or truth.tracks is None):
+        raise InputError(f"{truth.place} is the truth of a clip without pictures; put them into {place}")
+    if clip.frames and truth.kind == "one target" and truth.length != clip.frames:
+        lines = f"{truth.place} has {truth.length} lines, but the clip {clip.frames} frames"
+        raise InputError(f"{lines}; wanted a line a frame")
+    if clip.pictures and clip.frames:
+        last = max(truth.frames, default=0)
+        if last > clip.frames:
+            labels = f"{truth.place} labels frame {last}, but the clip has {clip.frames} frames"
+            raise InputError(f"{labels}; is it the same clip?")
+        if truth.length > clip.frames:
+            raise InputError(f"{truth.place} is of {truth.length} frames, but the clip has {clip.frames}; is it whole?")
+    if truth.masks:
+        # The first and the last mask alone: the others are checked when they are scored.
+        check_mask_sizes(clip.pictures[0], [truth.masks[truth.frames[0]], truth.masks[truth.frames[-1]]])
+    return clip
 
-    Raises InputError where the two differ, or the video cannot be opened.
-    """
-    there = frames_of(tuple(pictures)) if pictures else 0
-    if there and said and there != said:
-        where = pictures[0] if len(pictures) == 1 else pictures[0].parent
-        raise InputError(f"{where} has {there} frames, but {by} says {said}; are they of the same clip?")
-    return there or said
 
-
-# Start of frame, baseline to progressive lossless; C4, C8 and CC are tables.
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+def check_mask_sizes(picture: Path, masks: Iterable[Path]) -> None:
+    """Raises InputError for a mask of another size than the picture or video."""
+    size = VideoSource(str(picture), picture.name).size if is_video(picture) else size_of(picture)
+    for mask in masks:
+        if (found := size_of(mask)) != size:
+            raise InputError(
+                f"{mask} is {found[0]}×{found[1]} pixels, but {picture.name} {size[0]}×{size[1]}; "
+                "wanted masks of the size of the pictures"
+            )
 
 
 def size_of(path: Path) -> tuple[int, int]:
@@ -131,7 +141,7 @@ def size_of(path: Path) -> tuple[int, int]:
                 head += file.read(65536)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    size = _told(head)
+    size = _size_in_header(head)
     if size is not None and min(size) > 0:
         return size
     image = read_image(path)
@@ -140,68 +150,27 @@ def size_of(path: Path) -> tuple[int, int]:
     return image.shape[1], image.shape[0]
 
 
-def _told(head: bytes) -> tuple[int, int] | None:
-    """The size that the head of a file tells."""
+def _size_in_header(head: bytes) -> tuple[int, int] | None:
     if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) >= 24:
         return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     if head[:2] == b"BM" and len(head) >= 26:
         return int.from_bytes(head[18:22], "little"), abs(int.from_bytes(head[22:26], "little", signed=True))
     if pnm := re.match(rb"P[1-6]\s+([0-9]{1,6})\s+([0-9]{1,6})\s", head):
         return int(pnm[1]), int(pnm[2])
-    # A camera's notes may say that the picture is to be turned.
-    return _jpeg(head) if head[:2] == b"\xff\xd8" and b"Exif" not in head else None
+    # Exif may say that the picture is to be turned.
+    return _size_in_jpeg(head) if head[:2] == b"\xff\xd8" and b"Exif" not in head else None
 
 
-def _jpeg(head: bytes) -> tuple[int, int] | None:
+def _size_in_jpeg(head: bytes) -> tuple[int, int] | None:
     place = 2
     while place + 9 <= len(head) and head[place] == 0xFF:
-        if head[place + 1] == 0xFF:  # filling
+        marker = head[place + 1]
+        if marker == 0xFF:  # a fill byte
             place += 1
             continue
-        if head[place + 1] in _JPEG_FRAMES:
+        # Start of frame, baseline to progressive lossless; C4, C8 and CC are tables.
+        if 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):
             height, width = head[place + 5 : place + 7], head[place + 7 : place + 9]
             return int.from_bytes(width, "big"), int.from_bytes(height, "big")
         place += 2 + int.from_bytes(head[place + 2 : place + 4], "big")
     return None
-
-
-def fitted(clip: Clip) -> Clip:
-    """The clip as it is. Raises InputError: nothing to score, no pictures, other frames or sizes than its truth's."""
-    truth = clip.truth
-    if truth is None:
-        if not clip.still:
-            raise InputError(f"{clip.place} has no truth; nothing in it can be scored")
-        if not clip.pictures:
-            raise InputError(f"{clip.place} holds no pictures")
-        return clip
-    if not clip.pictures and (truth.kind != "boxes" or truth.tracks is None):
-        raise InputError(f"{truth.place} is the truth of a clip without pictures; put them into {clip.place}")
-    last = max(truth.frames, default=0)
-    if clip.frames and truth.kind == "one target" and truth.length != clip.frames:
-        raise InputError(
-            f"{truth.place} has {truth.length} lines, but the clip {clip.frames} frames; wanted a line a frame"
-        )
-    if clip.pictures and clip.frames and last > clip.frames:
-        raise InputError(
-            f"{truth.place} labels frame {last}, but the clip has {clip.frames} frames; is it the same clip?"
-        )
-    if clip.pictures and clip.frames and truth.length > clip.frames:
-        raise InputError(f"{truth.place} is of {truth.length} frames, but the clip has {clip.frames}; is it whole?")
-    _check_sizes(clip)
-    return clip
-
-
-def _check_sizes(clip: Clip) -> None:
-    """The first and the last mask beside the first picture; the others are seen when they are scored."""
-    truth = clip.truth
-    if truth is None or not truth.masks:
-        return
-    first = clip.pictures[0]
-    size = frame_size(first)
-    for mask in (truth.masks[truth.frames[0]], truth.masks[truth.frames[-1]]):
-        found = size_of(mask)
-        if found != size:
-            raise InputError(
-                f"{mask} is {found[0]}×{found[1]} pixels, but {first.name} {size[0]}×{size[1]}; "
-                "wanted masks of the size of the pictures"
-            )

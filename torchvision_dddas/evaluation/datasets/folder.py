@@ -8,42 +8,51 @@ from typing import Any
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.files import (
-    fitted,
+    count_frames,
+    fit_clip,
     frames_by_number,
-    frames_of,
     images_in,
-    labelled,
+    masks_by_frame,
     videos_in,
 )
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, SeqInfo, Truth, read_seqinfo
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
+from torchvision_dddas.evaluation.metrics.truth import (
+    Positions,
+    SeqInfo,
+    Truth,
+    find_truth,
+    load_truth,
+    read_seqinfo,
+)
+from torchvision_dddas.io.ground_tables import read_positions
 
 OPTIONS: Mapping[str, Any] = {"still": [], "people": [], "rate_hz": None}
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """The clips of a folder, or the one that it is. See `kinds.KINDS`."""
-    said = checked("folder", options, OPTIONS)
-    one = looks_like(folder)
-    places = {folder.resolve().name: folder} if one else {name: folder / name for name in folders_in(folder)}
+    given = check_options("folder", options, OPTIONS)
+    places = clips_in(folder, is_clip(folder))
 
     def clip_of(name: str) -> Clip:
-        people = any(fnmatchcase(name, pattern) for pattern in said["people"])
-        still = any(fnmatchcase(name, pattern) for pattern in said["still"])
-        return fitted(clip_at(places[name], name, said["rate_hz"], still, ("people",) if people else ("movers",)))
+        people, still = (any(fnmatchcase(name, pattern) for pattern in given[key]) for key in ("people", "still"))
+        return fit_clip(clip_at(places[name], name, given["rate_hz"], still, ("people",) if people else ("movers",)))
 
-    return gather("folder", folder, "", filter(wanted, places), clip_of)
+    return Collector("folder", folder, "", wanted).collect(places, clip_of)
+
+
+def clips_in(folder: Path, is_one: bool) -> dict[str, Path]:
+    """The folders of clips by name: those in a folder, or itself where it is one."""
+    return {folder.resolve().name: folder} if is_one else {name: folder / name for name in folders_in(folder)}
 
 
 FRAMES = ("frames", "img1")
 """Folders that may hold a clip's pictures."""
 
 
-def looks_like(folder: Path) -> bool:
+def is_clip(folder: Path) -> bool:
     """Whether a folder is a clip, and not one of clips."""
-    return any((folder / name).is_dir() for name in FRAMES) or truths.find(folder) is not None
+    return any((folder / name).is_dir() for name in FRAMES) or find_truth(folder) is not None
 
 
 def clip_at(
@@ -52,27 +61,25 @@ def clip_at(
     rate_hz: float | None = None,
     still: bool = False,
     shows: tuple[str, ...] = ("movers",),
-    labels: Labels | None = None,
 ) -> Clip:
-    """A clip's folder. rate_hz: where seqinfo.ini is not to say. labels: what the values of its masks mean.
+    """A clip's folder. rate_hz: in place of seqinfo.ini's.
 
     Raises InputError: neither pictures nor truth, several videos, files that cannot be read.
     """
     pictures = pictures_at(place)
-    truth = truth_at(place, pictures, labels or Labels())
+    truth = truth_at(place, pictures)
     if not pictures and truth is None:
         raise InputError(f"{place} holds neither pictures nor truth; wanted frames/ or a video, and masks/ or boxes")
     positions = next((p for p in (place / "positions.csv", place / "truth" / "positions.csv") if p.is_file()), None)
     if truth is not None and positions is not None:
         truth = replace(truth, positions=positions_at(positions))
-    counted = frames_of(pictures)
-    said = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
+    info = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
     return Clip(
         name,
         place,
         pictures,
-        rate_hz or said.rate_hz,
-        counted or said.length,
+        rate_hz or info.rate_hz,
+        count_frames(pictures) or info.length,
         truth,
         still,
         shows,
@@ -96,25 +103,22 @@ def pictures_at(place: Path) -> tuple[Path, ...]:
     return tuple(videos)
 
 
-def truth_at(place: Path, pictures: tuple[Path, ...], labels: Labels) -> Truth | None:
+def truth_at(place: Path, pictures: tuple[Path, ...]) -> Truth | None:
     """The truth of a clip's folder, None where it has none. Raises InputError where it cannot be read."""
-    found = truths.find(place)
+    found = find_truth(place)
     if found is None:
         return None
     numbers = frames_by_number(pictures) if len(pictures) > 1 else {}
     if found.is_dir() and numbers:
         masks = [path for path in images_in(found, frozenset({".png"})) if path.stem.isdecimal()]
-        return Truth("masks", found, labelled(masks, numbers, pictures[0].parent), {}, labels=labels)
-    truth = truths.load(found)
-    return replace(truth, labels=labels) if truth.kind == "masks" else truth
+        return Truth("masks", found, masks_by_frame(masks, numbers, pictures[0].parent), {})
+    return load_truth(found)
 
 
 def positions_at(path: Path) -> Positions:
     """True places on the ground. Raises InputError where they cannot be read."""
-    from torchvision_dddas.io.ground_tables import read_positions
-
-    said = read_positions(path)
-    return Positions(said.frame, said.target, said.east_north_m, said.lonlat_deg)
+    table = read_positions(path)
+    return Positions(table.frame, table.target, table.east_north_m, table.lonlat_deg)
 
 
 def _first(place: Path, *patterns: str) -> Path | None:

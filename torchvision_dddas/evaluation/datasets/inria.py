@@ -9,9 +9,8 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.files import images_in, size_of
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, gather
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options
+from torchvision_dddas.evaluation.metrics.truth import Truth, read_text
 
 TERMS = "research; as is, without any warranty"
 BODY_HEIGHT_PX = 96.0
@@ -21,32 +20,32 @@ WIDTH_SHARE = 0.41
 Pictured = tuple[Path, tuple[int, int], np.ndarray]
 """A picture, its (width, height) and the boxes (N, 4) of its people."""
 
+BoxReader = Callable[[Path, tuple[int, int]], np.ndarray]
+"""From a picture and its (width, height) to the boxes (N, 4) of its people. Raises InputError."""
+
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """Options. part: Test or Train. body_height_px: of the person in each crop."""
-    given = checked("inria", options, {"part": "Test", "body_height_px": BODY_HEIGHT_PX})
+    given = check_options("inria", options, {"part": "Test", "body_height_px": BODY_HEIGHT_PX})
+    collector = Collector("inria", folder, TERMS, wanted)
     home = folder / given["part"] if (folder / given["part"]).is_dir() else folder
-    notes: list[str] = []
     if (home / "pos").is_dir() or (home / "neg").is_dir():
         nobody = np.zeros((0, 4))
-        found = {
-            "pos": _each(images_in(home / "pos"), _annotated, notes),
-            "neg": _each(images_in(home / "neg"), lambda picture: (picture, size_of(picture), nobody), notes),
+        readers: dict[str, tuple[Path, BoxReader]] = {
+            "pos": (home / "pos", _annotated_boxes),
+            "neg": (home / "neg", lambda picture, size: nobody),
         }
-        notes += [f"no pictures in {home / name}, where they belong" for name in found if not images_in(home / name)]
-    elif crops := images_in(folder):
-        height_px = given["body_height_px"]
-
-        def one(picture: Path) -> Pictured:
-            size = size_of(picture)
-            return picture, size, body_of(size, height_px)
-
-        found = {"crops": _each(crops, one, notes)}
+    elif images_in(folder):
+        readers = {"crops": (folder, lambda picture, size: body_of(size, given["body_height_px"]))}
     else:
-        lacking = f"{folder} holds neither {given['part']}/pos nor pictures; wanted INRIA person or its crops"
-        return Dataset("inria", folder, (), TERMS, (lacking,))
+        return collector.refuse(
+            f"{folder} holds neither {given['part']}/pos nor pictures; wanted INRIA person or its crops"
+        )
+    found = {name: _read_each(images_in(place), boxes_of, collector) for name, (place, boxes_of) in readers.items()}
+    absent = [place for place, _ in readers.values() if not images_in(place)]
+    collector.missing += [f"no pictures in {place}, where they belong" for place in absent]
     clips = {clip.name: clip for name, pictures in found.items() for clip in _by_size(home, name, pictures)}
-    return gather("inria", folder, TERMS, filter(wanted, clips), clips.__getitem__, notes)
+    return collector.collect(clips, clips.__getitem__)
 
 
 def body_of(size: tuple[int, int], height_px: float) -> np.ndarray:
@@ -58,24 +57,26 @@ def body_of(size: tuple[int, int], height_px: float) -> np.ndarray:
     return np.array([[(width - across) / 2, (height - height_px) / 2, across, height_px]])
 
 
-def _annotated(picture: Path) -> Pictured:
+def _annotated_boxes(picture: Path, size: tuple[int, int]) -> np.ndarray:
     path = picture.parents[1] / "annotations" / f"{picture.stem}.txt"
     if not path.is_file():
         raise InputError(f"no truth, which belongs in {path}")
-    said, size = read_annotation(path), size_of(picture)
-    if said.size != size:
-        raise InputError(f"it is {size[0]}×{size[1]} pixels, but {path} says {said.size[0]}×{said.size[1]}")
-    return picture, size, said.box_px
+    annotation = read_annotation(path)
+    if annotation.size != size:
+        said = f"{path} says {annotation.size[0]}×{annotation.size[1]}"
+        raise InputError(f"it is {size[0]}×{size[1]} pixels, but {said}")
+    return annotation.box_px
 
 
-def _each(pictures: Iterable[Path], read_one: Callable[[Path], Pictured], notes: list[str]) -> list[Pictured]:
-    """All that can be read; the others are told."""
+def _read_each(pictures: Iterable[Path], boxes_of: BoxReader, collector: Collector) -> list[Pictured]:
+    """All that can be read; the others go to the data set's missing clips."""
     found = []
     for picture in pictures:
         try:
-            found.append(read_one(picture))
+            size = size_of(picture)
+            found.append((picture, size, boxes_of(picture, size)))
         except InputError as error:
-            notes.append(f"{picture.parent.name}/{picture.name}: {error}")
+            collector.missing.append(f"{picture.parent.name}/{picture.name}: {error}")
     return found
 
 
@@ -110,14 +111,11 @@ class Annotation(NamedTuple):
 
 def read_annotation(path: Path) -> Annotation:
     """Read a file. Raises InputError: none of this kind, more or fewer boxes than announced, an empty box."""
-    try:
-        text = path.read_bytes().decode("latin-1").replace("\r\n", "\n")  # INRIA's own name has an accent
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    text = read_text(path, "latin-1").replace("\r\n", "\n")  # INRIA's own name has an accent
     size, count, corner = _SIZE.search(text), _COUNT.search(text), _CORNER.search(text)
     if size is None or count is None:
         what = "Image size" if size is None else "Objects with ground truth"
-        raise InputError(f"{path} does not tell '{what}'; wanted a PASCAL Annotation of version 1.00")
+        raise InputError(f"{path} does not hold '{what}'; wanted a PASCAL Annotation of version 1.00")
     boxes = np.array([[int(number) for number in found.groups()] for found in _BOX.finditer(text)], float)
     boxes = boxes.reshape(-1, 4)
     if len(boxes) != int(count[1]):

@@ -1,15 +1,14 @@
-"""The kinds of data sets that can be read, and reading one: each kind's adapter is a module of this folder."""
+"""The kinds of data sets, and reading one: the adapter of each kind is the module of that name in this folder."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from importlib import import_module
 from os.path import normpath
 from pathlib import Path
-from typing import Any, Protocol
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.record import Dataset
+from torchvision_dddas.evaluation.datasets.record import Dataset, Source
 
 KINDS: Mapping[str, str] = {
     "folder": "your own: a folder a clip, with frames/ or a video, and masks/, boxes_xywh.txt or gt/gt.txt",
@@ -27,67 +26,40 @@ KINDS: Mapping[str, str] = {
     "inria": "INRIA person: Test/ with pos/, annotations/ and neg/; or a folder of crops, each of one person",
     "simulated": "what dddas simulate writes: a folder a run",
 }
-"""Kind -> what it is, in a line. The adapter of `some-kind` is the module `some_kind`.
+"""Kind -> its layout in a line.
 
-An adapter has `read(folder, options, wanted) -> Dataset`. folder: where the data set lies, a folder that is there.
-options: further keys of the study's file (see `options.checked`). wanted: whether a clip of that name is asked for;
-others are not read. It raises InputError for a wrong option; what is not there, and clips that cannot be read, are told
-in Dataset.missing, so that the others go on (see `gathering.gather`).
+An adapter has `read(folder, options, wanted) -> Dataset`. folder: where the data set lies, a folder that exists.
+options: further keys of the study's file (see `record.check_options`). wanted: see `record.Wanted`. It raises
+InputError for a wrong option; absent files and clips that cannot be read go to Dataset.missing (see
+`record.Collector`), so that the others go on.
 """
 
-Wanted = Callable[[str], bool]
 
+def read(source: Source, base: Path) -> Dataset:
+    """The requested clips. base: what the folder is relative to.
 
-class Asked(Protocol):
-    """What a study says of a data set."""
-
-    @property
-    def kind(self) -> str:
-        """One of KINDS."""
-        ...
-
-    @property
-    def folder(self) -> Path:
-        """Where it lies."""
-        ...
-
-    @property
-    def clips(self) -> tuple[str, ...]:
-        """Patterns of names (fnmatch)."""
-        ...
-
-    @property
-    def options(self) -> Mapping[str, Any]:
-        """What the kind takes beside, by name."""
-        ...
-
-
-def read(source: Asked, base: Path) -> Dataset:
-    """The clips that are asked for. base: what the folder is relative to.
-
-    Raises InputError for an unknown kind or a wrong option. What is not there is told in Dataset.missing.
+    Raises InputError for an unknown kind or a wrong option. Dataset.missing says what is absent.
     """
-    known(source.kind)
+    check_kind(source.kind)
     folder = Path(normpath(base / source.folder.expanduser()))
 
     def wanted(name: str) -> bool:
         return any(fnmatchcase(name, pattern) for pattern in source.clips)
 
-    adapter = import_module(f"{__package__}.{source.kind.replace('-', '_')}")
+    layout = KINDS[source.kind]
     if not folder.is_dir():
-        said = "is no folder" if folder.exists() else "is not there"
-        return Dataset(source.kind, folder, (), missing=(f"{folder} {said}; there belongs {KINDS[source.kind]}",))
-    found: Dataset = adapter.read(folder, source.options, wanted)
-    clips = tuple(clip for clip in found.clips if wanted(clip.name))
-    if not clips and not found.missing:
-        asked = "" if "*" in source.clips else f" by the name {' or '.join(source.clips)}"
-        found = replace(found, missing=(f"{folder} holds no clip{asked}; wanted {KINDS[source.kind]}",))
-    # A name that a file gives a clip, or a file's own, may hold anything; so may what was found in it.
+        problem = "is no folder" if folder.exists() else "does not exist"
+        return Dataset(source.kind, folder, (), missing=(f"{folder} {problem}; wanted {layout}",))
+    found: Dataset = import_module(f"{__package__}.{source.kind}").read(folder, source.options, wanted)
+    if not found.clips and not found.missing:
+        names = "" if "*" in source.clips else f" by the name {' or '.join(source.clips)}"
+        found = replace(found, missing=(f"{folder} holds no clip{names}; wanted {layout}",))
+    # Names of clips and contents of files may hold anything; InputError makes printable lines of them.
     missing, notes = (tuple(str(InputError(line)) for line in lines) for lines in (found.missing, found.notes))
-    return replace(found, clips=clips, missing=missing, notes=notes)
+    return replace(found, missing=missing, notes=notes)
 
 
-def known(kind: str) -> None:
-    """Raises InputError, with the list of kinds, where this is none."""
+def check_kind(kind: str) -> None:
+    """Raises InputError, with the list of kinds, for an unknown one."""
     if kind not in KINDS:
         raise InputError(f"'{kind}' is no kind of data set; wanted one of {', '.join(KINDS)}")

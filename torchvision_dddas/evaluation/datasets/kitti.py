@@ -1,7 +1,6 @@
 """KITTI tracking: boxes of road users from a car, in pixels and in metres."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -9,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import asked, read_rows, table_of, text_of, truth_of
-from torchvision_dddas.evaluation.datasets.files import agreed, images_in, whole
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
-from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.datasets.annotations import check_classes, check_known, read_rows, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import check_numbering, images_in
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth, read_text
 
 TERMS = "CC BY-NC-SA 3.0"
 RATE_HZ = 10.0
@@ -29,56 +26,45 @@ _COLUMNS = (
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """Options. classes: those that count, of CLASSES; all by default."""
-    classes = checked("kitti", options, {"classes": list(CLASSES)})["classes"]
-    asked(np.zeros(0), classes, CLASSES, "KITTI")
+    classes = check_options("kitti", options, {"classes": list(CLASSES)})["classes"]
+    check_classes(classes, CLASSES, "KITTI")
+    collector = Collector("kitti", folder, TERMS, wanted)
     home = folder / "training" if (folder / "training").is_dir() else folder
     places = {path.stem: path for path in sorted((home / "label_02").glob("*.txt"))}
     if not places:
-        nothing = f"{folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
-        return Dataset("kitti", folder, (), TERMS, (nothing,))
-    named = folders_in(home / "image_02") if (home / "image_02").is_dir() else []
-    notes: list[str] = []
-    lacking = [
-        f"{name}: no truth, which belongs in {home / 'label_02' / name}.txt"
-        for name in named
-        if name not in places and wanted(name)
-    ]
+        return collector.refuse(
+            f"{folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
+        )
+    collector.report_unlabelled(folders_in(home / "image_02"), places, f"{home / 'label_02'}/{{}}.txt")
 
     def clip_of(name: str) -> Clip:
-        pictures = whole(images_in(home / "image_02" / name), 0)
+        belongs = home / "image_02" / name
+        pictures = check_numbering(images_in(belongs), 0)
         calibration, flight = home / "calib" / f"{name}.txt", home / "oxts" / f"{name}.txt"
-        unsure = [str(path) for path in (calibration, flight) if not path.is_file()]
-        truth = read_truth(places[name], classes, len(pictures), None if unsure else (calibration, flight))
-        if unsure:
-            notes.append(f"{name}: no places in metres, which need {' and '.join(unsure)}")
-        if not pictures:
-            notes.append(f"{name}: no pictures, which belong in {home / 'image_02' / name}")
-        return Clip(name, places[name], pictures, RATE_HZ, agreed(pictures, 0, "") or truth.frames[-1], truth)
+        absent = [str(path) for path in (calibration, flight) if not path.is_file()]
+        truth = read_truth(places[name], classes, len(pictures), None if absent else (calibration, flight))
+        if absent:
+            collector.notes.append(f"{name}: no places in metres, which need {' and '.join(absent)}")
+        return collector.label_clip(name, places[name], pictures, truth, belongs, rate_hz=RATE_HZ)
 
-    found = gather("kitti", folder, TERMS, filter(wanted, places), clip_of, lacking)
-    return replace(found, notes=tuple(notes))
+    return collector.collect(places, clip_of)
 
 
-def read_truth(
-    path: Path, classes: list[str] | None = None, length: int = 0, pose: tuple[Path, Path] | None = None
-) -> Truth:
+def read_truth(path: Path, classes: list[str], length: int = 0, pose: tuple[Path, Path] | None = None) -> Truth:
     """A label file. length: frames of the clip, 0 where unknown. pose: the files of calib and oxts.
 
     Raises InputError with file and line.
     """
     rows = read_rows(path, _COLUMNS, "type", first=0)
     v, words = rows.values, rows.word.astype(str)
-    known = np.isin(words, (*CLASSES, UNLABELLED))
-    if not known.all():
-        i = int((~known).argmax())
-        raise InputError(f"{path}, line {rows.line[i]}: the type is '{words[i]}'; wanted {', '.join(CLASSES)}")
+    check_known(path, rows, words, (*CLASSES, UNLABELLED), "type", ", ".join(CLASSES))
     frame, box = v[:, 0] + 1, np.column_stack([v[:, 6:8], v[:, 8:10] - v[:, 6:8]])
     region = words == UNLABELLED
-    regions = TrackTable(frame[region].astype(np.int64), v[region, 1].astype(np.int64), box[region])
+    regions = TrackTable.of(frame[region], v[region, 1], box[region])
     rest = ~region
     table = table_of(path, frame[rest], v[rest, 1], box[rest], rows.line[rest])
-    whole_ones = (v[rest, 3] <= 0) & (v[rest, 4] < LEAST_OCCLUDED_UNKNOWN)
-    counts = asked(words[rest], classes or CLASSES, CLASSES, "KITTI") & whole_ones
+    is_visible = (v[rest, 3] <= 0) & (v[rest, 4] < LEAST_OCCLUDED_UNKNOWN)
+    counts = np.isin(words[rest], classes) & is_visible
     where = positions_of(table.at(counts), v[rest][counts, 13:16], *pose) if pose else None
     return truth_of(path, table, counts, length, regions if region.any() else None, where)
 
@@ -108,7 +94,7 @@ def positions_of(table: TrackTable, camera_m: np.ndarray, calibration: Path, rec
 
 def camera_from_imu(path: Path) -> np.ndarray:
     """(4, 4) rectified camera from the inertial unit. Raises InputError where one of the matrices lacks."""
-    lines = {cells[0].rstrip(":"): cells[1:] for line in text_of(path).splitlines() if (cells := line.split())}
+    lines = {cells[0].rstrip(":"): cells[1:] for line in read_text(path).splitlines() if (cells := line.split())}
     matrices = []
     for name, size in _SIZES.items():
         try:
@@ -138,7 +124,7 @@ def poses(path: Path) -> np.ndarray:
         i = int(outside.argmax())
         raise InputError(
             f"{path}, line {rows.line[i]}: {latitude[i]:g}, {longitude[i]:g} is no place; wanted degrees, "
-            f"latitudes to {MOST_LATITUDE_DEG:g}"
+            f"latitudes up to {MOST_LATITUDE_DEG:g}"
         )
     scale = EARTH_RADIUS_M * np.cos(np.radians(latitude[0]))
     east = scale * np.radians(longitude)

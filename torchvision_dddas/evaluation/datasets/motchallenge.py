@@ -15,7 +15,7 @@ out. Boxes of all classes take part in the matching that finds those.
 Terms, as its makers state them: CC BY-NC-SA 3.0; cite the paper of the year.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,26 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import by_frame, read_rows, table_of, text_of
-from torchvision_dddas.evaluation.datasets.files import agreed, images_in, number_of, videos_in, whole
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.truth import Positions, SeqInfo, Truth, read_seqinfo
+from torchvision_dddas.evaluation.datasets.annotations import boxes_by_frame, read_rows, table_of
+from torchvision_dddas.evaluation.datasets.files import check_numbering, count_frames, images_in, number_of, videos_in
+from torchvision_dddas.evaluation.datasets.record import (
+    Clip,
+    Collector,
+    Dataset,
+    Wanted,
+    check_options,
+    find_below,
+    folders_in,
+)
+from torchvision_dddas.evaluation.metrics.truth import (
+    Positions,
+    SeqInfo,
+    Truth,
+    load_truth,
+    read_seqinfo,
+    read_text,
+    split_cells,
+)
 
 TERMS = "CC BY-NC-SA 3.0"
 BENCHMARKS = ("", "MOT15", "MOT16", "MOT17", "MOT20")
@@ -37,7 +51,7 @@ DISTRACTORS = (2, 7, 8, 12)
 NON_MOTORIZED = 6
 _COLUMNS = ("frame", "identity", "x", "y", "width", "height", "counts", "class", "visibility")
 _GROUND = ("frame", "identity", "x", "y", "width", "height", "counts", "ground x", "ground y", "ground z")
-_DEEP = 3
+_MARKS = ("seqinfo.ini", "gt/gt.txt", "det/det.txt")
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
@@ -45,55 +59,44 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
 
     least_visibility: pedestrians less visible than that are no mistake, found or not (2016 and later).
     """
-    given = checked("motchallenge", options, {"benchmark": "", "least_visibility": 0.0})
+    given = check_options("motchallenge", options, {"benchmark": "", "least_visibility": 0.0})
     if given["benchmark"] not in BENCHMARKS:
         raise InputError(f"'{given['benchmark']}' is no benchmark; wanted one of {', '.join(BENCHMARKS[1:])}")
+    collector = Collector("motchallenge", folder, TERMS, wanted)
     places = sequences(folder)
     if not places:
-        lacking = f"{folder} holds no sequence; wanted SEQUENCE/gt/gt.txt in it, or in its train/"
-        return Dataset("motchallenge", folder, (), TERMS, (lacking,))
-    notes: list[str] = []
+        return collector.refuse(f"{folder} holds no sequence; wanted SEQUENCE/gt/gt.txt in it, or in its train/")
 
     def clip_of(name: str) -> Clip:
         clip = sequence(places[name], given["benchmark"], given["least_visibility"])
         if not clip.pictures:
-            notes.append(f"{name}: no pictures, which belong in {places[name] / 'img1'}")
+            collector.notes.append(f"{name}: no pictures, which belong in {places[name] / 'img1'}")
         return replace(clip, name=name)
 
-    found = gather("motchallenge", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, notes=tuple(notes))
+    return collector.collect(places, clip_of)
 
 
 def sequences(folder: Path) -> dict[str, Path]:
     """The sequences in a folder by name: its own, or those up to three folders deep; two of a name by their folders."""
     places: dict[str, Path] = {}
-    for place in _below(folder, _DEEP):
+    for place in find_below(folder, lambda place: any((place / mark).is_file() for mark in _MARKS), 3):
         name = place.name if place.name not in places else "-".join(place.relative_to(folder).parts)
         places[name or place.resolve().name] = place
     return places
 
 
-def _below(folder: Path, deep: int) -> Iterator[Path]:
-    marks = ("seqinfo.ini", "gt/gt.txt", "det/det.txt")
-    if any((folder / mark).is_file() for mark in marks):
-        yield folder
-    elif deep:
-        for name in folders_in(folder):
-            yield from _below(folder / name, deep - 1)
-
-
 def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) -> Clip:
     """The clip of a sequence's folder. Raises InputError: no truth, broken files, different frame counts."""
-    said = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
+    info = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
     path = place / "gt" / "gt.txt"
     if not path.is_file():
         raise InputError(f"no truth, which belongs in {path} (that of test sequences is not published)")
-    images = images_in(place / said.pictures)
-    pictures = whole(images, 1) if images else videos_in(place)
+    images = images_in(place / info.pictures)
+    pictures = check_numbering(images, 1) if images else videos_in(place)
     if len(pictures) > 1 and not images:
-        raise InputError(f"{place} holds {len(pictures)} videos; wanted one, or pictures in {place / said.pictures}")
-    frames = agreed(pictures, said.length, "seqinfo.ini")
-    later = benchmark not in ("", "MOT15") or (not benchmark and _columns(path) == len(_COLUMNS))
+        raise InputError(f"{place} holds {len(pictures)} videos; wanted one, or pictures in {place / info.pictures}")
+    frames = count_frames(pictures, info.length, "seqinfo.ini")
+    later = benchmark not in ("", "MOT15") or (not benchmark and _count_columns(path) == len(_COLUMNS))
     name = place.resolve().name
     vehicles = (NON_MOTORIZED,) if (benchmark or name).startswith("MOT20") else ()
     truth = _with_classes(path, (*DISTRACTORS, *vehicles), least_visibility, frames) if later else _of_2015(path)
@@ -101,16 +104,9 @@ def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) ->
     if frames and truth.frames[-1] > frames:
         raise InputError(f"{path} labels frame {truth.frames[-1]}, but the clip has {frames}; is it the same clip?")
     given = place / "det" / "det.txt"
-    return Clip(
-        name,
-        place,
-        pictures,
-        said.rate_hz,
-        frames or truth.frames[-1],
-        truth,
-        shows=("people",),
-        given=given if given.is_file() else None,
-    )
+    given_or_none = given if given.is_file() else None
+    last = frames or truth.frames[-1]
+    return Clip(name, place, pictures, info.rate_hz, last, truth, shows=("people",), given=given_or_none)
 
 
 def single_pictures(place: Path) -> dict[int, Path]:
@@ -120,16 +116,15 @@ def single_pictures(place: Path) -> dict[int, Path]:
     return {number: path for path in paths if (number := number_of(path)) is not None}
 
 
-def _columns(path: Path) -> int:
-    first = next((line for line in text_of(path).splitlines() if line.strip()), "")
-    return len(first.split(",") if "," in first else first.split())
+def _count_columns(path: Path) -> int:
+    return len(split_cells(next((line for line in read_text(path).splitlines() if line.strip()), "")))
 
 
 def _of_2015(path: Path) -> Truth:
-    truth = truths.load(path)
+    truth = load_truth(path)
     if truth.tracks is None:
         raise InputError(f"{path} has no identities; wanted MOTChallenge's frame,id,x,y,w,h,counts")
-    if _columns(path) < len(_GROUND):
+    if _count_columns(path) < len(_GROUND):
         return truth
     rows = read_rows(path, _GROUND).values
     known = ~(rows[:, 7:10] == -1).all(axis=1) & (rows[:, 9] != -1) & (rows[:, 6] != 0)
@@ -148,14 +143,6 @@ def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: fl
     true = (kind == PEDESTRIAN) & (counts != 0) & ~hidden
     if not true.any():
         raise InputError(f"{path} holds no pedestrian that counts")
-    boxes = by_frame(table.at(true), max(length, int(table.frame.max())))
-    return Truth(
-        "boxes",
-        path,
-        {},
-        boxes,
-        table.at(true),
-        table.at(ignored),
-        ignoring="removed",
-        others=table.at(~true & ~ignored),
-    )
+    kept, others = table.at(true), table.at(~true & ~ignored)
+    boxes = boxes_by_frame(kept, max(length, int(table.frame.max())))
+    return Truth("boxes", path, {}, boxes, kept, table.at(ignored), ignoring="removed", others=others)

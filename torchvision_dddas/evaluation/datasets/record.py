@@ -1,7 +1,7 @@
-"""What a data set holds, whatever its layout: clips, their truth, and the options of a kind."""
+"""What a data set holds, whatever its layout: clips with their truth. How an adapter collects them."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +9,21 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.io.images import natural_order
 
+Wanted = Callable[[str], bool]
+"""Whether a clip of that name is requested; others are not read."""
+
 
 @dataclass(frozen=True)
 class Clip:
     """One clip.
 
-    name: unique in its data set. place: what messages name. pictures: the files of its frames in order, or one video;
-    empty where it has none. rate_hz: None where nothing says. frames: how many, 0 where nothing says. truth: None where
-    nothing is known. still: nothing moves in it, so that whatever is found is false. shows: what its truth labels:
-    "movers", or "people", who may stand; a study asks for motion in the former and recognizes people in the latter.
-    given: a table of public detections. The rest are files as `dddas run` and `dddas locate` take them.
+    name: unique in its data set. place: the file or folder that messages name.
+    pictures: the files of its frames in order, or one video; empty where it has none.
+    rate_hz: None where unknown. frames: how many, 0 where unknown. truth: None where nothing is known.
+    still: nothing moves in it, so that every detection is false.
+    shows: what its truth labels: "movers", or "people", who may stand. A study detects motion in the former and
+        people in the latter.
+    given: a table of public detections. The other files are those that `dddas run` and `dddas locate` take.
     """
 
     name: str
@@ -41,8 +46,8 @@ class Clip:
 class Dataset:
     """Clips of one kind. terms: of use, as its makers state them.
 
-    missing: in words, clips that are left out and why, or what belongs in the folder. notes: in words, what else lacks,
-    and where it belongs; its clips are read all the same.
+    missing: one line for each clip that is left out, and why, or on what the folder should hold. notes: one line for
+    each thing that is absent from clips that are read all the same.
     """
 
     kind: str
@@ -53,20 +58,68 @@ class Dataset:
     notes: tuple[str, ...] = ()
 
 
-_WORDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of texts"}
+@dataclass(frozen=True)
+class Source:
+    """A data set as a study names it. clips: patterns of names (fnmatch). options: further options of its kind."""
+
+    kind: str
+    folder: Path
+    clips: tuple[str, ...] = ("*",)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
-def checked(kind: str, options: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, Any]:
-    """The options in force. wanted: name -> the value where it is not given, whose type is the option's.
+@dataclass
+class Collector:
+    """Collects the clips that can be read; the reason why another cannot goes to `missing`. Fields as in Dataset."""
 
-    A list holds texts; None stands for a number above 0 that need not be given. Raises InputError: an unknown name,
-    another type.
+    kind: str
+    folder: Path
+    terms: str
+    wanted: Wanted
+    missing: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def collect(self, names: Iterable[str], clip_of: Callable[[str], Clip]) -> Dataset:
+        """The wanted ones of the names in natural order. clip_of: reads one; its InputError goes to `missing`."""
+        clips = []
+        for name in sorted(filter(self.wanted, names), key=natural_order):
+            try:
+                clips.append(clip_of(name))
+            except InputError as error:
+                self.missing.append(f"{name}: {error}")
+        return Dataset(self.kind, self.folder, tuple(clips), self.terms, tuple(self.missing), tuple(self.notes))
+
+    def refuse(self, *missing: str) -> Dataset:
+        """A data set without clips: the folder does not hold this kind, for these reasons."""
+        return Dataset(self.kind, self.folder, (), self.terms, missing)
+
+    def report_unlabelled(self, names: Iterable[str], labelled: Iterable[str], belongs: str) -> None:
+        """Add to `missing` what has pictures and no truth. belongs: the path of the truth, with {} for the name."""
+        absent = [name for name in names if name not in labelled and self.wanted(name)]
+        self.missing += [f"{name}: no truth, which belongs in {belongs.format(name)}" for name in absent]
+
+    def label_clip(
+        self, name: str, place: Path, pictures: tuple[Path, ...], truth: Truth, belongs: Path | str, **more: Any
+    ) -> Clip:
+        """A clip of labelled boxes, which may lack its pictures; a note then says where they belong."""
+        if not pictures:
+            self.notes.append(f"{name}: no pictures, which belong in {belongs}")
+        return Clip(name, place, pictures, frames=truth.length or truth.frames[-1], truth=truth, **more)
+
+
+_EXPECTED = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of texts"}
+
+
+def check_options(kind: str, options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The options in force. defaults: by name; the type of a default is the option's.
+
+    A list holds texts; None stands for an optional number above 0. Raises InputError: an unknown name, another type.
     """
     for name, value in options.items():
-        if name not in wanted:
-            takes = f"it takes {', '.join(wanted)}" if wanted else "it takes none"
+        if name not in defaults:
+            takes = f"it takes {', '.join(defaults)}" if defaults else "it takes none"
             raise InputError(f"a data set of kind {kind} has no option '{name}'; {takes}")
-        default = wanted[name]
+        default = defaults[name]
         type_ = float if default is None else type(default)
         fits = isinstance(value, (int, float) if type_ is float else type_) and (
             type_ is bool or not isinstance(value, bool)
@@ -76,43 +129,26 @@ def checked(kind: str, options: Mapping[str, Any], wanted: Mapping[str, Any]) ->
         if default is None:
             fits = fits and 0 < value <= 1000
         if not fits:
-            what = "a number above 0, at most 1000" if default is None else _WORDS[type_]
-            raise InputError(f"{name} = {value!r} will not do for a data set of kind {kind}; wanted {what}")
-    return {**wanted, **options}
-
-
-def gather(
-    kind: str,
-    folder: Path,
-    terms: str,
-    names: Iterable[str],
-    clip_of: Callable[[str], Clip],
-    missing: Iterable[str] = (),
-) -> Dataset:
-    """A data set of the clips that can be read, in natural order of their names.
-
-    clip_of: the clip of a name; where it raises InputError, the line goes to Dataset.missing. missing: what is known
-    to be so before.
-    """
-    clips, told = [], list(missing)
-    for name in sorted(names, key=natural_order):
-        try:
-            clips.append(clip_of(name))
-        except InputError as error:
-            told.append(f"{name}: {error}")
-    return Dataset(kind, folder, tuple(clips), terms, tuple(told))
+            expected = "a number above 0, at most 1000" if default is None else _EXPECTED[type_]
+            raise InputError(f"{name} of a data set of kind {kind} must be {expected}, got {value!r}")
+    return {**defaults, **options}
 
 
 def folders_in(folder: Path) -> list[str]:
-    """Names of the folders in a folder, but hidden ones. Raises InputError where it is none or cannot be read."""
+    """The names of the folders in a folder, without hidden ones; none where it is no folder.
+
+    Raises InputError where it cannot be read.
+    """
     try:
         return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
     except OSError as error:
         raise InputError(f"{folder} cannot be read: {error.strerror}") from None
 
 
-def there(folder: Path, what: str) -> None:
-    """Raises InputError where a folder is not there. what: what belongs there."""
-    if not folder.is_dir():
-        found = "is a file" if folder.exists() else "is not there"
-        raise InputError(f"{folder} {found}; there belongs {what}")
+def find_below(folder: Path, is_clip: Callable[[Path], bool], depth: int) -> list[Path]:
+    """The folders that are clips: this one, or those at most so many folders deeper; none lies in another."""
+    if is_clip(folder):
+        return [folder]
+    return [place for name in folders_in(folder) if depth for place in find_below(folder / name, is_clip, depth - 1)]

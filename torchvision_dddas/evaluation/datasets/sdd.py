@@ -6,80 +6,64 @@
 
 or folders with annotations.txt and reference.jpg of any names, with a video where there is one. Frames count from 0.
 Lost rows lie outside the picture and are left out; occluded and generated (interpolated) ones count. Labels are
-LABELS; those that are not asked for neither count nor harm. Whoever stands is labelled too: to a detector of motion
-they are missed.
+LABELS; those that are not requested neither count nor harm. Whoever stands is labelled too: a detector of motion
+misses them.
 
 Terms, as its makers state them: CC BY-NC-SA 3.0.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import asked, read_rows, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.files import agreed, videos_in
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
+from torchvision_dddas.evaluation.datasets.annotations import (
+    Rows,
+    check_classes,
+    check_known,
+    read_rows,
+    table_of,
+    truth_of,
+)
+from torchvision_dddas.evaluation.datasets.files import count_frames, videos_in
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, find_below
 from torchvision_dddas.evaluation.metrics.truth import Truth
 
 TERMS = "CC BY-NC-SA 3.0"
 LABELS = ("Pedestrian", "Biker", "Skater", "Cart", "Car", "Bus")
 ANNOTATIONS = "annotations.txt"
 _COLUMNS = ("identity", "xmin", "ymin", "xmax", "ymax", "frame", "lost", "occluded", "generated", "label")
-_DEEP = 3
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """Options. classes: those that count, of LABELS; all by default. Clips are named SCENE-VIDEO or by their folder."""
-    classes = checked("sdd", options, {"classes": list(LABELS)})["classes"]
-    asked(np.zeros(0), classes, LABELS, "Stanford Drone")
-    places = clips_in(folder)
+    classes = check_options("sdd", options, {"classes": list(LABELS)})["classes"]
+    check_classes(classes, LABELS, "Stanford Drone")
+    collector = Collector("sdd", folder, TERMS, wanted)
+    found = find_below(folder, lambda place: (place / ANNOTATIONS).is_file(), 3)
+    places = {_name(place, folder): place for place in found}
     if not places:
-        lacking = f"{folder} holds no {ANNOTATIONS}; wanted annotations/SCENE/VIDEO/{ANNOTATIONS} in it"
-        return Dataset("sdd", folder, (), TERMS, (lacking,))
-    notes: list[str] = []
+        return collector.refuse(f"{folder} holds no {ANNOTATIONS}; wanted annotations/SCENE/VIDEO/{ANNOTATIONS} in it")
 
     def clip_of(name: str) -> Clip:
         place = places[name]
         video = _video(place)
-        frames = agreed(video, 0, "")
-        truth = read_truth(place / ANNOTATIONS, classes, frames)
-        if not video:
-            notes.append(f"{name}: no pictures; its video belongs in {place}")
-        return Clip(name, place, video, frames=frames or truth.frames[-1], truth=truth)
+        truth = read_truth(place / ANNOTATIONS, classes, count_frames(video))
+        return collector.label_clip(name, place, video, truth, place)
 
-    found = gather("sdd", folder, TERMS, filter(wanted, places), clip_of)
-    return replace(found, notes=tuple(notes))
+    return collector.collect(places, clip_of)
 
 
-def clips_in(folder: Path) -> dict[str, Path]:
-    """The folders with annotations by the clip's name."""
-    return {_name(place, folder): place for place in _below(folder, _DEEP)}
-
-
-def read_truth(path: Path, classes: list[str] | None = None, length: int = 0) -> Truth:
-    """An annotation file; length: frames of the clip, 0 where it is not known. Raises InputError with file and line."""
+def read_truth(path: Path, classes: list[str], length: int = 0) -> Truth:
+    """An annotation file; length: frames of the clip, 0 where unknown. Raises InputError with file and line."""
     rows = read_rows(path, _COLUMNS, "label", first=0)
-    v = rows.values
-    seen = v[:, 6] == 0
+    seen = Rows(*(part[rows.values[:, 6] == 0] for part in rows))
+    v, words = seen.values, seen.word.astype(str)
     box = np.column_stack([v[:, 1:3], v[:, 3:5] - v[:, 1:3]])
-    table = table_of(path, v[seen, 5] + 1, v[seen, 0], box[seen], rows.line[seen])
-    words = rows.word[seen]
-    unknown = ~np.isin(words.astype(str), LABELS)
-    if unknown.any():
-        i = int(unknown.argmax())
-        raise InputError(f"{path}, line {rows.line[seen][i]}: the label is '{words[i]}'; wanted {', '.join(LABELS)}")
-    return truth_of(path, table, asked(words, classes or LABELS, LABELS, "Stanford Drone"), length)
-
-
-def _below(folder: Path, deep: int) -> list[Path]:
-    if (folder / ANNOTATIONS).is_file():
-        return [folder]
-    return [place for name in folders_in(folder) if deep for place in _below(folder / name, deep - 1)]
+    table = table_of(path, v[:, 5] + 1, v[:, 0], box, seen.line)
+    check_known(path, seen, words, LABELS, "label", ", ".join(LABELS))
+    return truth_of(path, table, np.isin(words, classes), length)
 
 
 def _name(place: Path, folder: Path) -> str:
@@ -89,7 +73,7 @@ def _name(place: Path, folder: Path) -> str:
 
 
 def _video(place: Path) -> tuple[Path, ...]:
-    """Of the clip whose annotations lie in a folder: beside them, or under videos/ as published."""
+    """The video beside the annotations, or under videos/ as published."""
     top = place.parents[1] if len(place.parents) > 1 else place
     beside = top.parent / "videos" / place.parent.name / place.name if top.name == "annotations" else place
     return (videos_in(place) or videos_in(beside))[:1]

@@ -22,21 +22,18 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.files import fitted
-from torchvision_dddas.evaluation.datasets.folder import clip_at, pictures_at
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, folders_in, gather
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.datasets.files import fit_clip
+from torchvision_dddas.evaluation.datasets.folder import clip_at, clips_in, pictures_at
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options
+from torchvision_dddas.evaluation.metrics.truth import Positions, Truth, load_truth
 from torchvision_dddas.io.detection_tables import read_rows
 from torchvision_dddas.io.ground_tables import read_positions
 
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """The runs of a folder, or the one that it is. See `kinds.KINDS`."""
-    checked("simulated", options, {})
-    one = (folder / "truth").is_dir()
-    places = {folder.resolve().name: folder} if one else {name: folder / name for name in folders_in(folder)}
+    check_options("simulated", options, {})
+    places = clips_in(folder, (folder / "truth").is_dir())
 
     def clip_of(name: str) -> Clip:
         place = places[name]
@@ -45,27 +42,27 @@ def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
         if not pictures_at(place):
             raise InputError(f"{place} holds neither frames/ nor clip.mp4; simulate it with --save frames,masks")
         clip = clip_at(place, name, _rate(place / "run.json"))
-        return fitted(replace(clip, truth=_truth(place / "truth", clip.frames)))
+        return fit_clip(replace(clip, truth=_truth(place / "truth", clip.frames)))
 
-    return gather("simulated", folder, "", filter(wanted, places), clip_of)
+    return Collector("simulated", folder, "", wanted).collect(places, clip_of)
 
 
 def _truth(place: Path, frames: int) -> Truth:
     """Masks, identities and places of a run. Raises InputError where a file is not there or damaged."""
     for name in ("gt.txt", "positions.csv"):
         if not (place / name).is_file():
-            raise InputError(f"{place / name} is not there; the run was not finished, simulate it again")
+            raise InputError(f"{place / name} does not exist; the run was not finished, simulate it again")
     empty = not (place / "gt.txt").read_bytes().strip()
-    followed = Truth("boxes", place, {}, {}) if empty else truths.load(place / "gt.txt")
-    shown = Truth("masks", place, truths.load(place / "masks", 1).masks, {}) if (place / "masks").is_dir() else followed
+    labelled = Truth("boxes", place, {}, {}) if empty else load_truth(place / "gt.txt")
+    shown = Truth("masks", place, load_truth(place / "masks", 1).masks, {}) if (place / "masks").is_dir() else labelled
     if not shown.masks and empty:
-        raise InputError(f"{place}: nothing to find shows in the pictures")
+        raise InputError(f"{place}: no target is visible in the pictures")
     positions, fleet = _positions(place / "positions.csv")
     return replace(
         shown,
-        boxes=followed.boxes,
-        tracks=followed.tracks,
-        ignored=followed.ignored,
+        boxes=labelled.boxes,
+        tracks=labelled.tracks,
+        ignored=labelled.ignored,
         length=frames,
         positions=positions,
         fleet=fleet,
@@ -73,11 +70,11 @@ def _truth(place: Path, frames: int) -> Truth:
 
 
 def _positions(path: Path) -> tuple[Positions, Positions]:
-    """The places of the targets that show, and of the ground vehicles, which are the landmarks. Raises InputError."""
+    """The places of the visible targets, and of the ground vehicles, which are the landmarks. Raises InputError."""
     said = read_positions(path)
     header, cells = read_rows(path)
-    if lacking := [name for name in ("kind", "visible_px") if name not in header]:
-        raise InputError(f"positions {path} lacks {', '.join(lacking)}; wanted what `dddas simulate` writes")
+    if absent := [name for name in ("kind", "visible_px") if name not in header]:
+        raise InputError(f"positions {path} lacks {', '.join(absent)}; wanted what `dddas simulate` writes")
     kind, shown = header.index("kind"), header.index("visible_px")
     fleet = np.array([row[kind] == "ugv" for row in cells], bool)
     shows = np.array([row[shown] not in ("", "0") for row in cells], bool)
@@ -97,7 +94,7 @@ def _rate(path: Path) -> float | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise InputError(f"{path} does not tell the frames a second: {str(error)[:80]}") from None
+        raise InputError(f"{path} does not hold the frames a second: {str(error)[:80]}") from None
     if state != "complete":
         raise InputError(f"{path}: the run is {state}; simulate it again")
     return float(rate) if isinstance(rate, (int, float)) and 0 < rate <= 1000 else None

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.files import fitted, images_in, number_of
-from torchvision_dddas.evaluation.datasets.kinds import Wanted
-from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, checked, gather
-from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.datasets.files import fit_clip, images_in, number_of
+from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options
+from torchvision_dddas.evaluation.metrics.truth import load_truth, read_text
 
 TERMS = "for research; whoever uses it cites Mueller, Smith and Ghanem (2016)"
 
@@ -38,31 +37,28 @@ _PART = re.compile(
 
 def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
     """The clips of a folder that holds anno and data_seq. See `kinds.KINDS`."""
-    said = checked("uav123", options, OPTIONS)
-    if said["variant"] and said["variant"] not in VARIANTS:
-        raise InputError(f"'{said['variant']}' is no variant of UAV123; wanted {', '.join(VARIANTS)}")
-    variant = said["variant"] or next((v for v in VARIANTS if (folder / "anno" / v).is_dir()), "")
+    given = check_options("uav123", options, OPTIONS)
+    if given["variant"] and given["variant"] not in VARIANTS:
+        raise InputError(f"'{given['variant']}' is no variant of UAV123; wanted {', '.join(VARIANTS)}")
+    collector = Collector("uav123", folder, TERMS, wanted)
+    variant = given["variant"] or next((v for v in VARIANTS if (folder / "anno" / v).is_dir()), "")
     annotations, sequences = _places(folder, variant)
     parts = {annotations: "the boxes, CLIP.txt", sequences: "the frames, a folder a sequence"}
-    if told := [f"{p} is not there; there belong {what}" for p, what in parts.items() if not p.is_dir()]:
-        return Dataset("uav123", folder, (), TERMS, tuple(told))
-    rate_hz = said["rate_hz"] or VARIANTS.get(variant or folder.name, 30.0)
-    cuts = _cuts(folder, variant)
+    if absent := [f"{place} does not exist; wanted {what}" for place, what in parts.items() if not place.is_dir()]:
+        return collector.refuse(*absent)
+    rate_hz = given["rate_hz"] or VARIANTS.get(variant or folder.name, 30.0)
+    parts_of_sequences = _read_parts(folder, variant)
 
     def clip_of(name: str) -> Clip:
-        still = any(fnmatchcase(name, pattern) for pattern in said["still"])
+        still = any(fnmatchcase(name, pattern) for pattern in given["still"])
         if name.startswith("building") and not still:
             raise InputError("its target is a building, which does not move; name it in `still` if nothing else does")
-        sequence, first, last = cuts.get(name, (name, 0, 0))
-        place = sequences / sequence
-        pictures = _cut(place, name, first, last, name in cuts)
-        if still:
-            return fitted(Clip(name, place, pictures, rate_hz, len(pictures), still=True))
-        truth = truths.load(annotations / f"{name}.txt")
-        return fitted(Clip(name, place, pictures, rate_hz, len(pictures), truth))
+        sequence, *span = parts_of_sequences.get(name, (name,))
+        pictures = _pictures(sequences / sequence, name, span)
+        truth = None if still else load_truth(annotations / f"{name}.txt")
+        return fit_clip(Clip(name, sequences / sequence, pictures, rate_hz, len(pictures), truth, still))
 
-    names = [path.stem for path in annotations.glob("*.txt")]
-    return gather("uav123", folder, TERMS, filter(wanted, names), clip_of)
+    return collector.collect([path.stem for path in annotations.glob("*.txt")], clip_of)
 
 
 def _places(folder: Path, variant: str) -> tuple[Path, Path]:
@@ -73,15 +69,10 @@ def _places(folder: Path, variant: str) -> tuple[Path, Path]:
     return next(filter(Path.is_dir, anno), anno[0]), next(filter(Path.is_dir, data), data[0])
 
 
-def _cuts(folder: Path, variant: str) -> dict[str, tuple[str, int, int]]:
-    """Clip -> its sequence, first and last frame, by configSeqs.m; none where it is not there."""
+def _read_parts(folder: Path, variant: str) -> dict[str, tuple[Any, ...]]:
+    """Clip -> its sequence, first and last frame, by configSeqs.m; none where it does not exist."""
     path = folder / "configSeqs.m"
-    if not path.is_file():
-        return {}
-    try:
-        text = path.read_text(encoding="latin-1")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    text = read_text(path, "latin-1") if path.is_file() else ""
     # One file may hold a table for each variant, which begins as seqUAV123_10fps = {...
     tables = re.split(r"seq(UAV\w+)\s*=\s*\{", text)
     mine = dict(zip(tables[1::2], tables[2::2], strict=True)).get(variant, text)
@@ -91,15 +82,16 @@ def _cuts(folder: Path, variant: str) -> dict[str, tuple[str, int, int]]:
     }
 
 
-def _cut(place: Path, name: str, first: int, last: int, known: bool) -> tuple[Path, ...]:
-    """The pictures of a clip. known: whether configSeqs.m says which. Raises InputError where one is not there."""
+def _pictures(place: Path, name: str, span: list[int]) -> tuple[Path, ...]:
+    """The pictures of a clip. span: first and last frame, empty if unknown. Raises InputError if one is absent."""
     pictures = images_in(place)
     if not pictures:
-        wanted = "" if known else f", or configSeqs.m, which tells of what sequence {name} is a part"
+        wanted = "" if span else f", or configSeqs.m, which says of what sequence {name} is a part"
         raise InputError(f"{place} holds no pictures; wanted the frames of the clip{wanted}")
-    if not known:
+    if not span:
         return pictures
-    cut = tuple(p for p in pictures if first <= (number_of(p) or 0) <= last)
-    if len(cut) != last - first + 1:
-        raise InputError(f"{place} holds {len(cut)} of the frames {first} to {last} of {name}; wanted all of them")
-    return cut
+    first, last = span
+    part = tuple(p for p in pictures if first <= (number_of(p) or 0) <= last)
+    if len(part) != last - first + 1:
+        raise InputError(f"{place} holds {len(part)} of the frames {first} to {last} of {name}; wanted all of them")
+    return part

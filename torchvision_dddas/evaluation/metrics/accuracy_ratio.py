@@ -65,10 +65,6 @@ class Windows(NamedTuple):
     windows: int = 0
     total: float = 0.0
 
-    def plus(self, other: "Windows") -> "Windows":
-        """The sums of both."""
-        return Windows(self.windows + other.windows, self.total + other.total)
-
     @property
     def mean(self) -> float:
         """Mean accuracy ratio; NaN without windows."""

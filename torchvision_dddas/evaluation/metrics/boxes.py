@@ -19,10 +19,6 @@ class Boxes(NamedTuple):
     false: int = 0
     missed: int = 0
 
-    def plus(self, other: "Boxes") -> "Boxes":
-        """The counts of both."""
-        return Boxes(*(a + b for a, b in zip(self, other, strict=True)))
-
 
 class OneTarget(NamedTuple):
     """Frames with the one labelled target; those where it is hit, where a box meets it at IoU 0.3; blobs elsewhere."""
@@ -31,10 +27,6 @@ class OneTarget(NamedTuple):
     hit: int = 0
     near: int = 0
     other: int = 0
-
-    def plus(self, other: "OneTarget") -> "OneTarget":
-        """The counts of both."""
-        return OneTarget(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
@@ -50,8 +42,7 @@ def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
 def areas(box_px: Any, other_px: Any) -> tuple[Any, Any]:
     """(...) what two boxes (..., 4) share and what they cover together, px²; broadcast against each other.
 
-    Arrays, or tensors, whose gradients it keeps. The pipeline has a formula of its own, `targets.boxes`: measures share
-    no code with what they measure.
+    Arrays, or tensors, whose gradients it keeps. The pipeline has its own formula: measures share no code with it.
     """
     low = box_px[..., :2].clip(min=other_px[..., :2])
     high = (box_px[..., :2] + box_px[..., 2:]).clip(max=other_px[..., :2] + other_px[..., 2:])
@@ -134,7 +125,7 @@ def judged(found: np.ndarray, score: np.ndarray, truth: np.ndarray, least: float
 
 
 class Curve(NamedTuple):
-    """Over all thresholds of the score, falling. score: (K,). right, false: (K,) detections at or above it."""
+    """Right and false detections (K,) of at least each score (K,), which falls."""
 
     score: np.ndarray
     right: np.ndarray
@@ -158,7 +149,7 @@ class Ranking:
     images: np.ndarray
 
     def curve(self, weight: np.ndarray | None = None) -> Curve:
-        """weight: (U,) how often each unit counts; once if not said."""
+        """weight: (U,) how often each unit counts; by default once."""
         if not len(self.right):
             return Curve(*np.zeros((3, 0)))
         of_each = np.ones(len(self.right)) if weight is None else weight[self.unit]
@@ -183,16 +174,14 @@ def ranking(
 ) -> Ranking:
     """Rank (M,) detections. right: 1, 0, or NaN for what does not count. true, images: (U,) of each unit.
 
-    images: 1 each if not said.
+    images: 1 each by default.
     """
     known = ~np.isnan(right)
     score, right, unit = score[known], right[known], unit[known]
     order = np.argsort(-score, kind="stable")
-    score, right, unit = score[order], right[order], unit[order]
+    score, right, unit = score[order], right[order], unit[order].astype(np.int64)
     ends = np.flatnonzero(np.append(score[1:] != score[:-1], True)[: len(score)])
-    return Ranking(
-        right, unit.astype(np.int64), ends, score[ends], true, np.ones(len(true)) if images is None else images
-    )
+    return Ranking(right, unit, ends, score[ends], true, np.ones(len(true)) if images is None else images)
 
 
 def precision_recall(curve: Curve, true: float) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,11 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import boxes, pixels, tracking, truth
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
-from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
-from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.evaluation.metrics.registry import Counts
 from torchvision_dddas.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
-from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.metrics.truth import Ignoring, TrackTable, Truth
 from torchvision_dddas.io.images import decode_image
-
-Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | GroundLocations]
 
 
 @dataclass(frozen=True)
@@ -106,10 +103,7 @@ def _summed(frames: list[int], groups: dict[str, list[Any]]) -> tuple[Counts, di
     counts: Counts = {}
     each: dict[str, Each] = {}
     for group, of_frames in groups.items():
-        whole = of_frames[0]
-        for one in of_frames[1:]:
-            whole = whole.plus(one)
-        counts[group] = whole
+        counts[group] = whole = reduce(add_counts, of_frames)
         columns = dict(zip(whole._fields, np.array(of_frames, float).T, strict=True))
         each[group] = {"frame": np.array(frames, np.int64), **columns}
     return counts, each

@@ -26,8 +26,9 @@ from torchvision_dddas.evaluation.metrics.crowd_frames import (
     shown,
     touched,
 )
-from torchvision_dddas.evaluation.metrics.matching import TrackTable, pair
+from torchvision_dddas.evaluation.metrics.matching import pair
 from torchvision_dddas.evaluation.metrics.pixels import ratio
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.types import FrameResult, Truth
 
 INSIDE = 5.991

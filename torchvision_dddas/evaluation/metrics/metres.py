@@ -6,8 +6,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.evaluation.metrics.boxes import iou
-from torchvision_dddas.evaluation.metrics.matching import EPSILON, TrackTable
+from torchvision_dddas.evaluation.metrics.matching import match
 from torchvision_dddas.evaluation.metrics.pixels import ratio
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 
 INSIDE = 5.991
 """Of chi-square with two degrees of freedom, in 95 %."""
@@ -26,10 +27,6 @@ class GroundLocations(NamedTuple):
     told: int = 0
     strays: int = 0
 
-    def plus(self, other: "GroundLocations") -> "GroundLocations":
-        """The counts of both."""
-        return GroundLocations(*(a + b for a, b in zip(self, other, strict=True)))
-
 
 def located_measures(counts: GroundLocations) -> dict[str, float]:
     """Share of the true places that were told, and of the told ones that are somebody's."""
@@ -44,11 +41,8 @@ def by_boxes(frame: np.ndarray, box_px: np.ndarray, truth: TrackTable) -> np.nda
     which = np.full(len(frame), -1)
     for number in np.intersect1d(frame, truth.frame):
         rows, true = np.flatnonzero(frame == number), np.flatnonzero(truth.frame == number)
-        overlap = iou(box_px[rows], truth.box_px[true])
-        overlap[overlap < LEAST_IOU - EPSILON] = 0
-        i, j = linear_sum_assignment(overlap, maximize=True)
-        hit = overlap[i, j] > 0
-        which[rows[i[hit]]] = true[j[hit]]
+        i, j = match(iou(box_px[rows], truth.box_px[true]), LEAST_IOU)
+        which[rows[i]] = true[j]
     return which
 
 

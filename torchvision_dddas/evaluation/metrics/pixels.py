@@ -1,7 +1,7 @@
 """The source's six pixel measures, from counts that may be pooled (appendix B, eq. 10 and 11)."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,12 @@ class Pixels(NamedTuple):
     fn: int = 0
     tn: int = 0
 
-    def plus(self, other: "Pixels") -> "Pixels":
-        """The counts of both."""
-        return Pixels(*(a + b for a, b in zip(self, other, strict=True)))
+
+def add_counts(one: Any, other: Any) -> Any:
+    """The counts of both, of any of the NamedTuples of counts: their fields are numbers, arrays or counts again."""
+    if isinstance(one, tuple):
+        return type(one)(*map(add_counts, one, other))
+    return one + other
 
 
 def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
@@ -52,15 +55,11 @@ def ratio(part: float, whole: float) -> float:
 
 
 class Still(NamedTuple):
-    """Frames that were looked at, those with any blob, and the blobs."""
+    """Processed frames of a clip in which nothing moves, those with any blob, and the blobs."""
 
     frames: int = 0
     alarmed: int = 0
     blobs: int = 0
-
-    def plus(self, other: "Still") -> "Still":
-        """The counts of both."""
-        return Still(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 def still_measures(counts: Still) -> dict[str, float]:

@@ -7,8 +7,9 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.evaluation.metrics import accuracy_ratio
 from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
-from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, Ignoring, Paired, TrackTable, pair
+from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, Paired, pair
 from torchvision_dddas.evaluation.metrics.pixels import ratio
+from torchvision_dddas.evaluation.metrics.truth import Ignoring, TrackTable
 
 ONE_TARGET_LEAST = 0.3
 """IoU from which a box counts as the one labelled target: moving-target detections seldom fit as tightly as labels."""
@@ -37,10 +38,6 @@ class Clear(NamedTuple):
     mostly_lost: int = 0
     overlap: float = 0.0
 
-    def plus(self, other: "Clear") -> "Clear":
-        """The counts of both."""
-        return Clear._make(a + b for a, b in zip(self, other, strict=True))
-
 
 ALPHA = np.arange(0.05, 0.99, 0.05)
 """The nineteen IoUs from which a box counts as found; the same numbers to the last bit as TrackEval's."""
@@ -63,10 +60,6 @@ class Hota(NamedTuple):
     precision: np.ndarray = _NONE
     overlap: np.ndarray = _NONE
 
-    def plus(self, other: "Hota") -> "Hota":
-        """The sums of both."""
-        return Hota(*(a + b for a, b in zip(self, other, strict=True)))
-
 
 class Identity(NamedTuple):
     """Boxes with the right identity, true boxes without it, found boxes without it."""
@@ -74,10 +67,6 @@ class Identity(NamedTuple):
     idtp: int = 0
     idfn: int = 0
     idfp: int = 0
-
-    def plus(self, other: "Identity") -> "Identity":
-        """The counts of both."""
-        return Identity(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class TrackCounts(NamedTuple):
@@ -93,18 +82,6 @@ class TrackCounts(NamedTuple):
     found: int = 0
     links_2: Windows = Windows()
     links_3: Windows = Windows()
-
-    def plus(self, other: "TrackCounts") -> "TrackCounts":
-        """The counts of both."""
-        return TrackCounts(
-            self.clear.plus(other.clear),
-            self.identity.plus(other.identity),
-            self.hota.plus(other.hota),
-            self.true + other.true,
-            self.found + other.found,
-            self.links_2.plus(other.links_2),
-            self.links_3.plus(other.links_3),
-        )
 
     def by_name(self) -> dict[str, int]:
         """The counts of boxes and identities; those of HOTA are curves and stay out."""
@@ -165,10 +142,6 @@ class TargetTrack(NamedTuple):
     switches: int = 0
     fragmentations: int = 0
     same: int = 0
-
-    def plus(self, other: "TargetTrack") -> "TargetTrack":
-        """The counts of both."""
-        return TargetTrack(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 def count_one_target(truth: TrackTable, found: TrackTable) -> TargetTrack:

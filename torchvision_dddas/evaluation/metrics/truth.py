@@ -10,16 +10,54 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.matching import Ignoring, TrackTable
 from torchvision_dddas.io.images import decode_image
 
 UNNAMED = 1 << 24
 """The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
 
 
+Ignoring = Literal["dropped", "removed"]
+"""What becomes of a found box on an ignored true one, see `matching.pair`."""
+
+
+class TrackTable(NamedTuple):
+    """A clip's boxes with identities, one row a box, in any order.
+
+    frame: (N,) int64 from 1. identity: (N,) int64, any numbers. box_px: (N, 4), x, y, width, height.
+    """
+
+    frame: np.ndarray
+    identity: np.ndarray
+    box_px: np.ndarray
+
+    @classmethod
+    def of(cls, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray) -> "TrackTable":
+        """A table of columns of any number type."""
+        return cls(frame.astype(np.int64), identity.astype(np.int64), box_px)
+
+    def at(self, rows: np.ndarray) -> "TrackTable":
+        """The rows that an index or a mask picks."""
+        return TrackTable(self.frame[rows], self.identity[rows], self.box_px[rows])
+
+    def every(self, interval: int) -> "TrackTable":
+        """The rows of frames 1, 1 + interval, 1 + 2 interval, ..."""
+        return self.at((self.frame - 1) % interval == 0)
+
+    def boxes_by_frame(self) -> dict[int, np.ndarray]:
+        """The boxes (n, 4) of each frame that has any, in the table's order."""
+        return {number: self.box_px[rows] for number, rows in rows_by_frame(self.frame).items()}
+
+
+def rows_by_frame(frame: np.ndarray) -> dict[int, np.ndarray]:
+    """The rows of each number in frame (N,), in order."""
+    order = np.argsort(frame, kind="stable")
+    numbers, starts = np.unique(frame[order], return_index=True)
+    return dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True)) if len(frame) else {}
+
+
 @dataclass(frozen=True)
 class Labels:
-    """What the values of a mask mean. background: nothing moves there. unscored: nobody knows, or nobody asks.
+    """What the values of a mask mean. background: nothing moves there. unscored: unknown, or outside what counts.
 
     Each other value is a mover; movers: where given, only these are, and any other value is unscored. separate: each is
     one target, so that boxes can be scored too.
@@ -35,7 +73,7 @@ class Labels:
 class Positions:
     """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres.
 
-    lonlat_deg: (N, 2), None where unknown; of use where results count their metres from another origin.
+    lonlat_deg: (N, 2), None where unknown; needed where results have another origin of their metres.
     """
 
     frame: np.ndarray
@@ -49,11 +87,10 @@ class Truth:
     """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
 
     tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
-    length: frames of the clip, 0 where nothing says how many. labels: of the masks. positions: None where unknown;
-    fleet: the same of the landmarks, by numbers of their own.
-    ignoring: what becomes of a found box on an ignored one (see `matching.pair`). others: boxes that are neither true
-    nor ignored but may take a found box in that. regions: where nobody labelled; identities mean nothing there. See
-    `uncounted.counted` for all three.
+    length: frames of the clip, 0 where unknown. labels: of the masks. positions: None where unknown; fleet: those of
+    the landmarks, with identities of their own. ignoring, others and regions are for `matching.counted`: what becomes
+    of a found box on an ignored one; boxes that are neither true nor ignored but may take a found box; and regions
+    that nobody labelled, whose identities mean nothing.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -76,7 +113,7 @@ class Truth:
         return sorted(self.masks or self.boxes)
 
 
-def find(place: Path) -> Path | None:
+def find_truth(place: Path) -> Path | None:
     """Where the truth of a clip lies: a file, a folder of PNGs, or what a clip's folder holds; None if it has none."""
     if place.is_file() or _numbered(place):
         return place
@@ -86,14 +123,14 @@ def find(place: Path) -> Path | None:
     return None
 
 
-def load(place: Path, first_frame: int | None = None) -> Truth:
+def load_truth(place: Path, first_frame: int | None = None) -> Truth:
     """Read the truth. first_frame is the number in a mask's name that is the clip's first frame.
 
     By default it is 0 if there is a file of that number, else 1. Raises InputError if nothing usable is there.
     """
     if not place.exists():
         raise InputError(f"no truth at {place}")
-    found = find(place)
+    found = find_truth(place)
     if found is None:
         raise InputError(f"{place} holds no truth: wanted numbered PNG masks, boxes_xywh.txt or a MOTChallenge gt.txt")
     if found.is_dir():
@@ -103,7 +140,7 @@ def load(place: Path, first_frame: int | None = None) -> Truth:
         if early:
             raise InputError(f"{numbers[early[0]]} is numbered below the first frame, {first}: see --first-frame")
         return Truth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
-    return _boxes(found)
+    return _load_boxes(found)
 
 
 def read_mask(path: Path) -> np.ndarray:
@@ -122,13 +159,13 @@ def read_mask(path: Path) -> np.ndarray:
 
 def labels_of(truth: Truth, frame: int) -> np.ndarray:
     """(H, W) int32 of a frame's mask: 0 background, above it movers, -1 where nothing counts. Raises as `read_mask`."""
-    values, said = read_mask(truth.masks[frame]), truth.labels
-    if said == Labels():
+    values, meaning = read_mask(truth.masks[frame]), truth.labels
+    if meaning == Labels():
         return values
-    labels = np.where(np.isin(values, said.background), 0, np.where(values == 0, UNNAMED, values))
-    labels[np.isin(values, said.unscored)] = -1
-    if said.movers:
-        labels[~np.isin(values, said.movers + said.background)] = -1
+    labels = np.where(np.isin(values, meaning.background), 0, np.where(values == 0, UNNAMED, values))
+    labels[np.isin(values, meaning.unscored)] = -1
+    if meaning.movers:
+        labels[~np.isin(values, meaning.movers + meaning.background)] = -1
     return labels
 
 
@@ -138,11 +175,8 @@ def _numbered(folder: Path) -> dict[int, Path]:
     return {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdecimal()}
 
 
-def _boxes(path: Path) -> Truth:
-    try:
-        lines = [x.replace(",", " ").split() for x in path.read_text(encoding="utf-8-sig").splitlines() if x.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no table of boxes: {error}") from error
+def _load_boxes(path: Path) -> Truth:
+    lines = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     if not lines:
         raise InputError(f"{path} is empty: wanted one box a line")
     if len(lines[0]) == 4:
@@ -155,11 +189,14 @@ def _boxes(path: Path) -> Truth:
     # MOTChallenge: a 0 in the seventh column marks a box that does not count.
     counts = rows.mark != 0
     kept = rows.table.at(counts)
-    boxes = {int(f): kept.box_px[kept.frame == f] for f in np.unique(rows.table.frame)}
+    boxes = dict.fromkeys(np.unique(rows.table.frame).tolist(), np.zeros((0, 4))) | kept.boxes_by_frame()
     if not rows.named:
         return Truth("boxes", path, {}, boxes)
     table = with_identities(rows, path)
-    return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), _length(path))
+    # The clip's length is in MOTChallenge's seqinfo.ini, beside the truth or above its folder.
+    ini = next((p for p in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini") if p.is_file()), None)
+    length = read_seqinfo(ini).length if ini is not None else 0
+    return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
 
 
 def _one_target(path: Path, lines: list[list[str]]) -> Truth:
@@ -168,18 +205,10 @@ def _one_target(path: Path, lines: list[list[str]]) -> Truth:
     except ValueError as error:
         raise InputError(f"{path} is no table of boxes: {error}") from error
     if far := [row for row, far in zip(lines, (np.abs(table) > FARTHEST).any(axis=1), strict=True) if far]:
-        raise InputError(f"{path}: the box {','.join(far[0])} is none; wanted {-FARTHEST:g} to {FARTHEST:g}")
+        raise InputError(f"{path}: a box is {','.join(far[0])}; wanted numbers from {-FARTHEST:g} to {FARTHEST:g}")
     there = np.flatnonzero(~np.isnan(table).any(axis=1))
     tracks = TrackTable(there + 1, np.ones(len(there), np.int64), table[there])
     return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)}, tracks, None, len(table))
-
-
-def _length(path: Path) -> int:
-    """Frames of the clip by MOTChallenge's seqinfo.ini, beside the truth or above its folder; 0 where there is none."""
-    for place in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini"):
-        if place.is_file():
-            return read_seqinfo(place).length
-    return 0
 
 
 FARTHEST = 1e9
@@ -202,23 +231,18 @@ class MotRows(NamedTuple):
 
 
 def read_rows(path: Path, what: str) -> MotRows:
-    """Read a file; `what` says in errors what it was taken for.
+    """Read a file; `what` names it in errors.
 
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole
     or below 1, an identity that is not whole, a size that is not positive.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InputError(f"{what} {path} cannot be read: {reason}") from None
     rows = [
-        [*_row(_cells(line), f"{what} {path}, line {number}"), number]
-        for number, line in enumerate(lines, 1)
+        [*_row(split_cells(line), f"{what} {path}, line {number}"), number]
+        for number, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1)
         if line.strip()
     ]
     values = np.array(rows, float).reshape(-1, 8)
-    table = TrackTable(values[:, 0].astype(np.int64), values[:, 1].astype(np.int64), values[:, 2:6])
+    table = TrackTable.of(values[:, 0], values[:, 1], values[:, 2:6])
     return MotRows(table, values[:, 6], values[:, 7].astype(np.int64))
 
 
@@ -227,7 +251,7 @@ def with_identities(rows: MotRows, path: Path) -> TrackTable:
     table = rows.table
     unnamed = np.flatnonzero(table.identity == -1)
     if len(unnamed):
-        raise InputError(f"{path}, line {rows.line[unnamed[0]]}: identity -1 stands for none; other rows have one")
+        raise InputError(f"{path}, line {rows.line[unnamed[0]]}: identity -1 means none, but other rows have one")
     order = np.lexsort([rows.line, table.identity, table.frame])
     frame, identity, line = table.frame[order], table.identity[order], rows.line[order]
     again = np.flatnonzero((frame[1:] == frame[:-1]) & (identity[1:] == identity[:-1]))
@@ -240,8 +264,26 @@ def with_identities(rows: MotRows, path: Path) -> TrackTable:
     return table
 
 
-def _cells(line: str) -> list[str]:
+def read_text(path: Path, encoding: str = "utf-8-sig", what: str = "") -> str:
+    """A file's text. Raises InputError where it cannot be read or is none."""
+    try:
+        return path.read_text(encoding=encoding)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InputError(f"{what}{path} cannot be read: {reason}") from None
+
+
+def split_cells(line: str) -> list[str]:
+    """The cells of a line, separated by commas, or by blanks where there are none."""
     return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+
+
+def to_number(cell: str) -> float:
+    """A cell's number, NaN for none."""
+    try:
+        return float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
+    except ValueError:
+        return math.nan
 
 
 def _row(cells: list[str], where: str) -> list[float]:
@@ -250,10 +292,7 @@ def _row(cells: list[str], where: str) -> list[float]:
         raise InputError(f"{where}: {count}; wanted frame,id,x,y,w,h[,score]")
     values = []
     for cell, column in zip(cells, _COLUMNS, strict=False):
-        try:
-            value = float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
-        except ValueError:
-            value = math.nan
+        value = to_number(cell)
         if not math.isfinite(value):
             raise InputError(f"{where}: {column} is '{cell}'; wanted a finite number")
         if column in ("frame", "id") and (value != int(value) or abs(value) > 2**53):
@@ -273,7 +312,7 @@ MOST_FRAMES = 10_000_000
 
 
 class SeqInfo(NamedTuple):
-    """What it says. length: frames, 0 where it does not. rate_hz: None where it does not. pictures: their folder."""
+    """The content of seqinfo.ini. length: frames, 0 if absent. rate_hz: None if absent. pictures: their folder."""
 
     length: int = 0
     rate_hz: float | None = None
@@ -287,7 +326,7 @@ def read_seqinfo(path: Path) -> SeqInfo:
         ini.read(path, encoding="utf-8")
         length = ini.getint("Sequence", "seqLength")
     except (configparser.Error, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path} does not tell seqLength under [Sequence]: {error}") from error
+        raise InputError(f"{path} does not hold seqLength under [Sequence]: {error}") from error
     if not 0 <= length <= MOST_FRAMES:
         raise InputError(f"{path}: seqLength is {length}; wanted 0 to {MOST_FRAMES}")
     try:

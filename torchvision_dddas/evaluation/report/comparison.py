@@ -6,7 +6,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from torchvision_dddas.evaluation.report.measures import GROUPS, TITLES, measure
+from torchvision_dddas.evaluation.metrics.registry import describe, title_of_group
+from torchvision_dddas.evaluation.report.measures import TITLES
 from torchvision_dddas.io.report import (
     MOST_ROWS,
     Cell,
@@ -60,7 +61,7 @@ def _task(task: str, changes: Mapping[str, Any], first: str, second: str) -> dic
     }
     if pooled := _rows(changes["pooled"]):
         group, name, entry = pooled[0]
-        before, after = (number_cell(entry[end], measure(name).digits).text for end in ("first", "second"))
+        before, after = (number_cell(entry[end], describe(name).digits).text for end in ("first", "second"))
         found |= {"change": _signed(entry, name), "metric": _title(group, name), "before": before, "after": after}
         found["verdict"] = entry["says"]
     return found
@@ -103,7 +104,7 @@ def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
         if not rows:
             continue
         name = changed[0][2]
-        rows.sort(key=lambda row: row.value * (-1 if measure(name).better < 0 else 1))
+        rows.sort(key=lambda row: row.value * (-1 if describe(name).better < 0 else 1))
         ends = [abs(v) for row in rows for v in (row.value, row.low, row.high) if math.isfinite(v)]
         reach = max(ends) or 1.0
         svg = interval_chart(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
@@ -113,7 +114,7 @@ def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
 
 
 def _row(title: str, name: str, entry: Entry, ways: Sequence[str]) -> list[Cell]:
-    digits = measure(name).digits
+    digits = describe(name).digits
     low, high = _change(entry)[1:]
     cells = [text_cell(title), number_cell(entry["first"], digits), number_cell(entry["second"], digits)]
     small = number_cell(entry["change"], digits, (low, high)).small
@@ -137,9 +138,9 @@ def _change(entry: Entry) -> tuple[float, float, float]:
 
 def _signed(entry: Entry, name: str) -> str:
     change = entry["change"]
-    text = format_number(math.nan if change is None else change, measure(name).digits)
+    text = format_number(math.nan if change is None else change, describe(name).digits)
     return f"+{text}" if change and change > 0 else text
 
 
 def _title(group: str, name: str) -> str:
-    return f"{measure(name).name}, {GROUPS.get(group, group)}"
+    return f"{describe(name).title}, {title_of_group(group)}"

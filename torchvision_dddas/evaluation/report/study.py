@@ -10,13 +10,11 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.metrics.registry import HEADLINES, describe, title_of_group
 from torchvision_dddas.evaluation.report.measures import (
-    GROUPS,
-    HEADLINES,
     TITLES,
     TaskFigures,
     groups_of,
-    measure,
     measure_plot,
     measure_table,
     read_figures,
@@ -93,7 +91,7 @@ def _task(task: Task, figures: TaskFigures, cases: Sequence[Case]) -> dict[str, 
         "cost": _format_cost(cases),
         "n_left_out": sum(case.cause != "" for case in cases),
         "plots": [*plots, *ranked_charts(cases)],
-        "tables": [(_capital(GROUPS.get(group, group)), measure_table(figures, group, frames)) for group in groups],
+        "tables": [(_capital(title_of_group(group)), measure_table(figures, group, frames)) for group in groups],
         "worst": draw_pictures(worst),
         "n_other_faults": n_other_faults,
         "courses": courses,
@@ -109,12 +107,12 @@ def _headline(task: Task, figures: TaskFigures) -> dict[str, str] | None:
     if chosen is None:
         return None
     group, name = chosen
-    known, pooled = measure(name), figures.pooled.get(group, {}).get(name)
+    known, pooled = describe(name), figures.pooled.get(group, {}).get(name)
     found = {"value": "", "clips": _clips_in_words(figures, group, name), "meaning": known.meaning}
     if pooled is not None:
         found["value"] = format_number(pooled.value, known.digits)
-        found["metric"] = f"{known.name}, {GROUPS.get(group, group)}"
-        if name.endswith("_m"):
+        found["metric"] = f"{known.title}, {title_of_group(group)}"
+        if known.unit == "m":
             found["metric"] = f"m, {known.meaning.removesuffix(', metres')}"
         found["interval"] = "no interval: too few clips or frames"
         if math.isfinite(pooled.low) and math.isfinite(pooled.high):
@@ -147,7 +145,7 @@ def _clips_in_words(figures: TaskFigures, group: str, name: str) -> str:
     }
     if len(values) < 2:
         return f"one clip: {next(iter(values), 'none')}"
-    known = measure(name)
+    known = describe(name)
     worst = (max if known.better < 0 else min)(values, key=lambda clip: values[clip])
     return f"pooled over {len(values)} clips; worst: {worst}, {format_number(values[worst], known.digits)}"
 

@@ -11,8 +11,8 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.boxes import iou
-from torchvision_dddas.evaluation.metrics.ignored_regions import counted
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.matching import counted
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.evaluation.report.task_charts import Tally, main_group, tally
 from torchvision_dddas.evaluation.studies.results import Case, Found
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, decode_image, read_image

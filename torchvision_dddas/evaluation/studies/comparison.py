@@ -9,23 +9,11 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
+from torchvision_dddas.evaluation.metrics.registry import GROUPS, is_lower_better
 from torchvision_dddas.evaluation.studies import estimates
-from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
+from torchvision_dddas.evaluation.studies.estimates import Estimate
 from torchvision_dddas.evaluation.studies.results import Scored, ScoredStudy
-from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measures
-
-ASKED: Mapping[str, tuple[str, ...]] = {
-    "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
-    "boxes": ("f1", "precision", "recall"),
-    RANKED: ("ap", "log_average_miss_rate"),
-    "target": ("hit", "other_blobs_per_frame"),
-    "tracks": ("hota", "mota", "idf1", "ar_3"),
-    "target_track": ("found", "same_identity"),
-    "still": ("false_blobs_per_frame",),
-    "location": ("located",),
-    METRES: ("median_m", "in_ellipse", "relative_median_m", "relative_in_ellipse"),
-}
-"""The measures that are compared, the first of each group for single clips too."""
+from torchvision_dddas.evaluation.studies.summary import measures
 
 LEVEL = 0.05
 
@@ -88,13 +76,13 @@ def _task(pairs: Pairs) -> dict[str, Any]:
 
 
 def _clip(one: Scored, other: Scored) -> dict[str, dict[str, Any]]:
-    asked = {group: names[:1] for group, names in ASKED.items()}
+    asked = {name: group.compared[:1] for name, group in GROUPS.items()}
     return _entries([one], [other], asked, {"over_frames": _over_frames([one], [other])})
 
 
 def _pooled(first: Sequence[Scored], second: Sequence[Scored]) -> dict[str, dict[str, Any]]:
     ways = {"over_clips": _over_clips(first, second), "over_frames": _over_frames(first, second)}
-    return _entries(first, second, ASKED, ways)
+    return _entries(first, second, {name: group.compared for name, group in GROUPS.items()}, ways)
 
 
 def _entries(
@@ -161,7 +149,7 @@ def _verdict(entry: Mapping[str, Any], name: str) -> str:
     change = entry["change"]
     if not change:
         return "the same"
-    better = (change < 0) == (name in BETTER_LOW)
+    better = (change < 0) == is_lower_better(name)
     word = "better" if better else "worse"
     ways = [way for name in ("over_clips", "over_frames") if (way := entry.get(name)) is not None]
     for way in ways:

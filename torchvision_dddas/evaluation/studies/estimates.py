@@ -7,29 +7,14 @@ import numpy as np
 
 from torchvision_dddas.evaluation.metrics import bootstrap, metres, tracking
 from torchvision_dddas.evaluation.metrics.bootstrap import Statistic, Stratum
-from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget, Ranking, ranking
-from torchvision_dddas.evaluation.metrics.figures import of_group
-from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still, ratio
+from torchvision_dddas.evaluation.metrics.boxes import Boxes, Ranking, ranking
+from torchvision_dddas.evaluation.metrics.pixels import ratio
+from torchvision_dddas.evaluation.metrics.registry import GROUPS, METRES, RANKED, measure
 from torchvision_dddas.evaluation.metrics.tracking import Clear
 from torchvision_dddas.evaluation.studies.results import Scored
 
 Measure = Callable[[np.ndarray], dict[str, float]]
 """Sums (C,) of a group's counts to its measures."""
-
-RANKED = "ranking"
-"""The group of what scores tell: average precision and miss rates."""
-
-METRES = "metres"
-"""The group of errors on the ground."""
-
-_KINDS: dict[str, Any] = {
-    "pixels": Pixels,
-    "boxes": Boxes,
-    "target": OneTarget,
-    "still": Still,
-    "location": GroundLocations,
-}
 
 
 class Estimate(NamedTuple):
@@ -53,13 +38,13 @@ def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
     groups = dict.fromkeys(group for scored in cases for group in scored.per_frame)
     blocks: dict[str, list[int]] = {}
     for group in groups:
-        names, measure = _columns(group)
+        names, of_sums = _columns(group)
         having = [scored for scored in cases if group in scored.per_frame]
         tables = [_table(scored, group, names) for scored in having]
-        blocks[group] = [bootstrap.block_length(_influence(table, measure)) for table in tables]
+        blocks[group] = [bootstrap.block_length(_influence(table, of_sums)) for table in tables]
         strata = tuple(Stratum(len(t), block) for t, block in zip(tables, blocks[group], strict=True) if len(t))
         if strata:
-            found[group] = Estimate(_of_sums(np.concatenate(tables), measure), strata, tuple(tables))
+            found[group] = Estimate(_of_sums(np.concatenate(tables), of_sums), strata, tuple(tables))
     if having := [scored for scored in cases if "boxes" in scored.ranked]:
         true: list[np.ndarray] = []
         unit: list[np.ndarray] = []
@@ -85,10 +70,10 @@ def over_clips(cases: Sequence[Scored]) -> dict[str, Estimate]:
         counts = [scored.counts[group] for scored in cases if group in scored.counts]
         table = np.stack([flat(one) for one in counts])
 
-        def measure(sums: np.ndarray, like: Any = counts[0]) -> dict[str, float]:
-            return of_group(shaped(sums, like))
+        def measure_sums(sums: np.ndarray, like: Any = counts[0], group: str = group) -> dict[str, float]:
+            return measure(group, shaped(sums, like))
 
-        found[group] = Estimate(_of_sums(table, measure), (Stratum(len(table)),), (table,))
+        found[group] = Estimate(_of_sums(table, measure_sums), (Stratum(len(table)),), (table,))
     if having := [scored for scored in cases if "boxes" in scored.ranked]:
         ranked = ranking_of(having)
         found[RANKED] = Estimate(ranked.measures, (Stratum(len(having)),), _content(ranked))
@@ -149,8 +134,8 @@ def _columns(group: str) -> tuple[tuple[str, ...], Measure]:
         return (*tracking.PER_FRAME, "windows_2", "ar_2", "windows_3", "ar_3"), _of_tracks
     if group == "target_track":
         return ("frames", "found"), lambda sums: {"found": ratio(sums[1], sums[0])}
-    kind = _KINDS[group]
-    return kind._fields, lambda sums: of_group(kind(*sums.tolist()))
+    kind = type(GROUPS[group].counts)
+    return kind._fields, lambda sums: measure(group, kind(*sums.tolist()))
 
 
 def _of_tracks(sums: np.ndarray) -> dict[str, float]:

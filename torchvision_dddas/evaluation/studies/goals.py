@@ -7,20 +7,12 @@ from typing import Any
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.metrics.registry import groups_of_task, is_lower_better, measure_names
 from torchvision_dddas.evaluation.studies.results import Case
 from torchvision_dddas.evaluation.studies.spec import TASKS, Task
-from torchvision_dddas.evaluation.studies.summary import BETTER_LOW, measure_names, measures
+from torchvision_dddas.evaluation.studies.summary import measures
 
 BY = ("pooled", "mean", "worst")
-
-OF_TASK: Mapping[Task, tuple[str, ...]] = {
-    "motion": ("pixels", "boxes", "ranking", "target", "still"),
-    "tracking": ("tracks", "target_track"),
-    "association": ("tracks",),
-    "people": ("boxes", "ranking"),
-    "location": ("metres", "location"),
-}
-"""The groups of measures that a task can have; which of them a clip has depends on its truth."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +27,7 @@ class Goal:
     @property
     def minimize(self) -> bool:
         """Whether less is better."""
-        return self.measure in BETTER_LOW
+        return is_lower_better(self.measure)
 
     @property
     def name(self) -> str:
@@ -54,9 +46,9 @@ def parse_goal(text: str, by: str = "pooled") -> Goal:
         raise InputError(f"'{named}' is no task of a study; wanted {', '.join(TASKS)}")
     if by not in BY:
         raise InputError(f"a goal is over all clips by {', '.join(BY)}; got '{by}'")
-    if group not in OF_TASK[task]:
-        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(OF_TASK[task])}")
-    if measure.startswith("n_") and measure not in BETTER_LOW:
+    if group not in groups_of_task(task):
+        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(groups_of_task(task))}")
+    if measure.startswith("n_") and not is_lower_better(measure):
         raise InputError(f"{measure} is a count, of which neither more nor less is better; wanted a measure")
     if measure not in measure_names(group):
         raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(measure_names(group))}")
@@ -69,7 +61,7 @@ def possible_groups(clip: Clip, task: Task) -> tuple[str, ...]:
     if task == "motion" and clip.still:
         return ("still",)
     if truth is None or task in ("association", "people", "location"):
-        return OF_TASK[task]
+        return groups_of_task(task)
     alone = truth.kind == "one target"
     if task == "tracking":
         return ("target_track",) if alone else ("tracks",)
@@ -119,6 +111,6 @@ def _known(clips: Sequence[Mapping[str, Mapping[str, Any]]]) -> str:
         for clip in clips
         for group, found in clip.items()
         for name in found
-        if not name.startswith("n_") or name in BETTER_LOW
+        if not name.startswith("n_") or is_lower_better(name)
     )
     return ", ".join(names)

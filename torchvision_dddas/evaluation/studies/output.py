@@ -10,13 +10,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchvision_dddas.evaluation.metrics.registry import GROUPS
 from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.studies.jobs import OnEvent
 from torchvision_dddas.evaluation.studies.results import Results, ScoredCase
 from torchvision_dddas.evaluation.studies.runner import Plan, cache_folder, run_study
 from torchvision_dddas.evaluation.studies.spec import Spec
 from torchvision_dddas.evaluation.studies.storage import SCORES, write_scores
-from torchvision_dddas.evaluation.studies.summary import GROUPS, summarize, summarize_costs
+from torchvision_dddas.evaluation.studies.summary import summarize, summarize_costs
 from torchvision_dddas.evaluation.studies.workers import Workers
 from torchvision_dddas.io.atomic_files import cannot_write, temporary, write_whole
 from torchvision_dddas.io.output.run_record import finite, versions

@@ -9,7 +9,7 @@ import numpy as np
 if TYPE_CHECKING:  # else what finds would seem to depend on what scores; see fingerprints.py
     from torchvision_dddas.config import Settings
     from torchvision_dddas.evaluation.datasets.record import Clip
-    from torchvision_dddas.evaluation.metrics.clip import Counts
+    from torchvision_dddas.evaluation.metrics.registry import Counts
     from torchvision_dddas.evaluation.studies.spec import Spec, Task
 
 

@@ -11,13 +11,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import boxes, metres
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.clip import Counts, How, Result, score_clip
-from torchvision_dddas.evaluation.metrics.ignored_regions import WITHIN, counted
-from torchvision_dddas.evaluation.metrics.matching import TrackTable
+from torchvision_dddas.evaluation.metrics.clip import How, Result, score_clip
+from torchvision_dddas.evaluation.metrics.matching import WITHIN, counted
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Still
+from torchvision_dddas.evaluation.metrics.registry import Counts
 from torchvision_dddas.evaluation.metrics.tracking import Each
-from torchvision_dddas.evaluation.metrics.truth import Positions, Truth
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
 from torchvision_dddas.evaluation.studies.results import Found, Scored, round_as_written
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.io.ground_tables import read_landmarks
@@ -30,7 +30,7 @@ _NOBODY, _NOT_ASKED = -1, -2
 def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
     """Score one case. interval: of tracking and association, as `dddas evaluate --interval`.
 
-    Boxes that count neither as right nor as false (see `ignored_regions.counted`) are left out. Raises InputError if
+    Boxes that count neither as right nor as false (see `matching.counted`) are left out. Raises InputError if
     the truth is missing, or does not fit what was found.
     """
     if task == "location":

@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import kinds
+from torchvision_dddas.evaluation.datasets.record import Source
 
 Task = Literal["motion", "tracking", "association", "people", "location"]
 
@@ -24,16 +25,6 @@ BACKENDS = ("auto", "torch", "onboard")
 
 _KEYS = ("name", "tasks", "config", "set", "backend", "interval", "dataset")
 _NAME = re.compile(r"[\w][\w .+-]{0,99}")
-
-
-@dataclass(frozen=True)
-class Source:
-    """A data set of a study. clips: patterns of names (fnmatch). options: further options of its kind, by name."""
-
-    kind: str
-    folder: Path
-    clips: tuple[str, ...] = ("*",)
-    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -89,7 +80,7 @@ def _source(table: Mapping[str, Any], where: str) -> Source:
         if not _text(table, key, where, ""):
             raise InputError(f"{where} has no {key}; wanted kind = one of {', '.join(kinds.KINDS)}, and folder")
     try:
-        kinds.known(table["kind"])
+        kinds.check_kind(table["kind"])
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     patterns = tuple(_texts(table, "clips", where)) if "clips" in table else ("*",)

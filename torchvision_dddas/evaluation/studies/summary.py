@@ -6,46 +6,20 @@ metrics.json has nothing of the machine, the time or the folders: the same data,
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.evaluation.metrics import bootstrap, metres
-from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget, ranking
-from torchvision_dddas.evaluation.metrics.figures import figures, mean, pooled
-from torchvision_dddas.evaluation.metrics.metres import GroundLocations
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still, ratio
-from torchvision_dddas.evaluation.metrics.tracking import TargetTrack, TrackCounts
+from torchvision_dddas.evaluation.metrics.pixels import ratio
+from torchvision_dddas.evaluation.metrics.registry import GROUPS, METRES, RANKED, figures, is_lower_better, mean, pooled
 from torchvision_dddas.evaluation.studies import estimates
-from torchvision_dddas.evaluation.studies.estimates import METRES, RANKED, Estimate
+from torchvision_dddas.evaluation.studies.estimates import Estimate
 from torchvision_dddas.evaluation.studies.results import Case, Results, Scored
 from torchvision_dddas.evaluation.studies.spec import TASKS, Task
 
 FORMAT = 1
-
-GROUPS = ("pixels", "boxes", RANKED, "target", "tracks", "target_track", "still", "location", METRES)
-
-BETTER_LOW = frozenset(
-    {
-        *("log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1", "mostly_lost", "other_blobs_per_frame"),
-        *("false_blobs_per_frame", "alarmed", "mean_m", "median_m", "p95_m", "rms_m"),
-        *("relative_mean_m", "relative_median_m", "relative_p95_m", "relative_rms_m"),
-        *("n_switches", "n_fragmentations"),
-    }
-)
-"""Measures of which less is better; of all others more is."""
-
-_EMPTY: Mapping[str, Any] = {
-    "pixels": Pixels(),
-    "boxes": Boxes(),
-    "target": OneTarget(),
-    "tracks": TrackCounts(),
-    "target_track": TargetTrack(),
-    "still": Still(),
-    "location": GroundLocations(),
-}
-"""Groups whose measures come from counts, with no counts at all."""
 
 
 def summarize(results: Results) -> dict[str, Any]:
@@ -79,7 +53,7 @@ def _task(task: Task, cases: Sequence[Case]) -> dict[str, Any]:
         "what": TASKS[task],
         "clips": clips,
         "pooled": pooled_measures(scored),
-        "mean": mean(list(clips.values()), GROUPS),
+        "mean": mean(list(clips.values())),
         "worst": _worst(clips),
         "notes": notes,
     }
@@ -116,17 +90,6 @@ def measures(cases: Sequence[Scored]) -> dict[str, dict[str, float]]:
     return {group: found[group] for group in GROUPS if group in found}
 
 
-def measure_names(group: str) -> tuple[str, ...]:
-    """The measures that a group of GROUPS can have, and those of its counts of which less is better."""
-    if group == RANKED:
-        return tuple(ranking(*np.zeros((5, 0))).measures())
-    if group == METRES:
-        none = dict.fromkeys(("error_m", "inside", "relative_error_m", "relative_inside"), np.zeros(0))
-        return tuple(metres.measures(none))
-    found = figures({group: _EMPTY[group]})[group]
-    return tuple(name for name in found if not name.startswith("n_") or name in BETTER_LOW)
-
-
 def _intervals(group: str, estimate: Estimate) -> dict[str, list[float] | None]:
     found = bootstrap.intervals(estimate.statistic, estimate.strata, estimate.seed(group))
     return {name: None if span is None else list(span) for name, span in found.items()}
@@ -140,7 +103,7 @@ def _worst(clips: dict[str, dict[str, Any]]) -> dict[str, dict[str, dict[str, An
                 if measure.startswith("n_") or math.isnan(value):
                     continue
                 known = worst.setdefault(group, {}).get(measure)
-                sign = -1 if measure in BETTER_LOW else 1
+                sign = -1 if is_lower_better(measure) else 1
                 if known is None or sign * value < sign * known["value"]:
                     worst[group][measure] = {"clip": name, "value": value}
     return worst
