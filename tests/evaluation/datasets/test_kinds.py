@@ -80,7 +80,7 @@ def test_a_folder_is_relative_to_the_base(tmp_path: Path) -> None:
     [
         (
             {"rate_hz": "fast"},
-            "rate_hz of a data set of kind folder must be a number above 0, at most 1000, got 'fast'",
+            "of kind folder must be a number above 0, at most 1000, got 'fast'",
         ),
         ({"rate_hz": 0}, "got 0"),
         ({"rate_hz": True}, "got True"),

@@ -91,7 +91,7 @@ def test_truth_without_pictures_is_told(tmp_path: Path) -> None:
     [
         ("egtest01_truth.csv", CSV + "car,99,7,1,2,8,5\n", "line 5: there is no picture 99; the clip has 0 to 20"),
         ("egtest01_truth.csv", CSV + "car,1,7\n", "line 5: 3 columns; wanted name,frame,identity,x,y,width,height"),
-        ("egtest01_truth.csv", CSV + "car,1,7,a,2,8,5\n", "line 5: got 'a'"),
+        ("egtest01_truth.csv", CSV + "car,1,7,a,2,8,5\n", "line 5: wanted a number from -1e+09 to 1e+09, got 'a'"),
         ("egtest01_truth.csv", CSV + "car,1,7,1,2,-8,5\n", "the box is -8×5 pixels; wanted more than 0"),
         ("egtest01_truth.csv", CSV + "car,10,7,1,2,8,5\n", "lines 4 and 5: identity 7 twice in frame 11"),
         ("egtest01_truth.csv", CSV + "car,1,7.5,1,2,8,5\n", "7.5 is no identity; wanted whole numbers"),

@@ -62,7 +62,7 @@ def test_an_interval_scores_frames_that_far_apart(tmp_path):
     scored = evaluate(truth, out, interval=2)["clips"]["out"]
     assert (scored["frames"], scored["tracks"]["n_tp"], scored["boxes"]["n_missed"]) == (1, 2, 1)
     assert scored["tracks"]["hota"] == pytest.approx(1)
-    with pytest.raises(InputError, match="the interval is 0 frames; wanted 1 or more"):
+    with pytest.raises(InputError, match="interval must be at least 1 frame, got 0"):
         evaluate(truth, out, interval=0)
 
 

@@ -8,10 +8,11 @@ import pytest
 from tests.evaluation.studies import world
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
 from torchvision_dddas.evaluation.studies.jobs import Job, do_job, find_cached, make_keys
-from torchvision_dddas.evaluation.studies.spec import Source, Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.storage import Cache
 
 TASKS: tuple[Task, ...] = ("motion", "tracking", "association")

@@ -10,14 +10,14 @@ from torchvision_dddas.cli import app
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.registry import figures
 from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, TrackTable, Truth
 from torchvision_dddas.evaluation.studies.results import round_as_written
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Source, Task
+from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import find
 from torchvision_dddas.evaluation.studies.storage import pack, unpack
 from torchvision_dddas.geometry import lonlat

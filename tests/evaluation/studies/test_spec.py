@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.spec import Source, Spec, read_spec
+from torchvision_dddas.evaluation.datasets.record import Source
+from torchvision_dddas.evaluation.studies.spec import Spec, read_spec
 
 SET = '[[dataset]]\nkind = "bms"\nfolder = "data"\n'
 

@@ -10,8 +10,8 @@ from tests.evaluation.studies import world
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.studies.spec import Source
 from torchvision_dddas.evaluation.studies.stages import (
     PARAMETER_GROUPS,
     allowed_tasks,
