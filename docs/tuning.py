@@ -35,7 +35,7 @@ def main(folder: Path) -> None:
 
     # 4. What it is worth: the whole pipeline with hard operations, before and after.
     tuned = {"difference.threshold": found.settings.difference.threshold}
-    verdict = judge(ready.spec, folder, ready.goal, tuned, ready.tuned, ready.held, jobs=0, cache=folder / "cache")
+    verdict = judge(ready.spec, folder, ready.goal, tuned, ready.tuned, ready.held, jobs=1, cache=folder / "cache")
     for words, side in (("tuned on", verdict.tuned), ("held out", verdict.held)):
         if side is not None:
             print(f"F on the clips {words}: {side.pooled[0]:.3f} -> {side.pooled[1]:.3f} ({side.says})")
