@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.evaluation.metrics.registry import title_of_group
+from torchvision_dddas.evaluation.metrics.registry import describe, title_of_group
 from torchvision_dddas.evaluation.report.comparison import MEANING, comparison_section
 from torchvision_dddas.io.report import (
     Axis,
@@ -34,7 +34,7 @@ def tuning_report(run: Mapping[str, Any]) -> str:
         "tuning.html",
         title=f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient",
         run={"loss": None, **run},
-        measure=measure(name),
+        measure=describe(name),
         group=title_of_group(group),
         sides=[_side(side, heading, verdict[side], group, name) for side, heading in SIDES.items() if verdict],
         charts=_charts(run),
@@ -57,7 +57,7 @@ def _side(anchor: str, heading: str, side: Mapping[str, Any] | None, group: str,
     return {
         "anchor": anchor,
         "heading": heading,
-        "gain": _gain(side, tasks[0]["pooled"].get(group, {}).get(name) if tasks else None, measure(name).digits),
+        "gain": _gain(side, tasks[0]["pooled"].get(group, {}).get(name) if tasks else None, describe(name).digits),
         "comparison": Markup("\n".join(sections)),
         "notes": [*side["notes"], *changes.get("notes", [])],
     }
