@@ -27,60 +27,6 @@ if TYPE_CHECKING:
 
 MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
 
-COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "pixels": ("f", "precision", "recall", "specificity", "accuracy", "gmean"),
-    "boxes": ("f1", "precision", "recall"),
-    "target": ("hit", "iou_0.3", "other_blobs_per_frame"),
-    "tracks": ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
-    "target_track": ("found", "same_identity", "n_switches", "n_fragmentations"),
-    "ranking": ("ap", "log_average_miss_rate", "miss_rate_at_0.1", "miss_rate_at_1"),
-    "still": ("false_blobs_per_frame", "alarmed"),
-    "location": ("located", "belongs"),
-    "metres": ("median_m", "p95_m", "in_ellipse", "relative_median_m", "relative_p95_m", "relative_in_ellipse"),
-}
-TITLES: Mapping[str, str] = {
-    "pixels": "Pixels",
-    "boxes": "Boxes, IoU ≥ 0.5",
-    "target": "One labelled target",
-    "tracks": "Tracks",
-    "target_track": "The labelled target's track, IoU ≥ 0.3",
-    "ranking": "Ranked boxes, IoU ≥ 0.5",
-    "still": "Still clips",
-    "location": "Positions",
-    "metres": "Errors in metres, and share of them inside 95 % ellipses",
-}
-# Headings that fit a terminal of 80 columns beside the clips' names.
-SHORT: Mapping[str, str] = {
-    "f": "F",
-    "f1": "F1",
-    "precision": "prec.",
-    "specificity": "spec.",
-    "accuracy": "acc.",
-    "gmean": "Gmean",
-    "iou_0.3": "IoU ≥ 0.3",
-    "other_blobs_per_frame": "other blobs",
-    "hota": "HOTA",
-    "deta": "DetA",
-    "assa": "AssA",
-    "mota": "MOTA",
-    "idf1": "IDF1",
-    "ar_3": "AR_3",
-    "same_identity": "same identity",
-    "n_switches": "IDsw",
-    "n_fragmentations": "frag.",
-    "ap": "AP",
-    "log_average_miss_rate": "LAMR",
-    "miss_rate_at_0.1": "miss at 0.1",
-    "miss_rate_at_1": "miss at 1",
-    "false_blobs_per_frame": "false blobs",
-    "median_m": "median",
-    "p95_m": "95 %",
-    "in_ellipse": "inside",
-    "relative_median_m": "to team",
-    "relative_p95_m": "95 %",
-    "relative_in_ellipse": "inside",
-}
-
 
 def change_spec(
     file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
@@ -193,7 +139,9 @@ def print_measures(console: "Console", measures: Mapping[str, Any], prefix: str 
 
     prefix: of titles. most: clips in a table, the worst of them if there are more.
     """
-    for group in COLUMNS:
+    from torchvision_dddas.evaluation.metrics.registry import GROUPS
+
+    for group in GROUPS:
         if clips := {name: clip for name, clip in measures["clips"].items() if group in clip}:
             console.print(_table(group, clips, measures, prefix, most or len(clips)))
 
@@ -202,14 +150,16 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
     from rich.markup import escape
     from rich.table import Table
 
-    columns, shown, more = COLUMNS[group], list(clips), ""
+    from torchvision_dddas.evaluation.metrics.registry import GROUPS, describe
+
+    columns, shown, more = GROUPS[group].columns, list(clips), ""
     if len(clips) > most:
-        shown = sorted(clips, key=lambda name: _rank(clips[name][group][columns[0]], group))[:most]
+        shown = sorted(clips, key=lambda name: _rank(clips[name][group][columns[0]], columns[0]))[:most]
         more = f"; the {most} worst of {len(clips)} clips"
-    table = Table(title=f"{prefix}{TITLES[group]}{more}")
+    table = Table(title=f"{prefix}{GROUPS[group].title[0].upper()}{GROUPS[group].title[1:]}{more}")
     table.add_column("clip", no_wrap=True)
-    for column in ("frames", *columns):
-        table.add_column(SHORT.get(column, column), justify="right", no_wrap=True)
+    for heading in ("frames", *(describe(column).short or describe(column).title for column in columns)):
+        table.add_column(heading, justify="right", no_wrap=True)
     for name in shown:
         cells = (format_figure(clips[name][group][c]) for c in columns)
         table.add_row(escape(str(InputError(name))), str(clips[name]["frames"]), *cells)
@@ -224,11 +174,13 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
     return table
 
 
-def _rank(value: float | None, group: str) -> float:
+def _rank(value: float | None, measure: str) -> float:
     """Lowest for the worst clip."""
+    from torchvision_dddas.evaluation.metrics.registry import is_lower_better
+
     if value is None or math.isnan(value):
         return math.inf
-    return -value if group in ("still", "metres") else value
+    return -value if is_lower_better(measure) else value
 
 
 def format_figure(value: float | int | None, sign: str = "") -> str:
