@@ -32,11 +32,11 @@ from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.motion import Masks
+from torchvision_dddas.tuning.motion import MotionFamily
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.registration import family as registration_family
-from torchvision_dddas.tuning.source_association import Affinities
-from torchvision_dddas.tuning.tracking import Identities
+from torchvision_dddas.tuning.registration import RegistrationFamily
+from torchvision_dddas.tuning.source_association import SourceFamily
+from torchvision_dddas.tuning.tracking import TrackingFamily
 
 MOTION = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
@@ -63,7 +63,7 @@ def measure_recovery(options: bench.Options) -> tuple[str, Any]:
             start = scaled(shipped, dict(zip(MOTION, factors.tolist(), strict=True)))
             tuned = start
             for after in (False, True):  # first far from what is right, then with the hard steps after the hulls
-                family, plan = Masks(after=after), Plan(options.steps, 4, 0.15, seed, most_watched=4)
+                family, plan = MotionFamily(after=after), Plan(options.steps, 4, 0.15, seed, most_watched=4)
                 tuned = descend(family, Parameters(tuned, MOTION), family.examples([learned], tuned), plan).settings
             rows.append([measure_f(clip, s) for clip in (learned, other) for s in (shipped, start, tuned)])
         bench.log(seed, np.round(rows[-1], 3))
@@ -90,7 +90,7 @@ def measure_registration(options: bench.Options) -> tuple[str, Any]:
             with tempfile.TemporaryDirectory() as place:
                 numbers = 2 * seed, 2 * seed + 1
                 pair = [film_clip(Path(place), number, SIZE) for number in numbers]
-                start, family = scaled(shipped, dict.fromkeys(TOLERANCES, factor)), registration_family()
+                start, family = scaled(shipped, dict.fromkeys(TOLERANCES, factor)), RegistrationFamily()
                 plan = Plan(options.steps, 4, 0.15, seed, most_watched=4)
                 tuned = descend(family, Parameters(start, TOLERANCES), family.examples(pair[:1], start), plan).settings
                 rows.append(
@@ -188,7 +188,7 @@ def measure_identities(options: bench.Options) -> tuple[str, Any]:
     found = clips.identified_clips(options.data, ("motchallenge", "cvml", "sdd"))
     found = [replace(c, pictures=()) for c in found if c.given is not None or not options.detections]
     plan = Plan(options.steps, 4, 0.2, look_every=8, pull=0.1)
-    return leave_out(options, Identities().at(options.interval, task), Settings(), TRACKING, found, task, plan)
+    return leave_out(options, TrackingFamily().at(options.interval, task), Settings(), TRACKING, found, task, plan)
 
 
 def measure_affinities(options: bench.Options) -> tuple[str, Any]:
@@ -196,7 +196,7 @@ def measure_affinities(options: bench.Options) -> tuple[str, Any]:
     shipped = with_parameters(load_config("paper"), {"paper.window": 2, "paper.rule": "dispersion"})
     found = clips.identified_clips(options.data, ("motchallenge", "cvml"))
     plan = Plan(options.steps, 8, 0.4, look_every=5, most_watched=16)
-    return leave_out(options, Affinities(interval=options.interval), shipped, PAPER, found, "association", plan)
+    return leave_out(options, SourceFamily(interval=options.interval), shipped, PAPER, found, "association", plan)
 
 
 def leave_out(
