@@ -63,7 +63,7 @@ def measure_recovery(options: bench.Options) -> tuple[str, Any]:
             start = scaled(shipped, dict(zip(MOTION, factors.tolist(), strict=True)))
             tuned = start
             for after in (False, True):  # first far from what is right, then with the hard steps after the hulls
-                family, plan = MotionFamily(after=after), Plan(options.steps, 4, 0.15, seed, most_watched=4)
+                family, plan = MotionFamily(with_later_steps=after), Plan(options.steps, 4, 0.15, seed, most_watched=4)
                 tuned = descend(family, Parameters(tuned, MOTION), family.examples([learned], tuned), plan).settings
             rows.append([measure_f(clip, s) for clip in (learned, other) for s in (shipped, start, tuned)])
         bench.log(seed, np.round(rows[-1], 3))
