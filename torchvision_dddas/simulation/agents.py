@@ -1,5 +1,6 @@
 """One moment of a simulated world: where everything is, and what the vehicles say of it."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,7 +181,7 @@ class Agents:
         for row, since, size in gusts:
             if since < _GUST_S:
                 # A spring at rest is by then as fast as the gust.
-                push[:2] += np.e * size / _GUST_S * np.array([np.sin(self._gust[row]), np.cos(self._gust[row])])
+                push[:2] += math.e * size / _GUST_S * np.array([np.sin(self._gust[row]), np.cos(self._gust[row])])
         return (push, 1 + max(size for *_, size in gusts) / 5) if gusts else (None, 1.0)
 
     def _report(self, before: np.ndarray, after: np.ndarray, begin: float, end: float) -> None:
