@@ -87,7 +87,7 @@ class Load:
 
 
 def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
-    """What may be looked at, from everything to the least: knobs by name, the same in each, `sampling.every` the last.
+    """The levels of load, from full to least: the same parameters by name in each, `sampling.every` the last.
 
     First keypoints are halved, then, where people are searched for in regions, a look takes a smaller share of the
     windows, both of which make it cheaper; then only every 2nd, 3rd, ... picture is looked at.
