@@ -62,7 +62,7 @@ def test_what_the_user_should_know_of_his_files_is_said_at_the_start(dddas, fram
     def noting(*given):
         return replace(prepare_run(*given), notes=["bravo has no colour"])
 
-    monkeypatch.setattr("torchvision_dddas.io.run_inputs.prepare_run", noting)
+    monkeypatch.setattr("torchvision_dddas.live.session.prepare_run", noting)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert "dddas: note: bravo has no colour\n" in done.stderr

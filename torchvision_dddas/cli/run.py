@@ -108,7 +108,7 @@ def run(
     given = None if landmarks is None else AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_config(config, set_ or [])
     if live:
-        from torchvision_dddas.cli.live import run_live
+        from torchvision_dddas.live.session import run_live
 
         code = run_live(
             out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet

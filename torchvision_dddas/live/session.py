@@ -1,0 +1,242 @@
+"""One session of `dddas run --live`: the whole path on pictures as they come, for as long as they come."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+from torchvision_dddas.config import LiveParameters, Settings, with_parameters
+from torchvision_dddas.detection import check_length, load_engine
+from torchvision_dddas.io.atomic_files import cannot_write
+from torchvision_dddas.io.output import RESULTS, Event, SessionLog, make_session_folder
+from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
+from torchvision_dddas.io.streams import About, Stream, open_streams
+from torchvision_dddas.io.video import without_secrets
+from torchvision_dddas.live.capture import LiveSource
+from torchvision_dddas.live.health import Health, Snapshot
+from torchvision_dddas.live.load_shedding import LoadShedding
+from torchvision_dddas.live.runner import Feed, RepeatedFailure, Result, record_result, results, send_result
+from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
+from torchvision_dddas.live.status import StatusWriter
+from torchvision_dddas.live.watchdog import HUNG, StopSignals, Supervisor, Watchdog
+from torchvision_dddas.people import PersonTracker, load_scorer
+from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.runtime import VERSION
+from torchvision_dddas.tracking import FrameTracker
+from torchvision_dddas.types import Adjustment, Frame
+
+INTERRUPTED = 130
+"""Exit code of a session that Ctrl-C ended; its outputs are valid."""
+
+_CLEAR = "\r\x1b[K"
+_COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
+
+
+def run_live(
+    out: Path,
+    clip: str,
+    given: AerialInput | None,
+    telemetry: Path | None,
+    interval: int,
+    settings: Settings,
+    backend: str = "auto",
+    emit: Sequence[str] = (),
+    serve: str | None = None,
+    people: bool = False,
+    rate_hz: float | None = None,
+    quiet: bool = False,
+) -> int:
+    """Run until the pictures end or a signal ends it; returns the exit code. Writes a new folder under out.
+
+    Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
+    """
+    address = None if serve is None else parse_address(serve)
+    health, supervisor, live = Health(), Supervisor(), settings.live
+    for name in _COUNTED:  # a count that is there from the start can be distinguished from a missing one
+        health.count(name, 0)
+    with ExitStack() as stack:
+        # What may be wrong at the start is found before the session has a folder.
+        source = stack.enter_context(closing(LiveSource(clip, live, health, rate_hz=rate_hz)))
+        if source.recorded is not None:
+            check_length(source.recorded)
+        ready = prepare_run(given, telemetry, settings, source, backend, clip)
+        begin = build_path(ready, source, people, interval, backend, health)
+        # What streams need to know; the time follows the source's clock.
+        site = None if ready.watch is None else ready.watch.locator.site
+        about = About(time.time())
+        if site is not None:
+            about = About(time.time(), site.origin_deg is not None, site.landmarks.names)
+        opened = stack.enter_context(ExitStack())
+        streams = _open(opened, emit, about, health, live, "--emit")
+        pages = dict[str, Page]()
+        server = None if address is None else HealthServer(address, pages)
+
+        folder = make_session_folder(out)
+        streams = _open(opened, [f"json:{folder / RESULTS}"], about, health, live, "--out") + streams
+        facts = {
+            "input": without_secrets(clip),
+            "telemetry": telemetry,
+            "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
+            "interval_frames": interval,
+            "people": people,
+            "backend": ready.engine.name,
+            "notes": ready.notes,
+        }
+        if given is not None and ready.watch is not None:
+            facts |= {**given.facts, **locator_facts(ready.watch.locator)}
+        log = SessionLog(folder, {**facts, "settings": ready.settings.model_dump()})
+        stack.callback(log.close)
+        status = StatusWriter(health, log, streams, live.status_s)
+        if not quiet:
+            status = StatusWriter(health, log, streams, live.status_s, _print_event, _print_snapshot)
+        try:
+            status.begin()
+        except OSError as error:
+            raise cannot_write(folder / "run.json", error) from None
+        watchdog = Watchdog(health, live.watchdog_s, supervisor)
+        patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
+        pages |= health_pages(health, watchdog, streams, status, without_secrets(clip), VERSION, patience_s)
+
+        feed = Feed(source, health, watchdog, ready.flight)
+
+        def stop(number: int) -> None:
+            """Take no further picture; the run ends once those that were taken are settled."""
+            feed.stop()
+            source.stop()
+
+        signals = stack.enter_context(StopSignals(stop))
+        stack.enter_context(status)
+        stack.enter_context(watchdog)
+        if server is not None:
+            stack.enter_context(server)
+        supervisor.say("READY=1")
+        if not quiet:
+            _print_start(source, folder, server, ready.notes)
+        failure = ""
+        try:
+            for result in results(begin, feed, health):
+                about.start_utc_s = source.start_utc_s
+                send_result(result, streams, health)
+                record_result(result, feed, health, live.deadline_ms)
+            status.state = "complete" if signals.signal is None else "stopped"
+        except RepeatedFailure as error:
+            failure, status.state = str(error), "failed"
+            health.event("run", failure)
+        supervisor.say("STOPPING=1")
+        opened.close()
+    if not quiet:
+        _print(_summarize(health, folder))
+    elif failure:  # --quiet silences events, not errors
+        _print(failure)
+    if failure:
+        return HUNG
+    return INTERRUPTED if signals.signal == signal.SIGINT else 0
+
+
+def build_path(
+    ready: PreparedRun, source: LiveSource, people: bool, interval: int, backend: str, health: Health
+) -> Callable[[Feed], Iterator[Result]]:
+    """The path from frames to results, which begins anew each time that it is called, and sheds load.
+
+    Raises InputError at once for pictures that are too small for people.
+    """
+    settings, scorer = ready.settings, None
+    if people:
+        # To search the whole picture takes as long as many pictures take to arrive.
+        share = min(settings.people.look_share, 0.1)
+        settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
+        scorer = load_scorer(settings.people, backend)
+    shedding = LoadShedding(source, settings, health, people)
+    engines = iter([ready.engine])
+
+    def build_person_tracker() -> PersonTracker | None:
+        if scorer is None:
+            return None
+        tracker = FrameTracker(shedding.settings, interval, source.size, pictures=False)
+        return PersonTracker(scorer, shedding.settings, interval, source.size, tracker)
+
+    build_person_tracker()
+
+    def begin(feed: Feed) -> Iterator[Result]:
+        # After an error nothing that remembers a frame is used again.
+        engine = next(engines, None) or load_engine(backend, shedding.settings)
+        person_tracker = build_person_tracker()
+
+        def retune(frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:
+            settings, adjustments = shedding(frame)
+            if person_tracker is not None and adjustments:
+                person_tracker.retune(settings)
+            return settings, adjustments
+
+        pipeline = Pipeline.from_parts(
+            engine,
+            shedding.settings,
+            None,
+            None if ready.watch is None else ready.watch.restarted(),
+            interval,
+            seen=None if person_tracker is None else person_tracker.update,
+            retune=retune,
+            pictures=False,
+        )
+        for result in pipeline(feed):
+            yield result, None if person_tracker is None else person_tracker.people_of(result.number, feed.ended)
+
+    return begin
+
+
+def _open(
+    opened: ExitStack, texts: Sequence[str], about: About, health: Health, live: LiveParameters, option: str
+) -> list[Stream]:
+    """Streams that are closed when `opened` is. Raises InputError."""
+    streams = open_streams(texts, about, health.event, live.retry_s, live.retry_most_s, option)
+    for stream in streams:
+        opened.callback(stream.close)
+    return streams
+
+
+# Messages go to stderr, because stdout is for streams.
+
+
+def _print(text: str) -> None:
+    clear = _CLEAR if sys.stderr.isatty() else ""
+    sys.stderr.write(f"{clear}dddas: {' '.join(text.split())}\n")
+    sys.stderr.flush()
+
+
+def _print_start(source: LiveSource, folder: Path, server: HealthServer | None, notes: Sequence[str]) -> None:
+    width, height = source.size
+    _print(f"{source.name}, {width}x{height} at {source.rate_hz:g} Hz; into {folder}")
+    if server is not None:
+        _print("status page: http://{}:{}/".format(*server.address))
+    for note in notes:
+        _print(f"note: {note}")
+
+
+def _print_event(event: Event) -> None:
+    _print(f"frame {event.frame}: {event.text}" if event.frame else event.text)
+
+
+def _print_snapshot(now: Snapshot) -> None:
+    """The state in one line, in place of the one before; nothing where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        return
+    late = f", {1000 * now.seconds['latency'][0]:.0f} ms late" if "latency" in now.seconds else ""
+    counts, gauges = now.counts, now.gauges
+    line = (
+        f"{gauges.get('rate_hz', 0.0):.1f} results/s{late}, {gauges.get('targets', 0):g} targets, "
+        f"{counts.get('dropped', 0)} of {counts.get('captured', 0)} pictures dropped"
+    )
+    sys.stderr.write(f"{_CLEAR}{line}")
+    sys.stderr.flush()
+
+
+def _summarize(health: Health, folder: Path) -> str:
+    now = health.snapshot()
+    counts = {name: now.counts.get(name, 0) for name in ("results", "captured", "dropped", "late")}
+    late = f", {1000 * now.seconds['latency'][2]:.0f} ms at 99 %" if "latency" in now.seconds else ""
+    return (
+        f"{counts['results']} results of {counts['captured']} pictures, {counts['dropped']} dropped, "
+        f"{counts['late']} late{late}; {folder}"
+    )
