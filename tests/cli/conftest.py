@@ -1,5 +1,7 @@
-"""Stand-ins for the engine, so that these tests are about the command line alone."""
+"""Stand-ins for the engine, so that these tests are about the command line alone, and readers of what it writes."""
 
+import csv
+import json
 import types
 
 import cv2
@@ -72,6 +74,61 @@ def bad(result):
     assert lines[0].startswith("dddas: ")
     assert "Traceback" not in result.output
     return lines[0]
+
+
+def rows(path):
+    """The rows of a table that was written, each by column name."""
+    with path.open(newline="") as text:
+        return list(csv.DictReader(text))
+
+
+def record(folder):
+    """run.json of a run."""
+    return json.loads((folder / "run.json").read_text())
+
+
+def names(folder):
+    """The names of all files in a folder, sorted."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+class StubScorer:
+    """Every picture's first window shows a person, if anybody is there."""
+
+    name = "stub"
+
+    def __init__(self, parameters, found):
+        self.parameters, self.found = parameters, found
+
+    def scores(self, images, parts):
+        k = self.parameters
+
+        def empty(part):
+            rows, columns = (part.height - k.window_height_px) // 8 + 1, (part.width - k.window_width_px) // 8 + 1
+            return np.full((rows, columns), -1, np.float32)
+
+        maps = [[empty(part) for part in wanted] for wanted in parts]
+        for of_picture in maps:
+            if of_picture and self.found:
+                of_picture[0][0, 0] = 3.0
+        return maps
+
+
+@pytest.fixture
+def scorer(monkeypatch):
+    """Replace the people detector's engine; gives the list of the engines that were loaded."""
+    loaded = []
+
+    def install(found=True):
+        def load(parameters, backend):
+            loaded.append(backend)
+            return StubScorer(parameters, found)
+
+        monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", load)
+        return loaded
+
+    install()
+    return install
 
 
 @pytest.fixture

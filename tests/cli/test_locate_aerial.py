@@ -1,13 +1,17 @@
 """`dddas locate aerial`: what it writes, how near it comes to the truth, and one line for each mistake."""
 
-import csv
-import json
 
 import numpy as np
 import pytest
 
-from tests.cli.conftest import bad
+from tests.cli.conftest import bad, record
+from tests.cli.conftest import rows as read_rows
 from tests.overflight import Overflight
+
+
+def located(result, folder):
+    assert result.exit_code == 0, result.output
+    return read_rows(folder / "positions.csv")
 
 
 @pytest.fixture
@@ -32,16 +36,6 @@ def aerial(dddas, file, tmp_path):
     return run
 
 
-def rows(folder, name="positions.csv"):
-    with (folder / name).open(newline="") as text:
-        return list(csv.DictReader(text))
-
-
-def located(result, folder):
-    assert result.exit_code == 0, result.output
-    return rows(folder)
-
-
 def test_exact_input_puts_every_target_where_it_is(aerial, tmp_path):
     flight = Overflight()
     found = located(aerial(flight), tmp_path / "out")
@@ -52,23 +46,6 @@ def test_exact_input_puts_every_target_where_it_is(aerial, tmp_path):
     way = (flight.targets(2) - flight.targets(1)) * flight.rate_hz
     velocity = np.array([[float(row["velocity_east_m_s"]), float(row["velocity_north_m_s"])] for row in last])
     np.testing.assert_allclose(velocity, way, atol=0.1)
-
-
-def test_a_landmark_without_reports_is_where_its_waypoints_say(aerial, tmp_path):
-    """Landmarks alone, four of them: without the plan of the one nothing could be located."""
-    flight = Overflight()
-    header, *lines = flight.landmarks_csv().splitlines()
-    told = [f"{header},planned"]
-    for line in lines:
-        frame, name, u, v, longitude, latitude, sigma = line.split(",")
-        silent = name == "ugv0"
-        told.append(",".join([frame, name, u, v, *(("", "") if silent else (longitude, latitude)), sigma, "0"]))
-        if silent and frame in ("1", "10"):
-            told.append(f"{frame},{name},,,{longitude},{latitude},{sigma},1")
-    found = located(aerial(flight, landmarks="\n".join(told) + "\n", telemetry=None), tmp_path / "out")
-    assert len(found) == 40
-    # The run's metres begin at the first place in the table, here the plan's: the same.
-    assert flight.errors(found).max() < 0.001
 
 
 @pytest.mark.slow
@@ -99,7 +76,7 @@ def test_a_homography_needs_neither_camera_nor_size(aerial, tmp_path):
     )
     assert flight.errors(found).max() < 0.001
     assert {row["by"] for row in found} == {"homography"}
-    assert any("no --rate" in note for note in json.loads((tmp_path / "out" / "run.json").read_text())["notes"])
+    assert any("no --rate" in note for note in record(tmp_path / "out")["notes"])
 
 
 def test_the_foot_of_a_body_is_found_below_its_middle(aerial, tmp_path):
@@ -155,8 +132,8 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(aerial, tmp_path):
     result = aerial(flight, landmarks=few, telemetry=None)
     found = located(result, tmp_path / "out")
     assert {int(row["frame"]) for row in found} == set(range(1, 11)) - {4}
-    record = json.loads((tmp_path / "out" / "run.json").read_text())
-    (gap,) = record["unreliable"]
+    kept = record(tmp_path / "out")
+    (gap,) = kept["unreliable"]
     assert (gap["first"], gap["last"]) == (4, 4)
     assert "3 landmarks" in gap["cause"]
     assert "1 missing" in gap["cause"]

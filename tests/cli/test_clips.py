@@ -1,0 +1,403 @@
+"""`dddas detect`, `people`, `track` and `run` on clips: what they write, valid clips that are odd, and faulty ones."""
+
+import json
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.cli.conftest import bad, names, record, rows
+from tests.synthetic_clip import render
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.detection_tables import read_detections
+
+ROOT = Path(__file__).resolve().parents[2]
+WINDOW = tuple(
+    word
+    for parameter in ("window_width_px=16", "window_height_px=32", "padding_px=0", "enlarge=1.0")
+    for word in ("--set", f"people.{parameter}")
+)
+COMMANDS = {"detect": (), "people": WINDOW, "track": (), "run": ()}
+TABLES = {"detect": "detections", "people": "detections", "track": "tracks", "run": "tracks"}
+every_command = pytest.mark.parametrize("command", COMMANDS)
+
+
+def walker(frames, x=4.0):
+    return "".join(f"{n},-1,{x + n:.3f},10,8,24,0.95,-1,-1,-1\n" for n in frames)
+
+
+@pytest.fixture
+def table(file):
+    return lambda text=None: file("det.txt", walker(range(1, 6)) if text is None else text)
+
+
+def tracks(folder):
+    text = (folder / "tracks.txt").read_text()
+    return np.array([[float(v) for v in line.split(",")] for line in text.splitlines()]).reshape(-1, 10)
+
+
+def film(folder):
+    """Frames and rate of the overlay."""
+    overlay = cv2.VideoCapture(str(folder / "overlay.mp4"))
+    return overlay.get(cv2.CAP_PROP_FRAME_COUNT), overlay.get(cv2.CAP_PROP_FPS)
+
+
+# What all four do.
+
+
+@every_command
+def test_quiet_says_nothing_and_save_none_writes_tables_alone(dddas, engine, scorer, clip, tmp_path, command):
+    out = tmp_path / "out"
+    result = dddas(command, clip, *COMMANDS[command], "--out", out, "--save", "none", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+    assert {f"{TABLES[command]}.csv", f"{TABLES[command]}.txt", "run.json"} <= set(names(out))
+    assert not {"masks", "overlay.mp4", "report.html"} & set(names(out))
+    assert [row.split(",")[0] for row in (out / f"{TABLES[command]}.txt").read_text().splitlines()] == list("12345")
+
+
+@every_command
+def test_a_frame_that_cannot_be_decoded_is_reported_and_recorded(dddas, engine, scorer, clip, tmp_path, command):
+    (clip / "00002.png").write_bytes(b"no picture")
+    result = dddas(command, clip, *COMMANDS[command], "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "1 problem while reading, the first: frame 3" in result.stdout
+    assert len(record(tmp_path / "out")["problems"]) == 1
+    assert film(tmp_path / "out")[0] == (5 if command == "people" else 4)  # the stand-in for detection skips it
+
+
+@every_command
+def test_parameters_are_set_and_recorded(dddas, engine, scorer, clip, tmp_path, command):
+    words = ("--set", "registration.keypoints=77", "--config", "fast", "--save", "none", "--quiet")
+    assert dddas(command, clip, *COMMANDS[command], *words, "--out", tmp_path / "out").exit_code == 0
+    assert record(tmp_path / "out")["settings"]["registration"]["keypoints"] == 77
+
+
+@pytest.mark.parametrize("command", ["detect", "people"])
+def test_several_clips_get_a_folder_each_and_share_one_engine(dddas, engine, scorer, clip, tmp_path, command):
+    loaded = scorer()
+    words = (*COMMANDS[command], "--out", tmp_path / "out", "--save", "none", "--quiet")
+    assert dddas(command, clip, clip, *words).exit_code == 0
+    assert names(tmp_path / "out") == ["walk", "walk-2"]
+    assert loaded == (["auto"] if command == "people" else [])
+
+
+def test_a_clip_in_which_nothing_is_found_has_empty_tables(dddas, engine, scorer, clip, tmp_path):
+    engine(found=False)
+    scorer(found=False)
+    for command in ("detect", "people"):
+        out = tmp_path / command
+        assert dddas(command, clip, *COMMANDS[command], "--out", out, "--quiet").exit_code == 0
+        assert (out / "detections.txt").read_text() == ""
+        for given in ([clip], ["--detections", out / "detections.csv"]):
+            assert dddas("track", *given, "--out", tmp_path / "out", "--quiet", "--save", "none").exit_code == 0
+            assert (tmp_path / "out/tracks.txt").read_text() == ""
+            assert (tmp_path / "out/tracks.csv").read_text().count("\n") == 1
+
+
+# Detect.
+
+
+def test_detect_saves_everything_by_default_and_sums_up(dddas, engine, clip, tmp_path):
+    result = dddas("detect", clip, "--out", tmp_path / "out", "--backend", "onboard")
+    assert result.stdout.splitlines() == [
+        "5 frames, 5 targets, 1 frames with unreliable registration",
+        f"{tmp_path / 'out'}: detections.csv, detections.txt, masks/, overlay.mp4, run.json",
+    ]
+    assert names(tmp_path / "out/masks") == [f"{k:06d}.png" for k in range(1, 6)]
+    kept = record(tmp_path / "out")
+    assert (kept["state"], kept["backend"], kept["clip"]["size"]) == ("complete", "stub onboard", [64, 48])
+    assert kept["unreliable"] == [{"first": 2, "last": 2, "cause": "blank"}]
+
+
+def test_an_error_that_the_engine_raises_is_one_line(dddas, engine, clip, tmp_path):
+    def stop(scene):
+        raise InputError("the clip has 1 frame;\nthe window needs 3: 2 are missing")
+
+    engine(after=stop)
+    assert "the window needs 3: 2 are missing" in bad(dddas("detect", clip, "--out", tmp_path / "out", "--quiet"))
+    assert not (tmp_path / "out/detections.txt").exists()
+
+
+# People.
+
+
+def test_people_in_a_clip_give_tables_a_film_and_a_record(dddas, scorer, clip, tmp_path):
+    result = dddas("people", clip, *WINDOW, "--out", tmp_path / "out", "--rate", 5)
+    assert result.stdout.splitlines() == [
+        "5 frames, 5 people",
+        f"{tmp_path / 'out'}: detections.csv, detections.txt, overlay.mp4, run.json",
+    ]
+    assert film(tmp_path / "out") == (5, 5)
+    kept = record(tmp_path / "out")
+    assert (kept["state"], kept["backend"], kept["targets"]) == ("complete", "stub", 5)
+    assert kept["searched"]["frames_everywhere"] == 5
+    assert set(kept["seconds"]["stages"]) == {"read", "plan", "score", "people"}
+
+
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_picture_of_any_depth_and_colour_gives_a_picture(dddas, scorer, tmp_path, channels, depth):
+    shape = (140, 90) if channels == 1 else (140, 90, channels)
+    image = np.random.default_rng(0).integers(0, np.iinfo(depth).max, shape, dtype=depth)
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    result = dddas("people", tmp_path / "a.png", "--out", tmp_path / "out")
+    assert result.stdout.startswith("1 frame, 1 person")
+    overlay = cv2.imread(str(tmp_path / "out/overlay.png"))
+    assert overlay is not None and overlay.shape == (140, 90, 3)
+
+
+@pytest.mark.parametrize("name", ["detections.txt", "detections.csv"])
+def test_track_and_evaluate_take_the_tables_of_people(dddas, scorer, clip, tmp_path, name):
+    dddas("people", clip, *WINDOW, "--out", tmp_path / "out", "--quiet")
+    found = tmp_path / "out" / name
+    assert dddas("track", "--detections", found, "--out", tmp_path / "tracks", "--quiet").exit_code == 0
+    truth = tmp_path / "gt.txt"
+    boxes = read_detections(found).box_px
+    truth.write_text("".join(f"{n},1,{x},{y},{w},{h},1,1,1\n" for n, (x, y, w, h) in enumerate(boxes, start=1)))
+    for folder, kind, measure in (("out", "boxes", "f1"), ("tracks", "tracks", "idf1")):
+        assert dddas("evaluate", truth, tmp_path / folder, "--out", tmp_path / "scores").exit_code == 0
+        (scores,) = json.loads((tmp_path / "scores/metrics.json").read_text())["clips"].values()
+        assert scores[kind][measure] == pytest.approx(1)
+
+
+def test_around_a_table_only_its_frames_are_searched(dddas, scorer, clip, file, tmp_path):
+    table = file("det.csv", "frame,x_px,y_px,width_px,height_px\n2,20,10,10,24\n4,20,10,10,24\n")
+    words = (*WINDOW, "--out", tmp_path / "out", "--save", "none")
+    result = dddas("people", clip, "--around", table, *words)
+    assert [row["frame"] for row in rows(tmp_path / "out/detections.csv")] == ["2", "4"]
+    assert f"note: 3 of 5 frames were not searched: {table} has no box there that a window fits" in result.stdout
+    kept = record(tmp_path / "out")
+    assert (kept["searched"]["frames_nowhere"], kept["searched"]["frames_in_regions"]) == (3, 2)
+    result = dddas("people", clip, "--around", file("none.txt", ""), *words)
+    assert "5 frames were not searched" in result.stdout and "holds no rows" in result.stdout
+
+
+def test_in_regions_the_share_of_windows_is_reported_and_recorded_with_its_cause(dddas, scorer, clip, tmp_path):
+    words = (*WINDOW, "--set", "people.search=regions", "--set", "people.rescan_frames=3", "--save", "none")
+    result = dddas("people", clip, *words, "--out", tmp_path / "out")
+    assert "% of the windows searched" in result.stdout
+    kept = record(tmp_path / "out")
+    assert kept["searched"]["frames_everywhere"] == 1
+    assert kept["adjustments"][0]["cause"] == "1 person expected"
+
+
+@pytest.mark.parametrize("backend", ["torch", "onboard"])
+def test_each_engine_runs_and_finds_nobody_in_noise(dddas, tmp_path, backend):
+    noise = np.random.default_rng(0).integers(0, 255, (150, 100, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.jpg"), noise)
+    result = dddas("people", tmp_path / "photo.jpg", "--backend", backend, "--out", tmp_path / "out")
+    assert result.stdout.startswith("1 frame, 0 people")
+    assert record(tmp_path / "out")["backend"] == backend
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")
+@pytest.mark.parametrize("search", ["everywhere", "regions"])
+def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(search, tmp_path):
+    """A film besides takes 35 MB more: PyAV and its encoder."""
+    for name in ("1.png", "2.png"):
+        image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / name), image)
+    program = """
+        import json, sys
+        from pathlib import Path
+        import cv2
+        import torchvision_dddas.cli
+
+        cv2.setNumThreads(2)
+        try:
+            torchvision_dddas.cli.main()
+        except SystemExit as stop:
+            lines = Path("/proc/self/status").read_text().splitlines()
+            peak_mb = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+            print(json.dumps([stop.code, peak_mb, [name for name in ("scipy", "torch") if name in sys.modules]]))
+    """
+    chosen = ["--set", f"people.search={search}", "--set", "people.scale_step=1.2", "--save", "none", "--quiet"]
+    words = [sys.executable, "-c", textwrap.dedent(program), "people", str(tmp_path), *chosen]
+    words += ["--out", str(tmp_path / "out")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    code, peak_mb, loaded = json.loads(done.stdout)
+    assert not code and loaded == []
+    assert peak_mb < 150
+
+
+# Track.
+
+
+def test_a_table_alone_gives_tables_and_a_record_without_a_film(dddas, table, tmp_path):
+    result = dddas("track", "--detections", table(), "--out", tmp_path / "out")
+    assert result.stdout.splitlines() == [
+        "5 frames, 5 detections, 1 identities, 0 detections without one",
+        f"{tmp_path / 'out'}: tracks.csv, tracks.txt, run.json",
+    ]
+    assert names(tmp_path / "out") == ["run.json", "tracks.csv", "tracks.txt"]
+    made = tracks(tmp_path / "out")
+    assert made[:, 0].tolist() == [1, 2, 3, 4, 5]
+    assert len(set(made[:, 1])) == 1
+    assert np.array_equal(made[:, 2:6], [[4 + n, 10, 8, 24] for n in range(1, 6)])
+    kept = record(tmp_path / "out")
+    assert (kept["state"], kept["frames"]["written"], kept["identities"], kept["untracked"]) == ("complete", 5, 1, 0)
+    assert kept["rows"] == {"given": 5, "used": 5}
+    assert (kept["clip"], kept["backend"], kept["outputs"]) == (None, None, ["tables"])
+
+
+def test_a_clip_with_a_table_gives_a_film_of_the_sampled_frames(dddas, clip, table, tmp_path):
+    words = ("--detections", table(), "--interval", 2, "--out", tmp_path / "out", "--rate", 8)
+    result = dddas("track", clip, *words)
+    assert "note: 2 of 5 rows lie on frames that --interval 2 leaves out" in result.stdout
+    assert film(tmp_path / "out") == (3, 4)
+    assert tracks(tmp_path / "out")[:, 0].tolist() == [1, 3, 5]
+    kept = record(tmp_path / "out")
+    assert kept["rows"] == {"given": 5, "used": 3}
+    assert (kept["interval_frames"], kept["backend"], kept["clip"]["size"]) == (2, "onboard", [64, 48])
+
+
+def test_the_tables_of_detect_can_be_tracked_as_text_and_as_csv(dddas, engine, clip, tmp_path):
+    dddas("detect", clip, "--out", tmp_path / "found", "--quiet")
+    for name in ("detections.txt", "detections.csv"):
+        words = ("--detections", tmp_path / "found" / name, "--out", tmp_path / name, "--quiet")
+        assert dddas("track", *words).exit_code == 0
+        assert len(tracks(tmp_path / name)) == 5
+    assert (tmp_path / "detections.txt/tracks.txt").read_text() == (tmp_path / "detections.csv/tracks.txt").read_text()
+
+
+def test_moving_targets_of_a_csv_get_identities_however_low_their_scores(dddas, clip, table, tmp_path):
+    header = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
+    text = header + "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
+    for words in ((), (clip,)):
+        result = dddas("track", *words, "--detections", table(text), "--out", tmp_path / "out", "--save", "none")
+        assert "5 detections, 1 identities, 0 detections without one" in result.stdout
+        assert "note: all rows are moving targets of dddas detect" in result.stdout
+        assert tracks(tmp_path / "out")[:, 6].tolist() == [0.41] * 5
+
+
+def test_scores_that_are_no_probabilities_are_reported_and_kept(dddas, table, tmp_path):
+    text = walker(range(1, 6)).replace("0.95", "43.332")
+    result = dddas("track", "--detections", table(text), "--out", tmp_path / "out")
+    assert "note: scores from 43.332 to 43.332 are no probabilities" in result.stdout
+    assert set(tracks(tmp_path / "out")[:, 6]) == {43.332}
+
+
+def test_rows_without_an_identity_are_counted_and_stay_in_the_csv(dddas, table, tmp_path):
+    text = walker(range(1, 6)) + walker(range(1, 6), x=40).replace("0.95", "0.05")
+    result = dddas("track", "--detections", table(text), "--out", tmp_path / "out")
+    assert "10 detections, 1 identities, 5 detections without one" in result.stdout
+    assert (tmp_path / "out/tracks.csv").read_text().count("untracked") == 5
+    assert len(tracks(tmp_path / "out")) == 5
+
+
+def test_the_record_of_a_table_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
+    text = walker(range(501, 560), x=0) + walker(range(502, 560), x=40)
+    dddas("track", "--detections", table(text), "--interval", 2, "--out", tmp_path / "out", "--quiet")
+    kept = record(tmp_path / "out")
+    assert (kept["first_frame"], kept["last_frame"], kept["frames"]["written"]) == (501, 559, 30)
+    assert kept["identities"] == len(set(tracks(tmp_path / "out")[:, 1])) == 2
+
+
+def test_a_clip_cut_short_ends_with_a_note_and_keeps_the_rows_after_it(dddas, table, tmp_path):
+    """A Matroska file does not count its frames: what it announces is no reason to refuse a table."""
+    path = tmp_path / "clip.mkv"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for k in range(8):
+        writer.write(np.full((48, 64, 3), 60 + k, np.uint8))
+    writer.release()
+    result = dddas("track", path, "--detections", table(walker(range(1, 13))), "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: the clip ended after frame 8, the table goes on to 12" in result.stdout
+    assert tracks(tmp_path / "out")[:, 0].tolist() == list(range(1, 13))
+
+
+# Odd and faulty clips, with the true engine.
+
+
+def grey16(image):
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.uint16) * 16
+
+
+def small(width, height):
+    return lambda image: cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return render(0, 9, (240, 180)).images
+
+
+@pytest.fixture
+def folder(tmp_path):
+    def write(images):
+        (tmp_path / "frames").mkdir()
+        for number, image in enumerate(images, 1):
+            cv2.imwrite(str(tmp_path / f"frames/{number:05d}.png"), image)
+        return tmp_path / "frames"
+
+    return write
+
+
+@pytest.fixture
+def detected(dddas, tmp_path):
+    """Detect, expect success, and give the record and the masks."""
+
+    def detect(clip, *words):
+        result = dddas("detect", clip, "--out", tmp_path / "out", "--quiet", *words)
+        assert (result.exit_code, result.output) == (0, "")
+        masks = [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in sorted((tmp_path / "out/masks").iterdir())]
+        return record(tmp_path / "out"), masks
+
+    return detect
+
+
+ODD = {
+    "16-bit grey": (grey16, (180, 240)),
+    "portrait": (lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE), (240, 180)),
+    "odd sides": (small(101, 67), (67, 101)),
+    "8x8": (small(8, 8), (8, 8)),
+    "a strip": (small(90, 3), (3, 90)),
+    "one pixel": (small(1, 1), (1, 1)),
+}
+
+
+@pytest.mark.parametrize("config", [(), ("--config", "fast"), ("--config", "source")])
+@pytest.mark.parametrize(("change", "shape"), ODD.values(), ids=ODD)
+def test_any_depth_and_size_gives_a_mask_for_every_frame(folder, detected, images, change, shape, config):
+    kept, masks = detected(folder([change(image) for image in images]), *config)
+    assert kept["frames"]["written"] == 9
+    assert [mask.shape for mask in masks] == [shape] * 9
+    if change is grey16 and not config:
+        assert any(mask.any() for mask in masks)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(("change", "shape"), ODD.values(), ids=ODD)
+def test_clips_of_any_size_and_depth_can_be_tracked(dddas, folder, images, table, tmp_path, change, shape, given):
+    words = ("--detections", table()) if given else ()
+    clip = folder([change(image) for image in images[:6]])
+    result = dddas("track", clip, *words, "--out", tmp_path / "out", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+    assert record(tmp_path / "out")["frames"]["written"] == film(tmp_path / "out")[0] == 6
+    assert (tmp_path / "out/tracks.csv").read_text().count("\n") >= 1 + 5 * given
+
+
+@pytest.mark.parametrize("numbers", [(4,), (8, 9), (3, 4, 9)])
+def test_undecodable_frames_get_empty_masks_and_are_recorded(folder, detected, images, numbers):
+    clip = folder(images)
+    for number in numbers:
+        (clip / f"{number:05d}.png").write_bytes(b"no picture")
+    kept, masks = detected(clip, "--config", "fast")
+    assert len(masks) == 9
+    assert not any(masks[number - 1].any() for number in numbers)
+    assert len(kept["problems"]) == len(numbers)
+    lost = [n for row in kept["unreliable"] for n in range(row["first"], row["last"] + 1)]
+    assert set(numbers) <= set(lost)
+
+
+def test_a_frame_of_another_size_late_in_a_clip_leaves_nothing_that_looks_whole(dddas, folder, images, tmp_path):
+    clip = folder([*images, *images[::-1], small(200, 150)(images[0])])
+    line = bad(dddas("detect", clip, "--out", tmp_path / "out", "--quiet", "--config", "fast"))
+    assert "200x150" in line and "240x180" in line
+    assert record(tmp_path / "out")["state"] == "failed"
+    assert not set(names(tmp_path / "out")) - {"run.json", "masks"}
