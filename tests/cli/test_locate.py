@@ -1,12 +1,11 @@
 """`dddas locate ground`: what it writes, and one line for each mistake."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
 
-from tests.cli.conftest import bad
+from tests.cli.conftest import bad, record, rows
 from tests.upright import boxes, camera
 from torchvision_dddas.io.ground_tables import read_positions
 
@@ -25,11 +24,6 @@ def tracks(cam, place=(0.0, 0.0), frames=(1, 2, 3), identities=(4, 8)):
         for identity, box in zip(identities, boxes(walked(frame), 1.75, cam, place), strict=True):
             lines.append(",".join([f"{frame},{identity}", *(f"{v:.6f}" for v in box), "0.9"]))
     return "\n".join(lines) + "\n"
-
-
-def rows(path):
-    with path.open(newline="") as text:
-        return list(csv.DictReader(text))
 
 
 def test_tracks_become_positions_with_covariances(dddas, file, tmp_path):
@@ -55,11 +49,11 @@ def test_tracks_become_positions_with_covariances(dddas, file, tmp_path):
     assert (first["camera"], first["target"], first["by"], first["cut"]) == ("c", "4", "both", "0")
     assert float(first["distance_m"]) == pytest.approx(np.hypot(1, 10.1), abs=1e-3)
     assert float(first["bearing_deg"]) == pytest.approx(360 - np.degrees(np.arctan(1 / 10.1)), abs=1e-3)
-    record = json.loads((out / "run.json").read_text())
-    assert (record["state"], record["people"], record["sightings"]["both"]) == ("complete", 6, 6)
+    kept = record(out)
+    assert (kept["state"], kept["people"], kept["sightings"]["both"]) == ("complete", 6, 6)
 
 
-def test_a_place_in_degrees_gives_a_map(dddas, file, tmp_path):
+def test_a_place_in_degrees_gives_a_map_which_a_run_without_one_removes(dddas, file, tmp_path):
     text = CAMERA + "longitude_deg = -110.95\nlatitude_deg = 32.23\n"
     out = tmp_path / "out"
     result = dddas("locate", "ground", file("t.csv", tracks(camera())), "--camera", file("c.toml", text), "--out", out)
@@ -74,6 +68,8 @@ def test_a_place_in_degrees_gives_a_map(dddas, file, tmp_path):
     assert degrees is not None
     assert np.allclose(feature["geometry"]["coordinates"], degrees[::2], atol=1e-8)
     assert abs(degrees[0, 0] + 110.95) < 1e-4 and 0 < degrees[0, 1] - 32.23 < 2e-4
+    again = dddas("locate", "ground", tmp_path / "t.csv", "--camera", file("m.toml", CAMERA), "--out", out)
+    assert not (out / "tracks.geojson").exists() and "geojson" not in again.stdout
 
 
 def test_a_line_of_the_map_is_cut_at_180_degrees(dddas, file, tmp_path):
@@ -88,15 +84,6 @@ def test_a_line_of_the_map_is_cut_at_180_degrees(dddas, file, tmp_path):
     assert west[-1][0] == 180 and east[0][0] == -180 and west[-1][1] == east[0][1]
     assert 179 < west[0][0] < 180 and -180 < east[-1][0] < -179
     assert min(west[0][1], east[-1][1]) <= east[0][1] <= max(west[0][1], east[-1][1])
-
-
-def test_the_map_of_an_earlier_run_does_not_stay_beside_a_run_without_one(dddas, file, tmp_path):
-    table, out = file("t.csv", tracks(camera())), tmp_path / "out"
-    degrees = file("d.toml", CAMERA + "longitude_deg = 10\nlatitude_deg = 50\n")
-    dddas("locate", "ground", table, "--camera", degrees, "--out", out)
-    assert (out / "tracks.geojson").exists()
-    result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", out)
-    assert not (out / "tracks.geojson").exists() and "geojson" not in result.stdout
 
 
 @pytest.mark.parametrize("name", ["circle", "x" * 300])
@@ -124,14 +111,9 @@ def test_two_cameras_give_the_fused_places_and_what_each_alone_says(dddas, file,
     found = read_positions(out / "positions.csv")
     assert np.allclose(found.east_north_m[:2], walked(1), atol=1e-3)
     assert [row["camera"] for row in rows(out / "sightings.csv")][:4] == ["south", "south", "west", "west"]
-
-
-def test_cameras_of_one_name_are_told_apart(dddas, file, tmp_path):
-    table, toml = file("t.csv", tracks(camera(), frames=(1,))), file("c.toml", CAMERA + 'name = "left, low"\n')
-    words = ("--camera", toml, "--camera", toml, "--out", tmp_path / "out")
-    assert dddas("locate", "ground", table, table, *words).exit_code == 0
-    found = [row["camera"] for row in rows(tmp_path / "out/sightings.csv")]
-    assert found == ["left, low-1"] * 2 + ["left, low-2"] * 2
+    words = [word for _ in "ab" for word in ("--camera", file("c.toml", CAMERA + 'name = "left, low"\n'))]
+    assert dddas("locate", "ground", tmp_path / "a.csv", tmp_path / "a.csv", *words, "--out", out).exit_code == 0
+    assert {row["camera"] for row in rows(out / "sightings.csv")} == {"left, low-1", "left, low-2"}
 
 
 def test_poses_move_the_camera(dddas, file, tmp_path):
@@ -143,7 +125,7 @@ def test_poses_move_the_camera(dddas, file, tmp_path):
     assert np.allclose(found.east_north_m[::2, 0], [99, 100, 101], atol=1e-3)
 
 
-def test_whoever_has_no_distance_is_told_of(dddas, file, tmp_path):
+def test_sightings_without_a_distance_are_counted(dddas, file, tmp_path):
     table = file("t.csv", "frame,x_px,y_px,width_px,height_px,cut\n1,600,700,150,260,1\n1,600,400,40,160,0\n")
     result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
@@ -161,5 +143,4 @@ def test_a_table_without_rows_gives_empty_tables(dddas, file, tmp_path):
     assert "note: the tables have no rows: nobody to locate" in result.stdout
     assert len(read_positions(tmp_path / "out/positions.csv")) == 0
     assert json.loads((tmp_path / "out/tracks.geojson").read_text())["features"] == []
-    record = json.loads((tmp_path / "out/run.json").read_text())
-    assert (record["state"], record["people"]) == ("complete", 0)
+    assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["people"]) == ("complete", 0)

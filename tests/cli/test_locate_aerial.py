@@ -1,6 +1,5 @@
 """`dddas locate aerial`: what it writes, how near it comes to the truth, and one line for each mistake."""
 
-
 import numpy as np
 import pytest
 

@@ -1,11 +1,9 @@
 """`dddas run sim:SCENARIO`: a closed loop from the command line, its files and the truth beside them."""
 
-import csv
-import json
-
 import numpy as np
 import pytest
 
+from tests.cli.conftest import record, rows
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry
 from torchvision_dddas.io.ground_tables import read_positions
@@ -26,23 +24,10 @@ def made(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("flown")
     path = scenario(folder / "tiny.toml", fault=FAULTS)
-    words = [
-        "run",
-        f"sim:{path}",
-        "--out",
-        str(folder / "out"),
-        "--save",
-        "report,truth",
-        "--set",
-        "steering.sampling=false",
-    ]
-    result = CliRunner().invoke(app, words)
+    words = ["run", f"sim:{path}", "--out", str(folder / "out"), "--save", "report,truth"]
+    result = CliRunner().invoke(app, [*words, "--set", "steering.sampling=false"])
     assert result.exit_code == 0, result.output
     return folder / "out", result.stdout
-
-
-def rows(path):
-    return list(csv.DictReader(path.open()))
 
 
 def test_results_and_truth_are_places_on_the_same_earth(made):
@@ -78,10 +63,10 @@ def test_the_log_tells_what_the_run_itself_noticed(made):
 
 def test_the_record_says_how_good_it_was(made):
     folder, said = made
-    record = json.loads((folder / "run.json").read_text())
-    assert record["state"] == "complete"
-    assert record["frames"]["written"] == 24
-    assert record["truth_score"]
+    kept = record(folder)
+    assert kept["state"] == "complete"
+    assert kept["frames"]["written"] == 24
+    assert kept["truth_score"]
     assert "crowds: " in said
 
 
@@ -101,7 +86,7 @@ def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dd
     path = scenario(tmp_path / "tiny.toml")
     result = dddas("run", f"sim:{path}", "--out", out, "--save", "truth", "--quiet", "--set", "steering.sampling=false")
     assert result.exit_code == 130
-    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+    assert record(out)["state"] == "interrupted"
     assert max(int(row["frame"]) for row in rows(out / "truth" / "positions.csv")) == 6
     assert len(rows(out / "fixes.csv")) == 6
 

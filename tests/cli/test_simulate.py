@@ -1,12 +1,11 @@
 """`dddas simulate`: files in the very formats that the other commands read."""
 
-import csv
-import json
 import tomllib
 
 import numpy as np
 import pytest
 
+from tests.cli.conftest import record, rows
 from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry, open_video
 from torchvision_dddas.evaluation.metrics import truth as judges
@@ -39,15 +38,11 @@ def test_the_pictures_are_a_clip_that_keeps_its_numbers(made):
     frames = list(source)
     assert [f.number for f in frames] == [n for n in range(1, 21) if n not in (6, 7)]
     assert source.size == (160, 120)
+    assert len(list(open_video(folder / "clip.mp4"))) == 20
     assert len(source.problems) == 2
     run = {f.number: f.image for f in open_video(f"sim:{folder / 'scenario.toml'}")}
     apart = np.abs(frames[0].image.astype(int) - run[1])
     assert apart.mean() < 3  # what JPEG takes away
-
-
-def test_the_film_has_a_picture_for_every_frame(made):
-    folder, _ = made
-    assert len(list(open_video(folder / "clip.mp4"))) == 20
 
 
 def test_the_scenario_is_written_as_it_was_run(made):
@@ -69,29 +64,12 @@ def test_reports_are_read_and_true(made):
     assert ("ugv1", 9.0) in said
     assert ("ugv1", 13.0) not in said  # its receiver is silent
     assert ("ugv2", 13.0) in said
-    true = [r for r in csv.DictReader((folder / "truth" / "positions.csv").open()) if r["kind"] == "ugv"][:4]
+    true = [r for r in rows(folder / "truth" / "positions.csv") if r["kind"] == "ugv"][:4]
     first = np.flatnonzero((landmarks.frame == 1) & ~landmarks.planned)
     places = np.array([[float(r["longitude_deg"]), float(r["latitude_deg"])] for r in true])
     origin = float(places[0, 0]), float(places[0, 1])
     apart = geometry.east_north(landmarks.place[first], origin) - geometry.east_north(places, origin)
     assert np.abs(apart).max() < 0.02
-
-
-def test_telemetry_is_read(made):
-    folder, _ = made
-    flown = read_telemetry(folder / "telemetry.csv")
-    assert len(flown) == 20
-    assert flown.geographic
-    assert np.isfinite(flown.altitude_m).all()
-    assert np.degrees(flown.hfov_rad) == pytest.approx(60)
-
-
-def test_camera_and_colours_are_read(made):
-    folder, _ = made
-    camera = read_camera(folder / "camera.toml")
-    assert camera.size_px == (160, 120)
-    assert camera.focal_px[0] == pytest.approx(80 / np.tan(np.radians(30)))
-    assert read_colours(folder / "colours.toml").names == ("ugv1", "ugv2", "ugv3", "ugv4")
 
 
 def test_the_elevation_is_that_of_the_world(made):
@@ -114,16 +92,11 @@ def test_what_ground_vehicles_saw_has_the_poses_that_they_report(made):
     table = read_poses(folder / "ground" / "ugv2" / "poses.csv")
     pictures = list(open_video(folder / "ground" / "ugv2"))
     assert [p.number for p in pictures] == table.at.tolist() == [1, 2, 3, 4]
-    assert [int(r["aerial_frame"]) for r in csv.DictReader((folder / "ground" / "ugv2" / "poses.csv").open())] == [
-        1,
-        6,
-        11,
-        16,
-    ]
+    assert [row["aerial_frame"] for row in rows(folder / "ground/ugv2/poses.csv")] == ["1", "6", "11", "16"]
     camera, poses = geometry.poses_at(camera, table, np.array([1, 4]))
     assert camera.geographic
     true = read_positions(folder / "truth" / "positions.csv")
-    vehicles = [r for r in csv.DictReader((folder / "truth" / "positions.csv").open()) if r["kind"] == "ugv"]
+    vehicles = [r for r in rows(folder / "truth" / "positions.csv") if r["kind"] == "ugv"]
     number = int(vehicles[1]["target"])
     assert true.lonlat_deg is not None
     lon, lat = true.lonlat_deg[(true.target == number) & (true.frame == 16)][0].tolist()
@@ -145,11 +118,11 @@ def test_the_truth_is_read_by_its_judges(made):
 
 def test_the_record_tells_what_happened(made):
     folder, said = made
-    record = json.loads((folder / "run.json").read_text())
-    assert record["state"] == "complete"
-    assert (record["frames"]["written"], record["dropped"]) == (20, 2)
-    assert [e["frame"] for e in record["events"]]
-    assert record["scenario"]["clip"]["seconds"] == 2
+    kept = record(folder)
+    assert kept["state"] == "complete"
+    assert (kept["frames"]["written"], kept["dropped"]) == (20, 2)
+    assert [e["frame"] for e in kept["events"]]
+    assert kept["scenario"]["clip"]["seconds"] == 2
     assert "20 frames of 160×120" in said
     assert f"dddas run {folder / 'frames'} --landmarks {folder / 'landmarks.csv'}" in said
 
@@ -196,20 +169,18 @@ def test_without_a_name_it_lists_the_scenarios(dddas):
 
 
 def test_run_locates_what_was_simulated(made, dddas, tmp_path):
-    """The files go together: the chain takes them all, and lays every picture on the ground."""
+    """The files go together: `run` takes them all, and every picture is georeferenced."""
     folder, _ = made
-    options = [
-        (f"--{n}", folder / f)
-        for n, f in (
-            ("landmarks", "landmarks.csv"),
-            ("telemetry", "telemetry.csv"),
-            ("colours", "colours.toml"),
-            ("camera", "camera.toml"),
-        )
-    ]
-    words = [w for pair in options for w in pair]
+    files = {name: folder / f"{name}.csv" for name in ("landmarks", "telemetry")}
+    files |= {name: folder / f"{name}.toml" for name in ("colours", "camera")}
+    flown = read_telemetry(files["telemetry"])
+    assert len(flown) == 20 and flown.geographic and np.isfinite(flown.altitude_m).all()
+    assert np.degrees(flown.hfov_rad) == pytest.approx(60)
+    camera = read_camera(files["camera"])
+    assert camera.size_px == (160, 120) and camera.focal_px[0] == pytest.approx(80 / np.tan(np.radians(30)))
+    assert read_colours(files["colours"]).names == ("ugv1", "ugv2", "ugv3", "ugv4")
+    words = [word for name, path in files.items() for word in (f"--{name}", path)]
     result = dddas("run", folder / "frames", *words, "--out", tmp_path / "run", "--save", "none", "--quiet")
     assert result.exit_code == 0, result.output
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert record["frames"]["written"] == 20
-    assert record["by"]["pose"] >= 18
+    assert record(tmp_path / "run")["frames"]["written"] == 20
+    assert record(tmp_path / "run")["by"]["pose"] >= 18
