@@ -52,15 +52,11 @@ class RegistrationParameters(Group):
     model: Literal["homography", "affine"] = parameter(
         "homography", "model of the background's motion; affine is the earlier baseline"
     )
-    keypoints: int = parameter(
-        500, "largest number of keypoints in a frame (good features to track)", "points", 50, 5000
-    )
+    keypoints: int = parameter(500, "largest number of keypoints in a frame (Shi-Tomasi corners)", "points", 50, 5000)
     cell_px: int = parameter(
         16, "side of the grid cells, which keep their best point each; grows until `keypoints` suffice", "px", 4, 256
     )
-    quality: float = parameter(
-        0.01, "smallest eigenvalue of a point, as a share of the frame's largest", "-", 1e-4, 0.5
-    )
+    quality: float = parameter(0.01, "smallest eigenvalue of a point as a share of the frame's largest", "-", 1e-4, 0.5)
     block_px: Odd = parameter(5, "window over which the structure tensor is summed, odd", "px", 3, 15)
     window_px: Odd = parameter(21, "Lucas-Kanade's window, odd", "px", 5, 51)
     levels: int = parameter(4, "pyramid levels above full resolution", "levels", 0, 6)
@@ -69,18 +65,14 @@ class RegistrationParameters(Group):
     forward_backward_px: float = parameter(
         1.0, "largest error of a point tracked forth and back; 0 switches the check off", "px", 0, 20
     )
-    ransac_px: float = parameter(
-        2.0, "a point within this distance of the model's prediction is an inlier", "px", 0.1, 20
-    )
+    ransac_px: float = parameter(2.0, "a point this close to the model's prediction is an inlier", "px", 0.1, 20)
     hypotheses: int = parameter(128, "number of models that RANSAC draws", "models", 8, 4096)
     redetect_frames: int = parameter(
         1, "detect keypoints every so many frames, and track the inliers in between (onboard)", "frames", 1, 60
     )
     halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
-    min_inlier_share: float = parameter(
-        0.4, "with a smaller share of inliers the registration is unreliable", "-", 0, 1
-    )
+    min_inlier_share: float = parameter(0.4, "with a smaller share of inliers registration is unreliable", "-", 0, 1)
 
 
 class IntervalParameters(Group):
@@ -90,9 +82,7 @@ class IntervalParameters(Group):
     frames: int = parameter(3, "interval at the start; the only one if `rule` is false", "frames", 1, 60)
     minimum_frames: int = parameter(3, "shortest interval that the rule may choose", "frames", 1, 60)
     maximum_frames: int = parameter(8, "longest interval that the rule may choose", "frames", 1, 60)
-    reference_altitude_m: float = parameter(
-        20.0, "altitude above ground at which the interval is one frame", "m", 1, 1000
-    )
+    reference_altitude_m: float = parameter(20.0, "altitude at which the interval is one frame", "m", 1, 1000)
     reference_speed_m_s: float = parameter(5.0, "ground speed at which the interval is one frame", "m/s", 0.1, 100)
     reference_rate_hz: float = parameter(10.0, "frame rate at which the interval is one frame", "1/s", 1, 240)
     reference_flow: float = parameter(
@@ -102,9 +92,7 @@ class IntervalParameters(Group):
         0.5, "slower speeds count as this speed, so that hovering gives the longest interval", "m/s", 0.01, 10
     )
     cost: float = parameter(1.0, "cost of one step relative to its reference (O in eq. 2)", "-", 0.1, 10)
-    memory_frames: int = parameter(
-        9, "number of steps over which the median of the background flow is taken", "frames", 1, 100
-    )
+    memory_frames: int = parameter(9, "steps over which the median of the background flow is taken", "frames", 1, 100)
 
 
 class DifferenceParameters(Group):
@@ -119,16 +107,10 @@ class DifferenceParameters(Group):
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = parameter(
         (1, 2), "distances from the reference frame to its neighbours, on both sides", "frames"
     )
-    wide_frames: int = parameter(
-        6, "distance of the pair of frames that fills large targets; 0 switches it off", "frames", 0, 60
-    )
+    wide_frames: int = parameter(6, "distance of the pair of frames that fills large targets; 0: off", "frames", 0, 60)
     noise_levels: float = parameter(4.0, "noise of a flat region (normalized)", "grey levels", 0.1, 50)
-    gradient_share: float = parameter(
-        0.12, "share of the local gradient that counts as noise, for registration errors", "-", 0, 2
-    )
-    threshold: float = parameter(
-        3.5, "larger differences are foreground; noise units if normalized, else grey levels", "-", 0.1, 255
-    )
+    gradient_share: float = parameter(0.12, "share of the local gradient that counts as registration noise", "-", 0, 2)
+    threshold: float = parameter(3.5, "larger differences are foreground; in noise units if normalized", "-", 0.1, 255)
     peak: float = parameter(7.0, "smallest peak difference of a target, same unit as the threshold", "-", 0, 255)
     blur_px: Odd = parameter(5, "Gaussian kernel applied to the difference, odd; 1 switches it off", "px", 1, 31)
     border_px: int = parameter(4, "width of the strip along a warped frame's border that is ignored", "px", 0, 50)
@@ -138,15 +120,9 @@ class DifferenceParameters(Group):
 class MorphologyParameters(Group):
     """How the silhouette is cleaned (appendix B, step S5)."""
 
-    erode_px: int = parameter(
-        3, "ellipse that erodes the silhouette: raises precision, lowers recall; 1 switches it off", "px", 1, 31
-    )
-    close_px: int = parameter(
-        25, "ellipse that closes gaps between fragments of one target; 1 switches it off", "px", 1, 101
-    )
-    close_m: float = parameter(
-        0.0, "with telemetry: largest gap to close, at most close_px; 0 always uses close_px", "m", 0, 100
-    )
+    erode_px: int = parameter(3, "ellipse that erodes the silhouette: precision for recall; 1: off", "px", 1, 31)
+    close_px: int = parameter(25, "ellipse that closes gaps between fragments of one target; 1: off", "px", 1, 101)
+    close_m: float = parameter(0.0, "with telemetry: largest gap to close, at most close_px; 0: close_px", "m", 0, 100)
     hull: bool = parameter(True, "replace every blob by its convex hull")
 
 
@@ -154,31 +130,21 @@ class RefineParameters(Group):
     """Redrawing a target's outline by its motion and its colours."""
 
     on: bool = parameter(True, "refine outlines; false keeps the blobs of the morphology")
-    spatial_px: float = parameter(
-        90.0, "distance over which foreground evidence spreads where colours are constant", "px", 1, 500
-    )
+    spatial_px: float = parameter(90.0, "distance over which evidence spreads where colours are constant", "px", 1, 500)
     colour_levels: float = parameter(80.0, "change of colour that stops the spread", "grey levels", 1, 1000)
     share: float = parameter(0.55, "share of foreground evidence above which a pixel is foreground", "-", 0.05, 0.95)
-    shadow_share: float = parameter(
-        0.01, "cast shadows are removed from blobs of at most this share of the picture", "-", 0, 1
-    )
+    shadow_share: float = parameter(0.01, "shadows are removed from blobs up to this share of the picture", "-", 0, 1)
 
 
 class PersistenceParameters(Group):
     """What a blob must show over time to be a target: moving as one, steadily, unlike its surroundings."""
 
     on: bool = parameter(True, "test blobs by flow and persistence; false accepts every blob")
-    flow_share: float = parameter(
-        0.3, "share of a blob's core that must move steadily to pass the flow test", "-", 0, 1
-    )
+    flow_share: float = parameter(0.3, "share of a blob's core that moves steadily to pass the flow test", "-", 0, 1)
     sure_share: float = parameter(0.7, "a large blob with at least this share needs no further frames", "-", 0, 1)
-    links: int = parameter(
-        3, "frames out of five (two before, itself, two after) in which a blob must be seen", "frames", 1, 5
-    )
+    links: int = parameter(3, "frames of five (two before, itself, two after) that must show a blob", "frames", 1, 5)
     passes: int = parameter(2, "number of these frames in which it must pass the flow test", "frames", 0, 5)
-    large_share: float = parameter(
-        0.02, "a blob of at least this share of the picture needs one link and no flow test", "-", 0, 1
-    )
+    large_share: float = parameter(0.02, "a blob of this share of the picture needs one link, no flow test", "-", 0, 1)
     weak_links: int = parameter(4, "`links` for a blob that only the wide pair of frames shows", "frames", 1, 5)
     weak_passes: int = parameter(3, "`passes` for a blob that only the wide pair of frames shows", "frames", 0, 5)
     trusted_blobs: int = parameter(
@@ -201,12 +167,8 @@ class SmallParameters(Group):
     max_box_px: int = parameter(1500, "largest box area of a candidate", "px", 10, 1_000_000)
     max_candidates: int = parameter(80, "with more candidates in a frame none is tracked", "blobs", 1, 10_000)
     max_blobs: int = parameter(4, "with more large blobs than this, parallax is tested for", "blobs", 0, 1000)
-    parallax_px: float = parameter(
-        0.15, "residual of inliers that indicates parallax; then no small target is reported", "px", 0, 10
-    )
-    gate_px: float = parameter(
-        4.0, "largest distance between a track's prediction and the candidate that continues it", "px", 0.5, 50
-    )
+    parallax_px: float = parameter(0.15, "residual of inliers that means parallax: no small targets then", "px", 0, 10)
+    gate_px: float = parameter(4.0, "largest distance of a candidate from the track's prediction", "px", 0.5, 50)
     hits: int = parameter(10, "frames with a candidate that a track needs to be confirmed", "frames", 2, 60)
     min_travel_px: float = parameter(3.0, "smallest distance that a confirmed track has travelled", "px", 0, 100)
     sureness: float = parameter(8.0, "smallest speed of a confirmed track, in its standard deviations", "-", 1, 100)
@@ -216,16 +178,10 @@ class SmallParameters(Group):
 class HistoryParameters(Group):
     """The motion history, its gradient and the segmentation by motion (appendix B, step S5)."""
 
-    on: bool = parameter(
-        True, "motion history for heading and speed where no flow is computed, and to split touching targets"
-    )
+    on: bool = parameter(True, "motion history: heading and speed without flow, and splits of touching targets")
     duration_frames: float = parameter(6.0, "how long a silhouette stays in the history", "frames", 1, 120)
-    delta_min_frames: float = parameter(
-        0.5, "smallest difference of time stamps that gives a gradient", "frames", 0, 60
-    )
-    delta_max_frames: float = parameter(
-        4.0, "largest difference of time stamps that gives a gradient", "frames", 0, 120
-    )
+    delta_min_frames: float = parameter(0.5, "smallest difference of time stamps with a gradient", "frames", 0, 60)
+    delta_max_frames: float = parameter(4.0, "largest difference of time stamps with a gradient", "frames", 0, 120)
     segmentation_threshold_frames: float = parameter(
         1.0, "neighbours whose time stamps differ by more belong to different motions", "frames", 0, 60
     )
@@ -238,15 +194,11 @@ class GateParameters(Group):
     min_size_m: float = parameter(0.2, "smallest length of a target on the ground", "m", 0, 100)
     max_size_m: float = parameter(25.0, "largest length of a target on the ground", "m", 0.1, 1000)
     max_speed_m_s: float = parameter(60.0, "largest speed of a target over ground", "m/s", 0.1, 500)
-    focal_px: float = parameter(
-        1000.0, "focal length: bounds in px are bounds in m x focal length / altitude", "px", 10, 100_000
-    )
+    focal_px: float = parameter(1000.0, "focal length: a bound in px is m x focal length / altitude", "px", 10, 100_000)
     expected_size_m: float = parameter(
         1.7, "size of a typical small target: sets the smallest area if telemetry is given", "m", 0.05, 100
     )
-    expected_share: float = parameter(
-        0.1, "smallest share of the expected target's square that is foreground", "-", 0.01, 1
-    )
+    expected_share: float = parameter(0.1, "smallest foreground share of the expected target's square", "-", 0.01, 1)
 
 
 class TrackParameters(Group):
@@ -284,13 +236,9 @@ class TrackParameters(Group):
     own_size_scatter: float = parameter(
         1.0, "`size_scatter` for moving targets that dddas detected, which split and merge", "-", 1e-3, 10
     )
-    own_births: float = parameter(
-        0.0, "`births` for moving targets that dddas detected: most are parts of known targets", "-", 0, 10
-    )
+    own_births: float = parameter(0.0, "`births` for targets that dddas detected: most are parts of others", "-", 0, 10)
     appearance_weight: float = parameter(10.0, "weight of the similarity of appearance", "-", 0, 100)
-    appearance_offset: float = parameter(
-        0.86, "similarity of appearance that counts neither for nor against a link", "-", 0, 1
-    )
+    appearance_offset: float = parameter(0.86, "similarity of appearance that is neutral for a link", "-", 0, 1)
 
 
 class PaperParameters(Group):
@@ -302,10 +250,10 @@ class PaperParameters(Group):
     )
     weight: float = parameter(0.7, "share of location in the affinity if the rule is fixed", "-", 0, 1)
     lowest_dispersion: float = parameter(
-        0.65, "a feature with a larger dispersion separates targets: LL of III-D", "-", 0, 1
+        0.65, "a feature with a larger dispersion tells targets apart: LL of III-D", "-", 0, 1
     )
     location_cut: float = parameter(
-        0.25, "dissimilarity at which clusters of locations end: the normalised G; empirical", "-", 0, 1
+        0.25, "dissimilarity at which location clusters end: normalised G; empirical", "-", 0, 1
     )
     appearance_cut: float = parameter(0.25, "dissimilarity at which clusters of histograms end; empirical", "-", 0, 1)
     dispersion_of: Literal["smallest", "smallest_if_counts_differ", "newest"] = parameter(
@@ -315,20 +263,16 @@ class PaperParameters(Group):
         "one_dummy", "entries to raise to 1 - threshold: with one dummy, with any number (as printed), or none"
     )
     gated: Literal["features", "affinity"] = parameter(
-        "features", "gate location and appearance separately, or their weighted sum"
+        "features", "gate location and appearance, or their weighted sum"
     )
-    threshold: float = parameter(
-        0.4, "an entry with a dummy is raised if all real alternatives are below 1 - threshold", "-", 0, 1
-    )
+    threshold: float = parameter(0.4, "a dummy's entry is raised if all real ones are below 1 - threshold", "-", 0, 1)
     dummy: Literal["zero", "formula"] = parameter(
         "zero", "affinity with a dummy before the gate: zero, or eq. 4 and 5 with a zero vector"
     )
     histogram: Literal["channel", "count"] = parameter(
         "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"
     )
-    exact_targets: int = parameter(
-        12, "up to this many targets per frame the exact solution, else relaxation", "targets", 0, 1000
-    )
+    exact_targets: int = parameter(12, "largest number of targets a frame for the exact solution", "targets", 0, 1000)
     gap: float = parameter(0.005, "relaxation aims at a solution within this share of the bound", "-", 0, 1)
 
 
@@ -356,27 +300,19 @@ class PeopleParameters(Group):
         4,
     )
     max_levels: int = parameter(64, "largest number of pyramid levels", "levels", 1, 200)
-    padding_px: int = parameter(
-        24, "border added to each level by reflection, to detect people at the border", "px", 0, 256
-    )
+    padding_px: int = parameter(24, "reflected border of each level, to detect people at the border", "px", 0, 256)
     threshold: float = parameter(0.0, "smallest score of a window that may be a person", "-", -10, 10)
     suppression: Literal["nms", "opencv", "none"] = parameter(
         "nms", "nms keeps the best of overlapping windows; opencv averages groups; none keeps all"
     )
     overlap: float = parameter(0.4, "nms: bodies with a larger intersection over union are the same person", "-", 0, 1)
-    contained: float = parameter(
-        0.7, "nms: so are bodies that share more of the smaller one; 1 switches it off", "-", 0, 1
-    )
-    settle: float = parameter(
-        0.75, "nms: boxes are means of windows with this overlap with the best; 1: the best alone", "-", 0, 1
-    )
+    contained: float = parameter(0.7, "nms: so are bodies that share more of the smaller one; 1: off", "-", 0, 1)
+    settle: float = parameter(0.75, "nms: a box is the mean of windows that overlap the best by this", "-", 0, 1)
     group: int = parameter(2, "opencv: groups of at most this many windows are dropped", "windows", 0, 100)
     group_distance: float = parameter(0.2, "opencv: edges within this distance, in box sizes, form a group", "-", 0, 1)
     height_share: float = parameter(0.738, "body height divided by window height", "-", 0.1, 1)
     width_share: float = parameter(0.5, "body width divided by window width", "-", 0.1, 1)
-    feet_share: float = parameter(
-        0.845, "distance from the window's top to the feet, divided by window height", "-", 0.1, 1.2
-    )
+    feet_share: float = parameter(0.845, "distance from window top to feet, divided by window height", "-", 0.1, 1.2)
     probability_slope: float = parameter(2.6, "probability = 1 / (1 + exp(-slope (score - even)))", "-", 0.01, 100)
     probability_even: float = parameter(0.8, "score at which the probability of a person is 0.5", "-", -10, 10)
     search: Literal["everywhere", "regions"] = parameter(
@@ -451,9 +387,7 @@ class GroundParameters(Group):
     height_sigma: float = parameter(0.05, "standard deviation of a box's height, in box heights", "-", 0, 1)
     feet_sigma: float = parameter(0.03, "standard deviation of the foot row, in box heights", "-", 0, 1)
     gate_sigmas: float = parameter(3.0, "sightings at a larger distance are different people", "-", 0.5, 10)
-    within_frames: int = parameter(
-        0, "frames of several cameras this close together count as simultaneous", "frames", 0, 1000
-    )
+    within_frames: int = parameter(0, "frames of several cameras this close count as simultaneous", "frames", 0, 1000)
 
 
 class ConfirmParameters(Group):
@@ -462,33 +396,19 @@ class ConfirmParameters(Group):
     gate_probability: float = parameter(
         0.99, "share of people inside the gate of their own blob, by both covariances", "-", 0.5, 0.9999
     )
-    spread_m: float = parameter(
-        0.5, "standard deviation of people around their blob's position, which may be a crowd's", "m", 0, 20
-    )
+    spread_m: float = parameter(0.5, "sigma of people around their blob's position, maybe a crowd's", "m", 0, 20)
     unknown_sigma_m: float = parameter(2.0, "standard deviation of positions without covariance", "m", 0.01, 100)
-    inside_sigmas: float = parameter(
-        2.0, "a blob is well inside a view if this many of its standard deviations are", "-", 0, 10
-    )
+    inside_sigmas: float = parameter(2.0, "a blob is well inside a view if this many of its sigmas are", "-", 0, 10)
     body_width_m: float = parameter(0.6, "nearer objects within this distance of the line of sight occlude", "m", 0, 10)
-    least_score: float = parameter(
-        0.5, "people of a lower probability count neither for nor against their blob", "-", 0.5, 1
-    )
+    least_score: float = parameter(0.5, "people of a lower probability say nothing about their blob", "-", 0.5, 1)
     detection_rate: float = parameter(
-        0.7, "share of observations of a person in which one is recognized", "-", 0.01, 0.999
+        0.7, "share of a person's observations in which one is recognized", "-", 0.01, 0.999
     )
-    false_rate: float = parameter(
-        0.05, "share of observations of other blobs in which a person is recognized", "-", 0.001, 0.99
-    )
-    crowd_share: float = parameter(
-        0.5, "in pictures: detection rate in a blob of several people, relative to that of one", "-", 0, 1
-    )
+    false_rate: float = parameter(0.05, "share of other blobs' observations with a person recognized", "-", 0.001, 0.99)
+    crowd_share: float = parameter(0.5, "in pictures: detection rate in a crowd's blob over that of one", "-", 0, 1)
     prior: float = parameter(0.5, "share of blobs that are people", "-", 0.01, 0.99)
-    fresh: float = parameter(
-        0.3, "weight of a repeated observation by the same vehicle: its errors are correlated", "-", 0, 1
-    )
-    limit: float = parameter(
-        7.0, "largest absolute log-odds, so that later observations can still change the result", "-", 0.5, 50
-    )
+    fresh: float = parameter(0.3, "weight of a vehicle's repeated observation: its errors are correlated", "-", 0, 1)
+    limit: float = parameter(7.0, "largest absolute log-odds, so that later observations still count", "-", 0.5, 50)
     share: float = parameter(
         0.5, "in pictures: smallest intersection of a person's and a blob's box, over the smaller box", "-", 0.01, 1
     )
@@ -512,12 +432,8 @@ class LandmarkParameters(Group):
     sigma_m: float = parameter(
         1.43, "standard deviation of a landmark's report where none is given: GPS with 3.5 m at 95 %", "m", 0, 1000
     )
-    common_sigma_m: float = parameter(
-        0.0, "standard deviation of the error common to all receivers of the team", "m", 0, 1000
-    )
-    gap_s: float = parameter(
-        5.0, "a landmark ends after a dropout of this length without planned waypoints", "s", 0, 3600
-    )
+    common_sigma_m: float = parameter(0.0, "sigma of the error common to all receivers of the team", "m", 0, 1000)
+    gap_s: float = parameter(5.0, "a landmark ends after such a dropout without planned waypoints", "s", 0, 3600)
     drift_m_s: float = parameter(0.5, "growth of the position's uncertainty during a dropout", "m/s", 0, 100)
     height_m: float = parameter(0.0, "height of the colour (or of the point given in pixels) above ground", "m", 0, 20)
     length_m: float = parameter(
@@ -538,18 +454,14 @@ class AerialParameters(Group):
     mode: Literal["pose", "homography", "paper"] = parameter(
         "pose", "pose: from landmarks and telemetry; homography: landmarks only; paper: as printed, in degrees"
     )
-    hfov_deg: float = parameter(
-        70.0, "horizontal field of view if neither camera nor telemetry gives it", "deg", 1, 170
-    )
+    hfov_deg: float = parameter(70.0, "horizontal field of view where camera and telemetry give none", "deg", 1, 170)
     pitch_deg: float = parameter(
         90.0, "angle of the optical axis below the horizon if neither gives it; 90 is straight down", "deg", -90, 90
     )
     focal_sigma: float = parameter(
         0.01, "relative standard deviation of a given focal length, unless the camera's file gives it", "-", 0, 1
     )
-    focal_guess_sigma: float = parameter(
-        0.2, "relative standard deviation of a focal length that follows from hfov_deg", "-", 0, 1
-    )
+    focal_guess_sigma: float = parameter(0.2, "relative sigma of a focal length that follows from hfov_deg", "-", 0, 1)
     tilt_sigma_deg: float = parameter(1.0, "standard deviation of the reported tilt, per axis", "deg", 0, 90)
     tilt_guess_sigma_deg: float = parameter(15.0, "standard deviation of the tilt if pitch_deg is used", "deg", 0, 180)
     heading_sigma_deg: float = parameter(5.0, "standard deviation of the reported heading", "deg", 0, 180)
@@ -559,41 +471,31 @@ class AerialParameters(Group):
         1.43, "standard deviation of the vehicle's position, east and north: 3.5 m at 95 %", "m", 0, 1000
     )
     target_sigma_px: float = parameter(1.0, "standard deviation of a target's position in the picture", "px", 0, 100)
-    own_sigma: float = parameter(
-        0.13, "additional standard deviation for targets that dddas detected, in box sides", "sides", 0, 2
-    )
+    own_sigma: float = parameter(0.13, "additional sigma for targets that dddas detected, in box sides", "sides", 0, 2)
     point: Literal["auto", "centre", "foot"] = parameter(
         "auto",
         "point of a box on the ground: centre, foot, or auto: the table's feet, the foot for tables of dddas, "
         "else the centre",
     )
-    shadows: bool = parameter(
-        False, "blobs are bodies with their shadows: the foot is found from the direction of the sun"
-    )
+    shadows: bool = parameter(False, "blobs are bodies with shadows: the foot is found from the sun's direction")
     sun_azimuth_deg: float = parameter(0.0, "direction of the sun, clockwise from north", "deg", 0, 360)
     sun_height_deg: float = parameter(
         0.0, "elevation of the sun; 0: from the telemetry's clock, no shadows without a clock", "deg", 0, 90
     )
     target_height_m: float = parameter(1.7, "height of the body whose foot is wanted", "m", 0, 100)
-    gate_probability: float = parameter(
-        0.999, "share of correct landmarks that pass the consistency test", "-", 0.5, 0.999999
-    )
+    gate_probability: float = parameter(0.999, "share of right landmarks that pass the test", "-", 0.5, 0.999999)
     correlation_s: float = parameter(
         20.0, "correlation time of telemetry and receiver errors; 0: independent in each frame", "s", 0, 10000
     )
-    least_spread: float = parameter(
-        0.02, "landmarks whose width is a smaller share of their length count as collinear", "-", 0, 1
-    )
-    clock_offset_s: float = parameter(
-        0.0, "added to the times of telemetry and landmarks to get the clip's time", "s", -1e6, 1e6
-    )
+    least_spread: float = parameter(0.02, "landmarks of a smaller width over length count as collinear", "-", 0, 1)
+    clock_offset_s: float = parameter(0.0, "added to times of telemetry and landmarks: the clip's time", "s", -1e6, 1e6)
 
 
 class CrowdParameters(Group):
     """Moving targets that go together as one crowd."""
 
     join_m: float = parameter(
-        0.0, "targets located from the air with gaps up to this form one crowd; 0: no crowds", "m", 0, 100
+        0.0, "targets located from the air with gaps up to this are one crowd; 0: off", "m", 0, 100
     )
     speed_m_s: float = parameter(1.5, "largest velocity difference over ground within a crowd", "m/s", 0.01, 100)
 
@@ -602,54 +504,36 @@ class SteeringParameters(Group):
     """How what is found steers where the instruments go and look, in a run whose source can be steered."""
 
     on: bool = parameter(True, "steer the vehicles; false flies as planned")
-    sampling: bool = parameter(
-        False, "process only every k-th frame, k from the interval rule; the clip must be in order"
-    )
+    sampling: bool = parameter(False, "process every k-th frame, k from the interval rule; needs a clip in order")
     sampling_share: float = parameter(0.5, "k as a share of the rule's interval before its bounds", "-", 0.01, 10)
-    least_move_px: float = parameter(
-        1.5, "k is so large that a walker moves by at least this between processed frames", "px", 0, 100
-    )
+    least_move_px: float = parameter(1.5, "a walker moves by at least this between processed frames", "px", 0, 100)
     maximum_every: int = parameter(5, "largest k, however slow the scene", "frames", 1, 60)
     follow: bool = parameter(True, "the UAV keeps the crowds in view; false flies as planned")
     look: bool = parameter(True, "UGVs drive to targets that need a closer look; false drives as planned")
     fast_m_s: float = parameter(3.0, "speed of a UGV far from its goal", "m/s", 0, 30)
-    slow_m_s: float = parameter(
-        1.0, "speed of a UGV near its goal, where its motion degrades its position", "m/s", 0, 30
-    )
+    slow_m_s: float = parameter(1.0, "speed of a UGV near its goal: its motion degrades its position", "m/s", 0, 30)
     near_m: float = parameter(6.0, "distance to the goal that counts as near", "m", 0, 1000)
     station_m: float = parameter(12.0, "distance of UGVs from the crowd they observe", "m", 2, 1000)
-    look_m: float = parameter(
-        14.0, "largest distance at which a UGV's camera recognizes people: bodies of 64 px", "m", 1, 1000
-    )
+    look_m: float = parameter(14.0, "largest distance at which a UGV recognizes people: bodies of 64 px", "m", 1, 1000)
     picture_s: float = parameter(1.0, "time between two pictures of one UGV", "s", 0.01, 3600)
-    maximum_altitude_m: float = parameter(
-        0.0, "largest altitude of the UAV; 0: twice its initial altitude", "m", 0, 10_000
-    )
+    maximum_altitude_m: float = parameter(0.0, "largest altitude of the UAV; 0: twice the initial one", "m", 0, 10_000)
 
 
 class LiveParameters(Group):
     """A run that must keep up with a camera."""
 
-    pace: float = parameter(
-        1.0, "playback speed of a file relative to real time; 0: as fast as frames are processed", "-", 0, 1000
-    )
+    pace: float = parameter(1.0, "playback speed of a file over real time; 0: as fast as possible", "-", 0, 1000)
     queue_frames: int = parameter(2, "frames that may wait; beyond that the oldest is dropped", "frames", 1, 64)
-    deadline_ms: float = parameter(
-        80.0, "largest latency from camera to results, without the frames of look-ahead", "ms", 1, 60_000
-    )
+    deadline_ms: float = parameter(80.0, "largest latency from camera to results without look-ahead", "ms", 1, 60_000)
     shed: bool = parameter(True, "reduce the load when processing is too slow; false drops frames instead")
     load: float = parameter(0.85, "largest share of the time between frames that processing may take", "-", 0.1, 1)
     calm_s: float = parameter(5.0, "time with spare capacity after which the load is raised again", "s", 0.1, 600)
     least_keypoints: int = parameter(80, "smallest number of keypoints under load", "-", 16, 10_000)
     maximum_every: int = parameter(8, "process at least one of this many frames under load", "frames", 1, 60)
     stall_s: float = parameter(5.0, "a stream without frames for this long counts as lost", "s", 0.1, 600)
-    retry_s: float = parameter(
-        0.5, "first delay before a lost stream is opened again; doubles with each attempt", "s", 0.01, 600
-    )
+    retry_s: float = parameter(0.5, "first delay before a lost stream is opened again; then it doubles", "s", 0.01, 600)
     retry_most_s: float = parameter(30.0, "longest delay before a lost stream is opened again", "s", 0.01, 3600)
-    watchdog_s: float = parameter(
-        30.0, "a step that takes longer counts as hung; 0 switches the watchdog off", "s", 0, 3600
-    )
+    watchdog_s: float = parameter(30.0, "a step that takes longer counts as hung; 0: no watchdog", "s", 0, 3600)
     status_s: float = parameter(2.0, "time between two writes of the status and the results", "s", 0.1, 600)
 
     @model_validator(mode="after")
