@@ -30,8 +30,7 @@ from geo_scene import (
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Georeferencer
-from torchvision_dddas.geo.plane_homography import locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import Fix, Flight, LandmarkObservations
 

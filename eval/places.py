@@ -27,8 +27,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 from torchvision_dddas.config import GroundParameters, Settings, with_parameters
 from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.geo.georeferencer import Georeferencer
-from torchvision_dddas.geo.plane_homography import locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.types import Camera, Flight, LandmarkObservations, Poses, Sightings

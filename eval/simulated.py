@@ -30,8 +30,8 @@ from torchvision_dddas.evaluation.metrics.crowd_frames import shown
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
 from torchvision_dddas.geo.colours import load_colours
-from torchvision_dddas.geo.plane_solvers import load_solver
-from torchvision_dddas.geo.terrain import shift_origin
+from torchvision_dddas.geo.plane_homography import load_solver
+from torchvision_dddas.geo.projection import shift_origin
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.simulation.drawing import view_from_pose

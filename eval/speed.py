@@ -286,7 +286,7 @@ def measure_geo(options: bench.Options) -> tuple[str, Any]:
     from geo_scene import CAMERA, Case, scenes
 
     from torchvision_dddas.geo.georeferencer import Georeferencer
-    from torchvision_dddas.geo.plane_solvers import load_solver
+    from torchvision_dddas.geo.plane_homography import load_solver
     from torchvision_dddas.geometry import east_north, lonlat
 
     solvers = {name: load_solver(name) for name in available_chains(("onboard", "torch"))}

@@ -22,7 +22,7 @@ import numpy as np
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.simulation import film, load_scenario

@@ -11,7 +11,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
 from torchvision_dddas.geo.aerial_targets import Targets, reference_points
 from torchvision_dddas.geo.colours import load_colours
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections

@@ -5,8 +5,7 @@ import pytest
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Georeferencer
-from torchvision_dddas.geo.plane_homography import locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 

@@ -4,18 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.colour_calibration import (
+from torchvision_dddas.geo.colours import (
+    ColourFinder,
     ColourSample,
     build_ranges,
     find_samples,
     hue_difference,
+    load_colours,
     mask_range,
     name_hues,
     pool_samples,
     sample_box,
     to_hsv,
 )
-from torchvision_dddas.geo.colours import ColourFinder, load_colours
 
 PLATES = {"red": (178, 210, 200), "yellow": (28, 220, 220), "blue": (112, 200, 190), "magenta": (150, 190, 200)}
 LEAST = 12

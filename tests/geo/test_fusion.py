@@ -5,8 +5,8 @@ import pytest
 
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters
-from torchvision_dddas.geo import fusion
-from torchvision_dddas.geo.fusion import associate, estimate_places, fuse, gate_distance
+from torchvision_dddas.geo import ground_locator
+from torchvision_dddas.geo.ground_locator import associate, estimate_places, fuse, gate_distance
 from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.types import Sightings
 
@@ -43,7 +43,7 @@ def test_beliefs_worked_out_one_by_one_or_all_at_once_are_the_same(monkeypatch):
     people = rng.uniform(-4, 4, (7, 2))
     team = [sightings(people + rng.normal(0, 1, 2) + rng.normal(0, 0.2, (7, 2)), 0.05, 1.4) for _ in range(3)]
     together_at_once = associate(team)
-    monkeypatch.setattr(fusion, "MATRICES", 1)
+    monkeypatch.setattr(ground_locator, "MATRICES", 1)
     assert np.array_equal(associate(team), together_at_once)
     assert (together_at_once >= 0).all(axis=1).sum() >= 5
 

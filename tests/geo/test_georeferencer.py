@@ -6,10 +6,8 @@ import numpy as np
 
 from tests.airborne import CAMERA, look, with_aerial
 from torchvision_dddas.config import Settings
-from torchvision_dddas.geo.bias_filter import BiasFilter
-from torchvision_dddas.geo.georeferencer import Georeferencer
-from torchvision_dddas.geo.plane_homography import locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.georeferencer import BiasFilter, Georeferencer
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.pose_estimation import independent_expectation, pose_prior
 
 SOLVER = load_solver("onboard")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring
-from torchvision_dddas.geo.plane_homography import fix_by_homography, locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import fix_by_homography, load_solver, locate_pixels
 from torchvision_dddas.geo.pose_estimation import move_pose
 from torchvision_dddas.geo.projection import project
 from torchvision_dddas.geometry import lonlat, transfer

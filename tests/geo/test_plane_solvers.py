@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.geo.plane_solvers import PlaneSolver, load_solver
+from torchvision_dddas.geo.plane_homography import PlaneSolver, load_solver
 
 
 @pytest.fixture(scope="module", params=["onboard", "torch"])
@@ -136,7 +136,7 @@ def test_fewer_than_four_landmarks_are_marked_by_number_and_by_weight(solver, co
 
 
 def test_the_onboard_solver_needs_no_torch():
-    load = "from torchvision_dddas.geo.plane_solvers import load_solver; load_solver('auto')"
+    load = "from torchvision_dddas.geo.plane_homography import load_solver; load_solver('auto')"
     script = f"import sys; {load}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "False"

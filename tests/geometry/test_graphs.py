@@ -12,7 +12,7 @@ import torchvision_dddas
 from torchvision_dddas import runtime as graphs
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import plane_solvers as onboard_plane
+from torchvision_dddas.geo import plane_homography
 from torchvision_dddas.people import onnx_scorer as onboard_people
 from torchvision_dddas.runtime import MANIFEST, SHIPPED, manifest, opened, seal, verified
 from torchvision_dddas.types import LinearSvm
@@ -132,9 +132,9 @@ def test_both_onboard_back_ends_refuse_tampered_graphs(folder: Path, monkeypatch
         (folder / name).write_bytes((folder / name).read_bytes() + b"\0")
     with pytest.raises(InputError, match=r"people_scores.onnx is not the graph"):
         onboard_people.OnnxScorer(PeopleParameters(graphs=str(folder)), LinearSvm(_nothing(), 0.0, "none"))
-    monkeypatch.setattr(onboard_plane, "SHIPPED", folder)
+    monkeypatch.setattr(plane_homography, "SHIPPED", folder)
     with pytest.raises(InputError, match=r"homography.onnx is not the graph"):
-        onboard_plane.open_graph.__wrapped__("homography")
+        plane_homography.open_graph.__wrapped__("homography")
 
 
 def test_shipped_graphs_that_are_damaged_ask_for_a_new_installation(folder: Path, monkeypatch):

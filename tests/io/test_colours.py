@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.colour_calibration import find_overlaps
+from torchvision_dddas.geo.colours import find_overlaps
 from torchvision_dddas.io.colour_files import format_colours, read_colours
 from torchvision_dddas.types import Colours
 

@@ -7,8 +7,7 @@ import torch
 from tests import airborne
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo.georeferencer import Georeferencer
-from torchvision_dddas.geo.plane_homography import locate_pixels
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.tuning.aerial_location import (
     SPREADS,
     AerialExample,

@@ -24,8 +24,8 @@ from torchvision_dddas.control.ugv_commands import UgvTeam
 from torchvision_dddas.detection import interval_from_flow, interval_from_telemetry, pixels_per_metre
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
 from torchvision_dddas.geo.colours import load_colours
-from torchvision_dddas.geo.plane_solvers import load_solver
-from torchvision_dddas.geo.terrain import shift_origin
+from torchvision_dddas.geo.plane_homography import load_solver
+from torchvision_dddas.geo.projection import shift_origin
 from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.types import (
     Adjustment,

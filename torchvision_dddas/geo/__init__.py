@@ -2,9 +2,14 @@
 
 from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix, check_table, frames_to_locate, is_outside
 from torchvision_dddas.geo.aerial_targets import Targets
-from torchvision_dddas.geo.crowds import group_crowds
 from torchvision_dddas.geo.ground_locator import GroundLocator
-from torchvision_dddas.geo.landmark_watch import LandmarkWatch, WatchedScene, check_colours, without_pixels
+from torchvision_dddas.geo.landmark_watch import (
+    LandmarkWatch,
+    WatchedScene,
+    check_colours,
+    group_crowds,
+    without_pixels,
+)
 from torchvision_dddas.geo.site import Site, build_site, check_span, describe_unknown_heights, resolve_camera, to_local
 
 __all__ = [

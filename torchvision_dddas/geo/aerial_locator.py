@@ -21,10 +21,16 @@ from torchvision_dddas.geo.aerial_targets import (
 )
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, LandmarkUse, select_landmarks
-from torchvision_dddas.geo.plane_homography import LEAST, absolute_covariance, locate_pixels, relative_width
-from torchvision_dddas.geo.plane_solvers import PlaneSolver, load_solver
+from torchvision_dddas.geo.plane_homography import (
+    LEAST,
+    PlaneSolver,
+    absolute_covariance,
+    load_solver,
+    locate_pixels,
+    relative_width,
+)
+from torchvision_dddas.geo.projection import ground_height, surface_of
 from torchvision_dddas.geo.site import Site, build_site, resolve_camera
-from torchvision_dddas.geo.terrain import ground_height, surface_of
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

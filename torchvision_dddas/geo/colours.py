@@ -1,14 +1,17 @@
-"""Colours in pictures: masks of ranges of hue, saturation and value, by OpenCV or torch, and the patches in a mask."""
+"""Colours in pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import occupied
 from torchvision_dddas.runtime import wants_torch
-from torchvision_dddas.types import Table
+from torchvision_dddas.types import Colours, Table
 
 # Gaps of a patch up to about this wide are closed: an antenna, a seam, a pixel of noise.
 _CLOSE_PX = 5
@@ -122,3 +125,290 @@ def find_patches(mask: np.ndarray, least_area_px: int) -> Patches:
         areas.append(stats[large, cv2.CC_STAT_AREA].astype(float))
         boxes.append((stats[large, :4] + (left, top, 0, 0)).astype(float))
     return Patches(np.concatenate(centres), np.concatenate(areas), np.concatenate(boxes))
+
+
+# Names of hues, in OpenCV's units.
+HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
+
+# Windows of hue in which patches are searched: half width and step; lowest saturations and value.
+_HALF, _STEP = 7, 4
+_SATURATIONS, _VALUE = (80, 120, 160), 50
+# Least fill of a patch's box; its greatest length over width; its greatest share of the picture.
+_FILL, _LONG, _MOST = 0.4, 3.0, 0.02
+# A hue that covers a larger share of the picture belongs to the ground.
+_GROUND = 0.05
+# Least difference in hue between colours.
+_APART = 10
+# Area from which size no longer raises the score, and the score of a clear colour.
+_AREA_PX, _CLEAR = 150.0, 0.24
+# Margins of ranges in hue, saturation and value that are tried: the widest that marks least else is taken.
+_MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
+_LOWEST = (40, 30)
+_ENDS = (2, 98)
+
+
+@dataclass(frozen=True)
+class ColourSample:
+    """A patch of a colour. hue: of most of its pixels. pixels: (P, 3) uint8 hue, saturation, value. score: in [0, 1].
+
+    picture: which it is in, counted from 0. box_px: x, y, width, height.
+    """
+
+    hue: float
+    pixels: np.ndarray
+    score: float
+    picture: int
+    box_px: tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class CalibratedColours:
+    """The ranges of K colours, (K,) samples of each, best first, and (K,) how many other patches each range marks."""
+
+    ranges: Colours
+    groups: tuple[tuple[ColourSample, ...], ...]
+    others: tuple[int, ...]
+
+
+def calibrate_colours(
+    images: Sequence[np.ndarray],
+    least_area_px: int,
+    count: int | None = None,
+    names: Sequence[str] = (),
+    boxes: Sequence[tuple[str, tuple[int, int, int, int]]] = (),
+) -> CalibratedColours:
+    """Find the colours of landmarks in (H, W, 3) uint8 BGR pictures that show all of them.
+
+    count: of colours; None: as many as names, or all that are clear. names: those of HUES go to the nearest colour,
+    others by hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture, instead of a search.
+    Raises InputError for a box without a strong colour, for too few colours, and for two that are too similar.
+    """
+    hsv = [to_hsv(image) for image in images]
+    if boxes:
+        groups, names = [[_named_sample(hsv[0], name, box)] for name, box in boxes], [name for name, _ in boxes]
+    else:
+        groups = _search(hsv, least_area_px, count or len(names) or None)
+        names = _match_names(names, [group[0].hue for group in groups])
+    low, high, others = build_ranges(groups, hsv, least_area_px)
+    for a, b in find_overlaps(low, high):
+        raise InputError(
+            f"the hues of {names[a]} and {names[b]} are too similar (about {low[a, 0]} and {low[b, 0]}); "
+            "give the landmarks colours that differ more"
+        )
+    return CalibratedColours(Colours(tuple(names), low, high), tuple(map(tuple, groups)), tuple(others.tolist()))
+
+
+def _named_sample(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -> ColourSample:
+    (x, y, wide, high), (height, width) = box_px, hsv.shape[:2]
+    if wide < 1 or high < 1 or x + wide > width or y + high > height:
+        raise InputError(f"the box {x},{y},{wide},{high} of {name} is not inside the picture, {width} x {height} px")
+    sample = sample_box(hsv, box_px)
+    if sample is None:
+        raise InputError(f"nothing in the box {x},{y},{wide},{high} of {name} has a strong colour")
+    return sample
+
+
+def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
+    groups = pool_samples([find_samples(one, least_area_px, number) for number, one in enumerate(hsv)], count)
+    if not groups or (count is not None and len(groups) < count):
+        has = f"{len(groups)} of {count} colours stand" if groups else "no colour stands"
+        where = "the picture" if len(hsv) == 1 else f"the {len(hsv)} pictures"
+        raise InputError(f"{has} out in {where}; give a box of each landmark with --at NAME=X,Y,W,H")
+    return sorted(groups, key=lambda group: group[0].hue)
+
+
+def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
+    """A name for each hue: the colour names that fit best, or the given names in the order of hues."""
+    from scipy.optimize import linear_sum_assignment  # heavy, and used by nothing else that runs onboard
+
+    if not names:
+        return name_hues(hues)
+    if not set(names) <= HUES.keys():
+        return list(names)
+    apart = [[float(abs(hue_difference(HUES[name], hue))) for name in names] for hue in hues]
+    return [names[place] for place in linear_sum_assignment(apart)[1].tolist()]
+
+
+def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
+    """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
+    return [
+        (a, b)
+        for a, b in combinations(range(len(low)), 2)
+        if _hues(low[a, 0], high[a, 0]) & _hues(low[b, 0], high[b, 0])
+        and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
+    ]
+
+
+def _hues(low: int, high: int) -> set[int]:
+    """The hues from 0 to 179 in a range."""
+    return {hue % 180 for hue in range(low, high + 1 if low <= high else high + 181)}
+
+
+def to_hsv(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
+    return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+
+
+def mask_range(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
+    if low[0] <= high[0]:
+        return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
+    below = cv2.inRange(hsv, np.asarray(low, float), np.array([180.0, *high[1:]]))
+    return cv2.bitwise_or(below, cv2.inRange(hsv, np.array([0.0, *low[1:]]), np.asarray(high, float)))
+
+
+def find_samples(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[ColourSample]:
+    """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
+
+    hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation in the picture and around
+    it: ground and plants, of whatever hue, are in many places.
+    """
+    found: list[ColourSample] = []
+    counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
+    for saturation in _SATURATIONS:
+        for hue in range(0, 180, _STEP):
+            window = np.arange(hue - _HALF, hue + _HALF + 1) % 180
+            if counts[window, saturation:].sum() > _GROUND * hsv[..., 0].size:
+                continue
+            low = np.array([(hue - _HALF) % 180, saturation, _VALUE])
+            mask = mask_range(hsv, low, np.array([(hue + _HALF) % 180, 255, 255]))
+            total = int(np.count_nonzero(mask))
+            if total >= least_area_px:
+                patches = find_patches(mask, least_area_px)
+                found += [_sample(hsv, mask, patches, k, total, picture) for k in _compact(patches, mask.size)]
+    return _distinct(sorted(found, key=lambda sample: -sample.score))
+
+
+def sample_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0) -> ColourSample | None:
+    """The saturated colour that most of a box x, y, width, height is of; None where nothing in it is saturated."""
+    x, y, width, height = box_px
+    part = hsv[y : y + height, x : x + width].reshape(-1, 3)
+    vivid = part[(part[:, 1] >= _SATURATIONS[0]) & (part[:, 2] >= _VALUE)]
+    if len(vivid) < max(4, len(part) // 10):
+        return None
+    count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
+    window = np.ones(2 * _HALF + 1)
+    around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], window, "valid")
+    most = vivid[np.abs(hue_difference(vivid[:, 0], float(around.argmax()))) <= _HALF]
+    return ColourSample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
+
+
+def pool_samples(samples: Sequence[Sequence[ColourSample]], count: int | None) -> list[list[ColourSample]]:
+    """The colours of several pictures, those of one hue together, best first: `count` of them, or those that are clear.
+
+    samples: of each picture.
+    """
+    groups: list[list[ColourSample]] = []
+    for sample in sorted((one for of in samples for one in of), key=lambda one: -one.score):
+        near = [group for group in groups if abs(hue_difference(group[0].hue, sample.hue)) < _APART]
+        if not near:
+            groups.append([sample])
+        elif all(one.picture != sample.picture for one in near[0]):
+            near[0].append(sample)
+    groups.sort(key=lambda group: -sum(one.score for one in group))
+    if count is not None:
+        return groups[:count]
+    return [group for group in groups if sum(one.score for one in group) >= _CLEAR * len(samples)]
+
+
+def build_ranges(
+    groups: Sequence[Sequence[ColourSample]], pictures: Sequence[np.ndarray], least_area_px: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
+
+    pictures: (H, W, 3) uint8 in hue, saturation, value. Hues are widened, up to half the gap to the next colour's, as
+    far as the range marks no more patches beside its own; saturations and values likewise.
+    """
+    middle = np.array([group[0].hue for group in groups])
+    ends = []
+    for group, hue in zip(groups, middle, strict=True):
+        pixels = np.concatenate([one.pixels for one in group]).astype(float)
+        away = np.percentile(hue_difference(pixels[:, 0], hue), _ENDS)
+        ends.append((away[0], away[1], *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
+    low, high, others = (np.zeros((len(groups), n), np.int64) for n in (3, 3, 1))
+    for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
+        down, up = _rooms(k, middle, ends)
+        best: int | None = None
+        for hue_margin, saturation_margin, value_margin in _MARGINS:
+            first = int(np.ceil(middle[k] + below - min(hue_margin, down)))
+            last = int(np.floor(middle[k] + above + min(hue_margin, up)))
+            least = (max(saturation - saturation_margin, _LOWEST[0]), max(value - value_margin, _LOWEST[1]))
+            lowest, highest = np.array([first % 180, *map(int, least)]), np.array([max(last, first) % 180, 255, 255])
+            count = sum(_others(hsv, lowest, highest, group, n, least_area_px) for n, hsv in enumerate(pictures))
+            if best is None or count < best:
+                best, low[k], high[k], others[k] = count, lowest, highest, count
+            if count == 0:
+                break
+    return low, high, others[:, 0]
+
+
+def name_hues(hues: Sequence[float]) -> list[str]:
+    """A name for each hue; those of one name are numbered."""
+    words = [min(HUES, key=lambda word: abs(hue_difference(HUES[word], hue))) for hue in hues]
+    return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
+
+
+def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> ColourSample:
+    x, y, width, height = (int(v) for v in patches.box_px[k])
+    seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
+    hue = _mean_hue(seen[:, 0])
+    # High for what is rare in the picture and in its surroundings.
+    around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
+    share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
+    # The middle of the box is all of it, also what the window of hue and saturation left out.
+    inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
+    alike = inner[(np.abs(hue_difference(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
+    pixels = np.concatenate([seen, alike])
+    return ColourSample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
+
+
+def _mean_hue(hues: np.ndarray) -> float:
+    return float(np.angle(np.exp(1j * np.pi * hues.astype(float) / 90).mean()) * 90 / np.pi % 180)
+
+
+def _compact(patches: Patches, picture_px: int) -> np.ndarray:
+    """The rows of patches that are compact like a vehicle's plate."""
+    sides = patches.box_px[:, 2:]
+    fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
+    long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
+    return np.flatnonzero((fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * picture_px))
+
+
+def _distinct(samples: list[ColourSample]) -> list[ColourSample]:
+    kept: list[ColourSample] = []
+    for sample in samples:
+        if all(
+            abs(hue_difference(sample.hue, one.hue)) >= _APART and not _meet(sample.box_px, one.box_px) for one in kept
+        ):
+            kept.append(sample)
+    return kept
+
+
+def _meet(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    return all(a[i] < b[i] + b[i + 2] and b[i] < a[i] + a[i + 2] for i in (0, 1))
+
+
+def _rooms(k: int, middle: np.ndarray, ends: Sequence[tuple[float, ...]]) -> tuple[float, float]:
+    """How far a range of hues may be widened down and up: just under half the gap to the next colour's."""
+    down, up = 90.0, 90.0
+    for j in range(len(middle)):
+        if j != k:
+            ahead = (middle[j] - middle[k]) % 180
+            up = min(up, (ahead + ends[j][0] - ends[k][1] - 1) / 2)
+            down = min(down, (180 - ahead - ends[j][1] + ends[k][0] - 1) / 2)
+    return down, up
+
+
+def _others(
+    hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[ColourSample], picture: int, least_area_px: int
+) -> int:
+    """Number of patches that a range marks in a picture beside the colour's own."""
+    patches = find_patches(mask_range(hsv, low, high), least_area_px)
+    own = [one.box_px for one in group if one.picture == picture]
+    boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in patches.box_px]
+    return sum(not any(_meet(box, mine) for mine in own) for box in boxes)
+
+
+def hue_difference(hue: np.ndarray | float, other: float) -> np.ndarray:
+    """How far hues are from another, in [-90, 90)."""
+    return (np.asarray(hue, float) - other + 90) % 180 - 90

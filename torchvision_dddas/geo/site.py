@@ -9,7 +9,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.terrain import ground_height
+from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 

@@ -21,7 +21,7 @@ from torchvision_dddas.geo import (
     without_pixels,
 )
 from torchvision_dddas.geo.colours import load_colours
-from torchvision_dddas.geo.plane_solvers import load_solver
+from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho

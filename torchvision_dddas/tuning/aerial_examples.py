@@ -14,7 +14,7 @@ from torchvision_dddas.evaluation.studies.scoring import whose_places
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.geo import AerialLocator, Targets, check_table
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
-from torchvision_dddas.geo.terrain import surface_of
+from torchvision_dddas.geo.projection import surface_of
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
 from torchvision_dddas.pipeline import Pipeline

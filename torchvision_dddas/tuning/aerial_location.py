@@ -27,8 +27,7 @@ from torchvision_dddas.geo.pose_estimation import (
     linearize_pose,
     pose_prior,
 )
-from torchvision_dddas.geo.projection import ground_with_slopes
-from torchvision_dddas.geo.terrain import Surface
+from torchvision_dddas.geo.projection import Surface, ground_with_slopes
 from torchvision_dddas.tuning.parameters import value_of
 from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 
