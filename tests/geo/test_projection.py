@@ -12,8 +12,7 @@ from torchvision_dddas.geo.pose_estimation import move_pose
 from torchvision_dddas.geo.projection import (
     axes_of,
     distort_pixels,
-    normalize,
-    normalize_with_slopes,
+    ground_with_slopes,
     project,
     project_with_slopes,
     rays,
@@ -64,14 +63,20 @@ def test_slopes_of_the_projection_are_its_differences(camera):
         assert np.allclose((there - back) / 2e-6, by_point[:, :, axis], rtol=1e-5, atol=1e-4)
 
 
-def test_slopes_of_the_lift_are_its_differences():
+@pytest.mark.parametrize("surface", [None, lambda there: 0.2 * there[:, 0] - 0.1 * there[:, 1]])
+def test_slopes_of_the_ground_are_its_differences(surface):
     pixels = np.array([[200.0, 100.0], [1500.0, 900.0]])
-    _, by_pixel, by_focal = normalize_with_slopes(pixels, 1.0, BENT)
-    for axis, step in enumerate(1e-3 * np.eye(2)):
-        apart = normalize(pixels + step, 1.0, BENT) - normalize(pixels - step, 1.0, BENT)
-        assert np.allclose(apart / 2e-3, by_pixel[:, :, axis], rtol=1e-4, atol=1e-9)
-    apart = normalize(pixels, np.exp(1e-5), BENT) - normalize(pixels, np.exp(-1e-5), BENT)
-    assert np.allclose(apart / 2e-5, by_focal, rtol=1e-4)
+
+    def ground(pose, at):
+        return ground_with_slopes(pose, BENT, at, 0.5, surface)[0]
+
+    _, by_pose, by_pixel = ground_with_slopes(ABOVE, BENT, pixels, 0.5, surface)
+    for axis, step in enumerate(1e-4 * np.eye(2)):
+        apart = ground(ABOVE, pixels + step) - ground(ABOVE, pixels - step)
+        assert np.allclose(apart / 2e-4, by_pixel[:, :, axis], rtol=1e-3, atol=1e-6)
+    for axis, step in enumerate(1e-5 * np.eye(7)):
+        apart = ground(move_pose(ABOVE, step), pixels) - ground(move_pose(ABOVE, -step), pixels)
+        assert np.allclose(apart / 2e-5, by_pose[:, :, axis], rtol=1e-3, atol=1e-3)
 
 
 @given(st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3))

@@ -24,7 +24,6 @@ from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, La
 from torchvision_dddas.geo.plane_homography import (
     LEAST,
     PlaneSolver,
-    absolute_covariance,
     load_solver,
     locate_pixels,
     relative_width,
@@ -219,7 +218,7 @@ class AerialLocator:
             np.full(len(rows), fix.frame),
             target,
             place,
-            absolute_covariance(relative, self.settings.landmarks.common_sigma_m),
+            relative + self.settings.landmarks.common_sigma_m**2 * np.eye(2),
             targets.score[rows],
             origin,
             None if origin is None else geometry.lonlat(place, origin),

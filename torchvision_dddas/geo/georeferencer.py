@@ -1,4 +1,10 @@
-"""How the pictures of a clip map to the ground."""
+"""How the pictures of a clip map to the ground, frame by frame, with slow errors estimated over all frames so far.
+
+The errors of telemetry and of the landmarks' receivers change slowly, so many frames estimate them. Each is an
+Ornstein-Uhlenbeck process plus noise. Together they have the standard deviation that the error is said to have; the
+process decays by a time constant. So the first frame is like a single picture, later ones gain in what is independent,
+pixels and motion, and no confidence grows beyond what slow errors allow.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -7,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.geo.landmark_faults import LandmarkCheck, check_landmarks, passes, reorder_pixels
+from torchvision_dddas.geo.landmark_faults import LandmarkCheck, check_landmarks, passes, reorder_pixels, try_repairs
 from torchvision_dddas.geo.plane_homography import (
     LEAST,
     PlaneSolver,
@@ -26,44 +32,21 @@ from torchvision_dddas.geo.pose_estimation import (
     independent_expectation,
     pose_prior,
 )
-from torchvision_dddas.geo.projection import project_with_slopes, undistort_pixels
-from torchvision_dddas.geometry import slope_of_turn
+from torchvision_dddas.geo.projection import undistort_pixels
 from torchvision_dddas.types import Camera, Fix, Flight, LandmarkObservations
 
 # A landmark not seen for so many time constants is forgotten.
-FORGOTTEN = 4.0
+_FORGOTTEN = 4.0
 # A receiver whose standard deviation changes by more than this factor works another way: its error is another.
-ANOTHER = 1.5
+_ANOTHER = 1.5
+# Share of the log likelihood of a hypothesis that is kept from frame to frame.
+_KEPT_LIKELIHOOD = 0.95
+# No single frame counts against a hypothesis by more than this: a report may jump.
+_MOST_EVIDENCE = 15.0
+_POSE_PARTS = np.array(["heading", "heading", "heading", "place", "place", "altitude", "focal length"])
 
-
-@dataclass(frozen=True)
-class LinearizedImage:
-    """The pixels of k of n landmarks as a linear function of the errors of telemetry and reports: truth less report.
-
-    shown_px: (2k,) slopes times the errors, plus noise of variance_px2 (2k,). slopes: (2k, 7 + 2n). used: (n,) bool.
-    """
-
-    shown_px: np.ndarray
-    slopes: np.ndarray
-    variance_px2: np.ndarray
-    used: np.ndarray
-
-
-def linearize_image(
-    marks: LandmarkObservations, camera: Camera, used: np.ndarray, solution: Solution
-) -> LinearizedImage:
-    """The picture of one frame, linear about its solution. The telemetry must give all seven of the pose."""
-    points = np.column_stack([solution.places, marks.up_m])[used]
-    seen, by_pose, by_point = project_with_slopes(points, solution.pose, camera)
-    k = len(points)
-    slopes = np.zeros((k, 2, 7 + 2 * len(used)))
-    slopes[:, :, :7] = by_pose
-    slopes[:, :, :3] = by_pose[:, :, :3] @ np.linalg.inv(slope_of_turn(solution.correction[:3]))
-    for row, landmark in enumerate(np.flatnonzero(used).tolist()):
-        slopes[row, :, 7 + 2 * landmark : 9 + 2 * landmark] = by_point[row, :, :2]
-    flat = slopes.reshape(2 * k, -1)
-    missing = (marks.image_px[used] - seen).ravel()
-    return LinearizedImage(missing + flat @ solution.correction, flat, np.repeat(marks.pixel_sigma[used], 2) ** 2, used)
+Degrees = tuple[np.ndarray, tuple[float, float]]
+"""Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +61,27 @@ class ErrorPersistence:
     telemetry: float = 0.9
     landmarks: float = 1.0
     pace: float = 1.0
+
+
+# Which errors of a vehicle and its landmarks persist is unknown: the hypothesis that predicts the pictures best counts.
+_HYPOTHESES = (
+    ErrorPersistence(),
+    ErrorPersistence(pace=5.0),
+    ErrorPersistence(pace=25.0),
+    ErrorPersistence(telemetry=0.5),
+    ErrorPersistence(telemetry=0.0),
+    ErrorPersistence(landmarks=0.0),
+    ErrorPersistence(telemetry=0.0, landmarks=0.0, pace=np.inf),
+)
+
+
+@lru_cache(maxsize=256)
+def _persistent_share(persistence: ErrorPersistence, size: int) -> np.ndarray:
+    """Share of each standard deviation that persists; that of a focal length does. Cached and read-only."""
+    share = np.full(size, np.sqrt(persistence.landmarks))
+    share[:6], share[6] = np.sqrt(persistence.telemetry), 1.0
+    share.flags.writeable = False
+    return share
 
 
 @dataclass(frozen=True)
@@ -96,95 +100,76 @@ class BiasFilter:
     sigma: np.ndarray = field(default_factory=lambda: np.full(7, np.nan))
     persistence: ErrorPersistence = ErrorPersistence()
 
-    @property
-    def is_updated(self) -> bool:
-        """Whether any frame has contributed."""
-        return bool(self.mean.any())
-
     def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "BiasFilter":
-        """The filter at a later time, with new landmarks added."""
+        """The filter at a later time, with new landmarks added, and without those not seen for too long."""
         correlation_s /= self.persistence.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
-        known, before = np.flatnonzero(prior.known), self._of(time_s, marks, FORGOTTEN * correlation_s)
-        was, size = before.sigma, len(before.mean)
+        before = self
+        staying = np.isin(self.ids, marks.landmark) | (time_s - self.seen_s <= _FORGOTTEN * correlation_s)
+        new = marks.landmark[~np.isin(marks.landmark, self.ids)]
+        if len(new) or not staying.all():
+            rows = np.r_[np.arange(7), (7 + 2 * np.flatnonzero(staying)[:, None] + [0, 1]).ravel()]
+            more = (0, 2 * len(new))
+            before = replace(
+                self,
+                ids=np.r_[self.ids[staying], new].astype(np.int64),
+                seen_s=np.r_[self.seen_s[staying], np.full(len(new), time_s)],
+                mean=np.pad(self.mean[rows], more),
+                covariance=np.pad(self.covariance[np.ix_(rows, rows)], more),
+                sigma=np.pad(self.sigma[rows], more, constant_values=np.nan),
+            )
+        was, share = before.sigma, before._share
         sigma = was.copy()
-        sigma[known] = 1 / np.sqrt(np.diag(prior.information)[known])
-        sigma[error_rows(before.ids, marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
+        sigma[:7][prior.known] = 1 / np.sqrt(np.diag(prior.information)[prior.known])
+        sigma[before.rows_of(marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
         with np.errstate(invalid="ignore"):
             grown = sigma / was
         # The altitude's sigma may be a share of the altitude, and grows with it.
-        grown[7:] = np.where((grown[7:] < ANOTHER) & (grown[7:] > 1 / ANOTHER), grown[7:], 0.0)
+        grown[7:] = np.where((grown[7:] < _ANOTHER) & (grown[7:] > 1 / _ANOTHER), grown[7:], 0.0)
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
-        filled = np.where(np.isfinite(sigma), sigma, 0.0) * self._slow(size)
-        was = was * self._slow(size)
+        now, was = (np.where(np.isfinite(each * share), each * share, 0.0) for each in (sigma, was))
         covariance = before.covariance * np.outer(factor, factor)
         # Process noise: what each error has beyond the kept part of its standard deviation.
-        covariance[np.diag_indices(size)] += filled**2 - (factor * np.where(np.isfinite(was), was, 0.0)) ** 2
+        covariance[np.diag_indices(len(was))] += now**2 - (factor * was) ** 2
         return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
-
-    def _of(self, time_s: float, marks: LandmarkObservations, forgotten_s: float) -> "BiasFilter":
-        """The filter with new landmarks added, and those removed that were not seen for too long."""
-        seen, old = marks.landmark.tolist(), self.ids.tolist()
-        staying = [
-            row for row, identity in enumerate(old) if identity in seen or time_s - self.seen_s[row] <= forgotten_s
-        ]
-        new = [row for row, identity in enumerate(seen) if identity not in old]
-        if len(staying) == len(old) and not new:
-            return self
-        from_old = np.concatenate([np.arange(7), *(7 + 2 * row + np.arange(2) for row in staying)]).astype(int)
-        kept = len(from_old)
-        size = kept + 2 * len(new)
-        mean, covariance, sigma = np.zeros(size), np.zeros((size, size)), np.full(size, np.nan)
-        mean[:kept], sigma[:kept] = self.mean[from_old], self.sigma[from_old]
-        covariance[:kept, :kept] = self.covariance[np.ix_(from_old, from_old)]
-        ids = np.concatenate([self.ids[staying], marks.landmark[new]]).astype(np.int64)
-        seen_s = np.concatenate([self.seen_s[staying], np.full(len(new), time_s)])
-        return replace(self, ids=ids, seen_s=seen_s, mean=mean, covariance=covariance, sigma=sigma)
 
     def expected(self, prior: Prior, marks: LandmarkObservations) -> Expected:
         """What to expect of a frame's pose and landmarks; call `at` with that frame's time before."""
-        known, n = np.flatnonzero(prior.known), len(marks)
-        ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
-        theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
-        mean, information = np.zeros(7 + 2 * n), np.zeros((7 + 2 * n, 7 + 2 * n))
+        ours, theirs = self._matching_rows(prior.known, marks)
+        size = 7 + 2 * len(marks)
+        mean, information = np.zeros(size), np.zeros((size, size))
         mean[theirs] = self.mean[ours]
-        inverse = np.linalg.inv(self._seen(ours))
+        inverse = np.linalg.inv(self._in_one_frame(ours))
         information[np.ix_(theirs, theirs)] = (inverse + inverse.T) / 2
         return Expected(prior.pose, mean, information, prior.known)
 
-    def predict(self, marks: LandmarkObservations, linear: LinearizedImage) -> tuple[float, "BiasFilter"]:
+    def predict(
+        self, marks: LandmarkObservations, used: np.ndarray, shown_px: np.ndarray, slopes: np.ndarray
+    ) -> tuple[float, "BiasFilter"]:
         """Log density of a picture under the prediction, and the filter updated by it.
 
-        The telemetry must give all seven of the pose.
+        shown_px: (2m,) pixels of the landmarks used as a linear function of the errors, with slopes (2m, 7 + 2n). The
+        telemetry must give all seven of the pose.
         """
-        ours = np.concatenate([np.arange(7), error_rows(self.ids, marks.landmark)])
-        crossed = self.covariance[:, ours] @ linear.slopes.T
-        expected = linear.slopes @ self._seen(ours) @ linear.slopes.T + np.diag(linear.variance_px2)
-        surprise = linear.shown_px - linear.slopes @ self.mean[ours]
-        root = np.linalg.cholesky(expected)
-        white = np.linalg.solve(root, np.column_stack([surprise, crossed.T]))
+        ours, _ = self._matching_rows(np.ones(7, bool), marks)
+        variance = np.repeat(marks.pixel_sigma[used], 2) ** 2
+        crossed = self.covariance[:, ours] @ slopes.T
+        root = np.linalg.cholesky(slopes @ self._in_one_frame(ours) @ slopes.T + np.diag(variance))
+        innovation = shown_px - slopes @ self.mean[ours]
+        white = np.linalg.solve(root, np.column_stack([innovation, crossed.T]))
         density = -0.5 * float(white[:, 0] @ white[:, 0]) - float(np.log(np.diag(root)).sum())
         covariance = self.covariance - white[:, 1:].T @ white[:, 1:]
-        mean = self.mean + white[:, 1:].T @ white[:, 0]
-        return density, self._with(mean, covariance, marks.landmark[linear.used])
+        return density, self._with(self.mean + white[:, 1:].T @ white[:, 0], covariance, marks.landmark[used])
 
     def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "BiasFilter":
         """The filter updated by a frame's solution, including errors that are correlated with those observed."""
-        known, n = np.flatnonzero(prior.known), len(marks)
-        ours = np.concatenate([known, error_rows(self.ids, marks.landmark)])
-        theirs = np.concatenate([known, np.arange(7, 7 + 2 * n)])
-        before = self._seen(ours)
+        ours, theirs = self._matching_rows(prior.known, marks)
+        before = self._in_one_frame(ours)
         gain = np.linalg.solve(before, self.covariance[ours]).T
         now = solution.correction_covariance[np.ix_(theirs, theirs)]
         mean = self.mean + gain @ (solution.correction[theirs] - self.mean[ours])
-        covariance = self.covariance + gain @ (now - before) @ gain.T
-        return self._with(mean, covariance, marks.landmark[used])
-
-    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "BiasFilter":
-        ids = set(seen.tolist())
-        seen_s = np.array([self.time_s if i in ids else t for i, t in zip(self.ids.tolist(), self.seen_s, strict=True)])
-        return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
+        return self._with(mean, self.covariance + gain @ (now - before) @ gain.T, marks.landmark[used])
 
     def forget(self, rows: np.ndarray) -> "BiasFilter":
         """The filter with some of its errors as before any frame."""
@@ -192,68 +177,38 @@ class BiasFilter:
         mean[rows] = 0
         covariance[rows] = 0
         covariance[:, rows] = 0
-        slow = (self.sigma * self._slow(len(mean)))[rows]
-        covariance[rows, rows] = np.where(np.isfinite(slow), slow, 0.0) ** 2
+        persistent = (self.sigma * self._share)[rows]
+        covariance[rows, rows] = np.where(np.isfinite(persistent), persistent, 0.0) ** 2
         return replace(self, mean=mean, covariance=covariance)
 
-    def _seen(self, rows: np.ndarray) -> np.ndarray:
+    def rows_of(self, wanted: np.ndarray) -> np.ndarray:
+        """The rows of the two errors of each wanted landmark."""
+        row = {identity: 7 + 2 * k for k, identity in enumerate(self.ids.tolist())}
+        return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)
+
+    def _matching_rows(self, known: np.ndarray, marks: LandmarkObservations) -> tuple[np.ndarray, np.ndarray]:
+        """The rows here, and those in a Solution, of the known parts of the pose and of landmarks."""
+        pose = np.flatnonzero(known)
+        return np.r_[pose, self.rows_of(marks.landmark)], np.r_[pose, 7 : 7 + 2 * len(marks)]
+
+    def _with(self, mean: np.ndarray, covariance: np.ndarray, seen: np.ndarray) -> "BiasFilter":
+        seen_s = np.where(np.isin(self.ids, seen), self.time_s, self.seen_s)
+        return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
+
+    def _in_one_frame(self, rows: np.ndarray) -> np.ndarray:
         """The covariance of errors in a single frame: the persistent part plus what is new in every frame."""
-        sigma = self.sigma[rows]
-        return self.covariance[np.ix_(rows, rows)] + np.diag(sigma**2 * (1 - self._slow(len(self.mean))[rows] ** 2))
+        return self.covariance[np.ix_(rows, rows)] + np.diag(self.sigma[rows] ** 2 * (1 - self._share[rows] ** 2))
 
-    def _slow(self, size: int) -> np.ndarray:
-        return _slow(self.persistence, size)
-
-
-@lru_cache(maxsize=256)
-def _slow(persistence: ErrorPersistence, size: int) -> np.ndarray:
-    """Share of each standard deviation that persists; a focal length does. Cached and read-only."""
-    share = np.full(size, np.sqrt(persistence.landmarks))
-    share[:6], share[6] = np.sqrt(persistence.telemetry), 1.0
-    share.flags.writeable = False
-    return share
-
-
-def error_rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The rows of the two errors of each wanted landmark."""
-    row = {identity: 7 + 2 * k for k, identity in enumerate(ids.tolist())}
-    return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)
-
-
-Degrees = tuple[np.ndarray, tuple[float, float]]
-"""Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
-
-_POSE_PARTS = ("heading", "heading", "heading", "place", "place", "altitude", "focal length")
-# Which errors of a vehicle and its landmarks persist is unknown: the hypothesis that predicts the pictures best counts.
-HYPOTHESES = (
-    ErrorPersistence(),
-    ErrorPersistence(pace=5.0),
-    ErrorPersistence(pace=25.0),
-    ErrorPersistence(telemetry=0.5),
-    ErrorPersistence(telemetry=0.0),
-    ErrorPersistence(landmarks=0.0),
-    ErrorPersistence(telemetry=0.0, landmarks=0.0, pace=np.inf),
-)
-
-# Share of the log likelihood of a hypothesis that is kept from frame to frame.
-_KEPT_LIKELIHOOD = 0.95
-# No single frame counts against a hypothesis by more than this: a report may jump.
-_MOST_EVIDENCE = 15.0
-
-
-@dataclass(frozen=True)
-class _Repair:
-    """The repair of the last frame: whose pixels landmarks had, and which were left out."""
-
-    pixels_of: dict[int, int]
-    without: frozenset[int]
+    @property
+    def _share(self) -> np.ndarray:
+        return _persistent_share(self.persistence, len(self.mean))
 
 
 class Georeferencer:
     """Finds how each frame of a clip maps to the ground. Call `update` with the frames in order.
 
     solver: for the plane homography. focal_known: the camera's focal length is given, not guessed. names: of the
-    landmarks, for messages. ground_up_m: height of the ground that altitudes are measured from.
+    landmarks, for messages.
     """
 
     def __init__(
@@ -263,14 +218,14 @@ class Georeferencer:
         solver: PlaneSolver,
         focal_known: bool = True,
         names: tuple[str, ...] = (),
-        ground_up_m: float = 0.0,
     ) -> None:
-        self.camera, self.settings, self.solver = camera, settings, solver
-        self.focal_known, self.names, self.ground_up_m = focal_known, names, ground_up_m
-        hypotheses = HYPOTHESES if settings.aerial.correlation_s > 0 else HYPOTHESES[-1:]
-        self.filters = [BiasFilter(persistence=hypothesis) for hypothesis in hypotheses]
-        self.likelihood = np.zeros(len(hypotheses))
-        self.repair = _Repair({}, frozenset())
+        self.camera, self.parameters, self.solver = camera, settings.aerial, solver
+        self.focal_known, self.names = focal_known, names
+        hypotheses = _HYPOTHESES if settings.aerial.correlation_s > 0 else _HYPOTHESES[-1:]
+        self._filters = [BiasFilter(persistence=hypothesis) for hypothesis in hypotheses]
+        self._likelihood = np.zeros(len(hypotheses))
+        # The repair of the last frame: whose pixels landmarks had, and which were left out.
+        self._repair: tuple[dict[int, int], list[int]] = {}, []
 
     def update(
         self,
@@ -285,45 +240,58 @@ class Georeferencer:
         flight: the telemetry at the frame, its place in local metres; None without telemetry. marks: the landmarks,
         places in local metres; rows without pixel or place do not count. degrees, for aerial.mode = paper.
         """
-        parameters = self.settings.aerial
         usable, changes = self._usable(marks)
         if degrees is not None:
             degrees = (np.asarray(degrees[0], float)[usable], degrees[1])
-        seen = marks[usable]
-        prior = pose_prior(flight, self.camera, parameters, self.ground_up_m, self.focal_known)
-        if parameters.mode == "pose":
-            fix = self._by_pose(frame, time_s, prior, seen)
+        prior = pose_prior(flight, self.camera, self.parameters, self.focal_known)
+        if self.parameters.mode == "pose":
+            fix = self._by_pose(frame, time_s, prior, marks[usable])
         else:
-            fix = self._by_homography(frame, prior, seen, degrees)
-        return _with_unusable(fix, marks, usable, changes)
+            fix = self._by_homography(frame, prior, marks[usable], degrees)
+        # Landmarks that are in the picture but could not be used are excluded.
+        shown = usable | np.isfinite(marks.image_px).all(axis=1)
+        states = iter(fix.state)
+        state = tuple(next(states) if can else "excluded" for can in usable[shown].tolist())
+        return replace(fix, landmark=marks.landmark[shown], state=state, changes=changes + fix.changes)
+
+    def _usable(self, marks: LandmarkObservations) -> tuple[np.ndarray, tuple[str, ...]]:
+        """The rows with pixel and place, each landmark once; and why others are left out."""
+        in_picture = np.isfinite(marks.image_px).all(axis=1)
+        placed = np.isfinite(marks.east_north_m).all(axis=1) & np.isfinite(marks.sigma_m)
+        unplaced = marks.landmark[in_picture & ~placed].tolist()
+        changes = [f"{self._name(identity)} left out: its place is not known" for identity in unplaced]
+        usable = in_picture & placed
+        rows, first = np.flatnonzero(usable), np.unique(marks.landmark[usable], return_index=True)[1]
+        for row in np.delete(rows, first).tolist():
+            usable[row] = False
+            changes.append(f"{self._name(int(marks.landmark[row]))} left out where it is seen a second time")
+        return usable, tuple(changes)
 
     def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: LandmarkObservations) -> Fix:
-        parameters, n = self.settings.aerial, len(marks)
-        cause = _describe_refusal(frame, prior, marks, parameters.least_spread)
-        bare = focal_prior(self.camera, parameters, self.focal_known)
-        self.filters = [bias.at(time_s, prior or bare, marks, parameters.correlation_s) for bias in self.filters]
-        best = int(self.likelihood.argmax())
-        before = self.filters[best]
+        cause = _describe_refusal(frame, prior, marks, self.parameters.least_spread)
+        bare = focal_prior(self.camera, self.parameters, self.focal_known)
+        correlation_s = self.parameters.correlation_s
+        self._filters = [bias.at(time_s, prior or bare, marks, correlation_s) for bias in self._filters]
+        best = int(self._likelihood.argmax())
+        before = self._filters[best]
         if cause:
             return no_fix(frame, marks, cause)
         if prior is None:
             # By landmarks alone a tilt and its mirror are hard to tell apart: in the filter a wrong one would persist.
             before = before.forget(np.arange(len(before.mean)))
         check, before = self._check(before, prior or bare, marks, None if prior is None else bare)
-        solution = check.solution
+        solution, cause = check.solution, check.cause
         if solution is None:
             no_pose = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
-            cause = check.cause or no_pose
-            return no_fix(frame, marks, cause)
+            return no_fix(frame, marks, cause or no_pose)
         if prior is not None and check.passed and not check.alone:
             self._update_filters(prior, reorder_pixels(marks, check.order), check.used, solution)
-            self.filters[best] = before.after(prior, marks, check.used, solution)
+            self._filters[best] = before.after(prior, marks, check.used, solution)
         count = int(check.used.sum())
-        cause = check.cause
-        if not cause and count < LEAST:
-            cause = (
-                f"frame {frame} has no landmark: by telemetry alone" if count == 0 else describe_too_few(frame, count)
-            )
+        if not cause and count == 0:
+            cause = f"frame {frame} has no landmark: by telemetry alone"
+        elif not cause and count < LEAST:
+            cause = describe_too_few(frame, count)
         return Fix(
             frame,
             "pose" if count else "telemetry",
@@ -331,120 +299,93 @@ class Georeferencer:
             solution.covariance[:7, :7],
             landmark=marks.landmark,
             state=check.state,
-            chi2=solution.cost if n else float("nan"),
-            freedom=solution.freedom if n else 0,
+            chi2=solution.cost if len(marks) else float("nan"),
+            freedom=solution.freedom if len(marks) else 0,
             changes=check.changes,
             cause=cause,
         )
 
     def _update_filters(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> None:
         """Compare the prediction of each hypothesis with the picture, and update its filter."""
-        if len(self.filters) == 1 or not (prior.known.all() and used.any()):
+        if len(self._filters) == 1 or not (prior.known.all() and used.any()):
             return
-        linear = linearize_image(marks, self.camera, used, solution)
-        updated = [bias.predict(marks, linear) for bias in self.filters]
-        density = np.array([density for density, _ in updated])
-        self.likelihood = _KEPT_LIKELIHOOD * self.likelihood + np.maximum(density - density.max(), -_MOST_EVIDENCE)
-        self.filters = [bias for _, bias in updated]
+        slopes = solution.slopes.copy()
+        slopes[:, :3] = slopes[:, :3] @ np.linalg.inv(solution.by_turn)
+        shown_px = solution.missing + slopes @ solution.correction
+        density, self._filters = map(
+            list, zip(*(bias.predict(marks, used, shown_px, slopes) for bias in self._filters), strict=True)
+        )
+        evidence = np.maximum(np.array(density) - max(density), -_MOST_EVIDENCE)
+        self._likelihood = _KEPT_LIKELIHOOD * self._likelihood + evidence
 
     def _check(
         self, before: BiasFilter, prior: Prior, marks: LandmarkObservations, bare: Prior | None
     ) -> tuple[LandmarkCheck, BiasFilter]:
         """The landmarks tested against the filter, and the filter to go on with."""
-        gate, n = self.settings.aerial.gate_probability, len(marks)
+        gate, n, identities = self.parameters.gate_probability, len(marks), marks.landmark.tolist()
         everyone, itself = np.ones(n, bool), np.arange(n)
-        solution = find_pose(marks, self.camera, before.expected(prior, marks))
-        if passes(solution, gate):
-            self.repair = _Repair({}, frozenset())
-            return LandmarkCheck(solution, itself, everyone), before
-        alone = None if bare is None else independent_expectation(bare, marks.sigma_m)
-        names = tuple(self._name(identity) for identity in marks.landmark.tolist())
-        known = self._last_repair(marks)
-        if known is not None:
-            check = check_landmarks(
-                marks, self.camera, before.expected(prior, marks), gate, names, known=known, only=True
-            )
-            if check.passed:
-                return check, before
-        for bias in self._forgetting(before, prior, marks):
-            expected = bias.expected(prior, marks)
-            solution = find_pose(marks, self.camera, expected)
+        expected = before.expected(prior, marks)
+        first = find_pose(marks, self.camera, expected)
+        if passes(first, gate):
+            self._repair = {}, []
+            return LandmarkCheck(first, itself, everyone), before
+        names = tuple(self._name(identity) for identity in identities)
+        # The repair of the last frame, where it applies to this frame's landmarks, before all others.
+        pixels_of, without = self._repair
+        rows = {identity: k for k, identity in enumerate(identities)}
+        order = np.array([rows.get(pixels_of.get(identity, identity), -1) for identity in identities], int)
+        if (pixels_of or without) and sorted(order) == list(range(n)):
+            known = [(order, ~np.isin(marks.landmark, without))]
+            if repaired := try_repairs(known, first, marks, self.camera, expected, gate, names):
+                return repaired, before
+        for bias in self._forgetting(before, marks):
+            solution = find_pose(marks, self.camera, bias.expected(prior, marks))
             if passes(solution, gate):
                 return LandmarkCheck(solution, itself, everyone), bias
+        alone = None if bare is None else independent_expectation(bare, marks.sigma_m)
         for bias in (before, before.forget(np.arange(len(before.mean)))):
             check = check_landmarks(marks, self.camera, bias.expected(prior, marks), gate, names, alone)
             if check.passed:
                 break
-        identities = marks.landmark.tolist()
-        self.repair = _Repair(
-            {a: identities[b] for a, b in zip(identities, check.order.tolist(), strict=True) if a != identities[b]},
-            frozenset(marks.landmark[~check.used].tolist()),
-        )
+        pairs = zip(identities, marks.landmark[check.order].tolist(), strict=True)
+        self._repair = {a: b for a, b in pairs if a != b}, marks.landmark[~check.used].tolist()
         return check, bias
 
-    def _forgetting(self, before: BiasFilter, prior: Prior, marks: LandmarkObservations) -> Iterator[BiasFilter]:
+    def _forgetting(self, before: BiasFilter, marks: LandmarkObservations) -> Iterator[BiasFilter]:
         """Filters with part of the past forgotten, for a report that jumps within its errors."""
-        if not before.is_updated:
-            return
-        yield before.forget(np.arange(7))
-        for identity in marks.landmark:
-            yield before.forget(error_rows(before.ids, np.array([identity])))
-        yield before.forget(np.arange(len(before.mean)))
+        if before.mean.any():
+            yield before.forget(np.arange(7))
+            for identity in marks.landmark:
+                yield before.forget(before.rows_of(np.array([identity])))
+            yield before.forget(np.arange(len(before.mean)))
 
     def _by_homography(
         self, frame: int, prior: Prior | None, marks: LandmarkObservations, degrees: Degrees | None
     ) -> Fix:
         """By landmarks alone; telemetry, where there is any, only tests their identities and places."""
-        parameters, n = self.settings.aerial, len(marks)
+        parameters, n = self.parameters, len(marks)
         paper = parameters.mode == "paper"
+        # Only a picture of a plane by a lens without distortion is a homography.
+        flat = marks if paper else replace(marks, image_px=undistort_pixels(marks.image_px, self.camera))
         if paper or prior is None or not prior.known.all() or n == 0:
-            seen = marks if paper else self._undistorted(marks)
-            return fix_by_homography(frame, seen, self.solver, parameters.least_spread, degrees, paper)
+            return fix_by_homography(frame, flat, self.solver, parameters.least_spread, degrees, paper)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         expected = independent_expectation(prior, marks.sigma_m)
         check = check_landmarks(marks, self.camera, expected, parameters.gate_probability, names)
         # Where no change explains the disagreement the telemetry may be wrong: the landmarks are used as reported.
-        kept = reorder_pixels(marks, check.order)[check.used] if check.passed else marks
-        fix = fix_by_homography(frame, self._undistorted(kept), self.solver, parameters.least_spread)
+        kept = reorder_pixels(flat, check.order)[check.used] if check.passed else flat
+        fix = fix_by_homography(frame, kept, self.solver, parameters.least_spread)
+        state = check.state if check.passed else ("used",) * n
         solution = check.solution
         return replace(
             fix,
             landmark=marks.landmark,
-            state=(check.state if check.passed else ("used",) * n) if fix.by else ("excluded",) * n,
+            state=state if fix.by else ("excluded",) * n,
             chi2=float("nan") if solution is None else solution.cost,
             freedom=0 if solution is None else solution.freedom,
             changes=check.changes,
             cause=fix.cause or check.cause,
         )
-
-    def _undistorted(self, marks: LandmarkObservations) -> LandmarkObservations:
-        """The landmarks as a lens without distortion shows them: only such a picture of a plane is a homography."""
-        return replace(marks, image_px=undistort_pixels(marks.image_px, self.camera))
-
-    def _usable(self, marks: LandmarkObservations) -> tuple[np.ndarray, tuple[str, ...]]:
-        """The rows with pixel and place, each landmark once; and why others are left out."""
-        in_picture = np.isfinite(marks.image_px).all(axis=1)
-        placed = np.isfinite(marks.east_north_m).all(axis=1) & np.isfinite(marks.sigma_m)
-        usable, unplaced = in_picture & placed, marks.landmark[in_picture & ~placed].tolist()
-        changes = [f"{self._name(identity)} left out: its place is not known" for identity in unplaced]
-        first: set[int] = set()
-        for row in np.flatnonzero(usable):
-            identity = int(marks.landmark[row])
-            if identity in first:
-                usable[row] = False
-                changes.append(f"{self._name(identity)} left out where it is seen a second time")
-            first.add(identity)
-        return usable, tuple(changes)
-
-    def _last_repair(self, marks: LandmarkObservations) -> tuple[np.ndarray, np.ndarray] | None:
-        """The repair of the last frame, for this frame's rows; None without one that applies."""
-        row = {identity: k for k, identity in enumerate(marks.landmark.tolist())}
-        if not (self.repair.pixels_of or self.repair.without):
-            return None
-        order = [row.get(self.repair.pixels_of.get(identity, identity), -1) for identity in row]
-        if sorted(order) != list(range(len(row))):
-            return None
-        return np.array(order), ~np.isin(marks.landmark, list(self.repair.without))
 
     def _name(self, identity: int) -> str:
         return self.names[identity] if 0 <= identity < len(self.names) else f"landmark {identity}"
@@ -458,15 +399,7 @@ def _describe_refusal(frame: int, prior: Prior | None, marks: LandmarkObservatio
             return describe_too_few(frame, n, " and no telemetry")
         return describe_one_line(frame, marks, least_spread)
     if 2 * n < int((~prior.known).sum()) or (n < 2 and not prior.known[2]):
-        lacking = " and ".join(dict.fromkeys(np.array(_POSE_PARTS)[~prior.known].tolist()))
+        lacking = " and ".join(dict.fromkeys(_POSE_PARTS[~prior.known].tolist()))
         has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
         return f"frame {frame} has {has}, too few where the telemetry does not say {lacking}"
     return ""
-
-
-def _with_unusable(fix: Fix, marks: LandmarkObservations, usable: np.ndarray, changes: tuple[str, ...]) -> Fix:
-    """The fix with the landmarks added that are in the picture but could not be used."""
-    seen = np.flatnonzero(usable | np.isfinite(marks.image_px).all(axis=1))
-    states = dict(zip(np.flatnonzero(usable).tolist(), fix.state, strict=True))
-    state = tuple(states.get(row, "excluded") for row in seen.tolist())
-    return replace(fix, landmark=marks.landmark[seen], state=state, changes=changes + fix.changes)

@@ -1,110 +1,83 @@
-"""The plane homography."""
+"""The plane homography from ground to picture by landmarks alone, its solvers, and pixels to places on the ground.
 
+The homography (appendix A, IV-B, eq. 6 to 11) has eight unknowns; each landmark is weighted by how well it is known.
+`paper` solves as the source does, by normal equations of raw degrees. Eq. (11) prints 1 where the last element of the
+inverse belongs; here it has its place. With a known pose of the camera, pixels go to the ground by rays instead.
+"""
+
+from collections.abc import Callable
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.geo.projection import Surface, ground_from_rays, inverse_2x2, undistort_pixels
+from torchvision_dddas.geo.projection import Surface, ground_with_slopes, inverse_2x2, undistort_pixels
 from torchvision_dddas.geometry import lonlat, transfer
 from torchvision_dddas.runtime import SHIPPED, opened, wants_torch
 from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 
-LEAST_POINTS = 4
+# Landmarks that a plane homography takes.
+LEAST = 4
+# A homography is refused whose depth at a landmark is no better known than this, as a share of it.
+_VAGUE = 0.3
+
+Solution = tuple[np.ndarray, np.ndarray]
+"""image_from_ground (B, 3, 3), h33 = 1, the identity where invalid, and whether each is valid (B,)."""
 
 
-class PlaneSolver(Protocol):
-    """Batched solver of plane homographies in float64."""
+class PlaneSolver:
+    """Batched solver of plane homographies in float64: the shipped ONNX graphs, or torch; they agree to 1e-6 px."""
 
-    name: str
+    def __init__(self, fit: Callable[..., Solution], fit_raw: Callable[..., Solution]) -> None:
+        """The functions of `functional.homography` on arrays."""
+        self._fit, self._fit_raw = fit, fit_raw
 
-    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """image_from_ground (B, 3, 3), h33 = 1, and whether each is valid (B,), from ground and image (B, n, 2).
+    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> Solution:
+        """Weighted least squares, Hartley-normalised, of ground and image (B, n, 2).
 
-        Weighted least squares, Hartley-normalised. weight: (B, n), 0 for a row that is padding.
+        weight: (B, n), 0 for a row that is padding, whatever it holds.
         """
-        ...
+        # Zero times NaN is not zero.
+        ground, image = (np.where(weight[..., None] > 0, points, 0.0) for points in (ground, image))
+        return self._solve(self._fit, ground, image, weight)
 
-    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same as the source solves it: normal equations of the given coordinates, such as degrees."""
-        ...
+    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> Solution:
+        """As the source solves it: normal equations of the given coordinates, such as degrees.
+
+        On an ill-conditioned system the two engines err differently.
+        """
+        return self._solve(self._fit_raw, ground, image)
+
+    @staticmethod
+    def _solve(fit: Callable[..., Solution], *arrays: np.ndarray) -> Solution:
+        count, n = arrays[0].shape[:2]
+        if n < LEAST or not count:
+            return np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, bool)
+        return fit(*(np.ascontiguousarray(array, np.float64) for array in arrays))
 
 
 def load_solver(backend: str) -> PlaneSolver:
     """The solver of a back end: auto, onboard or torch. Raises InputError for another name or missing packages."""
-    return TorchPlaneSolver() if wants_torch(backend) else OnnxPlaneSolver()
+    if not wants_torch(backend):
+        fit, fit_raw = open_graph("homography"), open_graph("homography_raw")
+        return PlaneSolver(
+            lambda ground, image, weight: fit.run(None, {"ground": ground, "image": image, "weight": weight}),
+            lambda ground, image: fit_raw.run(None, {"ground": ground, "image": image}),
+        )
+    import torch
 
+    from torchvision_dddas.functional import homography
 
-class OnnxPlaneSolver:
-    """PlaneSolver that runs the shipped ONNX graphs. They agree with the torch solver to 1e-6 px."""
+    def on_arrays(function: Callable[..., Any]) -> Callable[..., Solution]:
+        return lambda *arrays: tuple(result.numpy() for result in function(*map(torch.from_numpy, arrays)))
 
-    name = "onboard"
-
-    def __init__(self) -> None:
-        self.fit, self.fit_raw = open_graph("homography"), open_graph("homography_raw")
-
-    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See PlaneSolver. The graph is that of `functional.homography.fit`."""
-        ground, image, weight = (np.asarray(array, np.float64) for array in (ground, image, weight))
-        if weight.shape[1] < LEAST_POINTS or not len(weight):
-            return _invalid(len(weight))
-        if np.count_nonzero(weight) < weight.size:
-            # Padding may hold NaN, and zero times NaN is not zero.
-            ground, image = (np.where(weight[..., None] > 0, points, 0.0) for points in (ground, image))
-        matrix, valid = self.fit.run(None, {"ground": ground, "image": image, "weight": weight})
-        return matrix, valid
-
-    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See PlaneSolver. On an ill-conditioned system it and the torch solver err differently."""
-        ground, image = np.asarray(ground, np.float64), np.asarray(image, np.float64)
-        if ground.shape[1] < LEAST_POINTS or not len(ground):
-            return _invalid(len(ground))
-        matrix, valid = self.fit_raw.run(None, {"ground": ground, "image": image})
-        return matrix, valid
+    return PlaneSolver(on_arrays(homography.fit), on_arrays(homography.fit_raw))
 
 
 @cache
 def open_graph(name: str) -> Any:
     """An ONNX Runtime session of a shipped graph. Opening one takes longer than thousands of solutions."""
     return opened(SHIPPED, f"{name}.onnx")
-
-
-def _invalid(count: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, bool)
-
-
-class TorchPlaneSolver:
-    """PlaneSolver by `functional.homography`."""
-
-    name = "torch"
-
-    def __init__(self) -> None:
-        import torch
-
-        from torchvision_dddas.functional import homography
-
-        self._tensor, self._homography = torch.from_numpy, homography
-
-    def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See PlaneSolver."""
-        matrix, valid = self._homography.fit(*map(self._double, (ground, image, weight)))
-        return matrix.numpy(), valid.numpy()
-
-    def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See PlaneSolver."""
-        matrix, valid = self._homography.fit_raw(*map(self._double, (ground, image)))
-        return matrix.numpy(), valid.numpy()
-
-    def _double(self, array: np.ndarray) -> Any:
-        return self._tensor(np.ascontiguousarray(array, np.float64))
-
-
-# Landmarks that a plane homography takes.
-LEAST = 4
-
-
-# A homography is none whose depth at a landmark is no better known than this, as a share of it.
-VAGUE = 0.3
 
 
 def fix_by_homography(
@@ -124,10 +97,25 @@ def fix_by_homography(
     cause = describe_too_few(frame, n) if n < LEAST else describe_one_line(frame, marks, least_spread)
     if cause:
         return no_fix(frame, marks, cause)
-    if paper:
-        return _fix_as_printed(frame, marks, solver, degrees)
-    # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
+    degenerate = (
+        f"the {n} landmarks of frame {frame} allow no homography: three of four stand on one line, or two are swapped"
+    )
     middle = marks.east_north_m.mean(axis=0)
+    if paper:
+        given = marks.east_north_m if degrees is None else np.asarray(degrees[0], float)
+        matrix, valid = solver.solve_raw(given[None], marks.image_px[None])
+        if not valid[0] or not np.isfinite(matrix[0]).all():
+            return no_fix(frame, marks, degenerate)
+        ours = matrix[0]
+        if degrees is not None:
+            corner = lonlat(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), degrees[1])
+            degrees_from_metres = np.eye(3)
+            degrees_from_metres[:2, :2] = (corner[1:] - corner[0]).T
+            degrees_from_metres[:2, 2] = corner[0] - degrees_from_metres[:2, :2] @ middle
+            ours = ours @ degrees_from_metres
+        # Its errors are unknown.
+        return Fix(frame, "paper", image_from_ground=ours / ours[2, 2], landmark=marks.landmark, state=("used",) * n)
+    # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
     ground, image = marks.east_north_m - middle, marks.image_px
     variance = marks.pixel_sigma**2
     grown = np.linalg.norm(image - image.mean(axis=0)) / np.linalg.norm(ground)
@@ -135,23 +123,23 @@ def fix_by_homography(
     for again in (True, False):
         matrix, valid = solver.solve(ground[None], image[None], weight[None])
         if not valid[0] or not np.isfinite(matrix[0]).all():
-            return no_fix(frame, marks, _no_homography(frame, n))
+            return no_fix(frame, marks, degenerate)
         depth, by_ground, by_matrix = _slopes(ground, matrix[0])
         seen = np.eye(2) * variance[:, None, None]
         seen += by_ground @ by_ground.swapaxes(1, 2) * (marks.sigma_m**2)[:, None, None]
-        ours = weight * depth**2
+        applied = weight * depth**2
         if again:
-            # The solver's residuals are in pixels times this depth: now that it is known, each row weighs as it should.
+            # The solver's residuals are in pixels times this depth: now that it is known, each row is weighted rightly.
             weight = 2 / (depth**2 * np.trace(seen, axis1=1, axis2=2))
             weight = weight / weight.max()
     if (depth <= 0).any() and (depth >= 0).any():
-        return no_fix(frame, marks, _no_homography(frame, n))
-    information = np.einsum("n,nki,nkj->ij", ours, by_matrix, by_matrix)
-    spread_out = np.einsum("n,nki,nkl,nlj->ij", ours**2, by_matrix, seen, by_matrix)
+        return no_fix(frame, marks, degenerate)
+    information = np.einsum("n,nki,nkj->ij", applied, by_matrix, by_matrix)
+    spread_out = np.einsum("n,nki,nkl,nlj->ij", applied**2, by_matrix, seen, by_matrix)
     inverse = np.linalg.pinv(information, rcond=1e-15, hermitian=True)
     covariance = inverse @ spread_out @ inverse
     vague = np.sqrt(np.einsum("ni,ij,nj->n", ground, covariance[6:, 6:], ground)) / np.abs(depth)
-    if vague.max() > VAGUE:
+    if vague.max() > _VAGUE:
         cause = (
             f"the {n} landmarks of frame {frame} lie too near one line, three of them or all, for how well they are "
             "known: their homography would be no more than a guess; add a landmark off the line, or telemetry"
@@ -198,14 +186,11 @@ def relative_width(marks: LandmarkObservations) -> float:
 
     Receiver errors make a row on the ground wider than it is; in the picture it is a row whatever the errors.
     """
-    return min(spread(marks.east_north_m), spread(marks.image_px))
-
-
-def spread(points: Float[np.ndarray, "n 2"]) -> float:
-    """Width of a set of points as a share of its length."""
-    apart = points - points.mean(axis=0)
-    length, width = np.linalg.svd(apart, compute_uv=False)[:2]
-    return float(width / length) if length > 0 else 0.0
+    shares = []
+    for points in (marks.east_north_m, marks.image_px):
+        length, width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2]
+        shares.append(float(width / length) if length > 0 else 0.0)
+    return min(shares)
 
 
 def locate_pixels(
@@ -219,24 +204,36 @@ def locate_pixels(
     """East and north of what pixels show, and the covariance relative to the landmarks' team; NaN where there is none.
 
     sigma_px: standard deviation of u and of v each. up_m: height of what is seen above the ground: the plane up = 0 or
-    the surface. Where all that is known is a homography both are left aside. A ray that meets no ground gives NaN.
+    the surface. A homography uses neither of them.
     """
     pixels = np.asarray(pixels, float).reshape(-1, 2)
     if fix.pose is not None and fix.covariance is not None:
-        return ground_from_rays(fix.pose, fix.covariance, camera, pixels, sigma_px, up_m, surface)
+        ground, by_pose, by_pixel = ground_with_slopes(fix.pose, camera, pixels, up_m, surface)
+        covariance = by_pose @ fix.covariance @ by_pose.swapaxes(1, 2)
+        return ground, covariance + sigma_px**2 * by_pixel @ by_pixel.swapaxes(1, 2)
+    unknown = np.full((len(pixels), 2, 2), np.nan)
     if fix.image_from_ground is None:
-        return np.full((len(pixels), 2), np.nan), np.full((len(pixels), 2, 2), np.nan)
+        return unknown[:, 0], unknown
     if fix.by != "paper":
         pixels = undistort_pixels(pixels, camera)
     middle = np.array(fix.about_m)
     matrix = _about(fix.image_from_ground, middle)
-    ground, covariance = _by_inverse(matrix / matrix[2, 2], fix.matrix_covariance, pixels, sigma_px)
-    return ground + middle, covariance
-
-
-def absolute_covariance(relative_m2: Float[np.ndarray, "N 2 2"], common_sigma_m: float) -> Float[np.ndarray, "N 2 2"]:
-    """The covariance of absolute places: with the error that all receivers of the team share."""
-    return relative_m2 + common_sigma_m**2 * np.eye(2)
+    matrix = matrix / matrix[2, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        try:
+            ground = transfer(np.linalg.inv(matrix), pixels)
+        except np.linalg.LinAlgError:
+            ground = unknown[:, 0]
+        depth, by_ground, by_matrix = _slopes(ground, matrix)
+        # A point that a picture from above would show mirrored lies beyond the horizon.
+        ground = np.where((depth * np.linalg.det(matrix) < 0)[:, None], ground, np.nan)
+        if fix.matrix_covariance is None:
+            return ground + middle, unknown
+        by_pixel = inverse_2x2(by_ground)
+        seen = by_matrix @ fix.matrix_covariance @ by_matrix.swapaxes(1, 2) + sigma_px**2 * np.eye(2)
+        covariance = by_pixel @ seen @ by_pixel.swapaxes(1, 2)
+        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+    return ground + middle, np.where(np.isfinite(ground).all(axis=1)[:, None, None], covariance, np.nan)
 
 
 def _slopes(ground: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -258,49 +255,3 @@ def _about(matrix: np.ndarray, middle: np.ndarray) -> np.ndarray:
     shift = np.eye(3)
     shift[:2, 2] = middle
     return matrix @ shift
-
-
-def _no_homography(frame: int, n: int) -> str:
-    return (
-        f"the {n} landmarks of frame {frame} allow no homography: three of four stand on one line, or two are swapped"
-    )
-
-
-def _fix_as_printed(
-    frame: int, marks: LandmarkObservations, solver: PlaneSolver, degrees: tuple[np.ndarray, tuple[float, float]] | None
-) -> Fix:
-    """The source's solution, of raw degrees if given, in local metres; its errors are unknown."""
-    n = len(marks)
-    given = marks.east_north_m if degrees is None else np.asarray(degrees[0], float)
-    matrix, valid = solver.solve_raw(given[None], marks.image_px[None])
-    if not valid[0] or not np.isfinite(matrix[0]).all():
-        return no_fix(frame, marks, _no_homography(frame, n))
-    ours = matrix[0]
-    if degrees is not None:
-        middle = marks.east_north_m.mean(axis=0)
-        corner = lonlat(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), degrees[1])
-        degrees_from_metres = np.eye(3)
-        degrees_from_metres[:2, :2] = (corner[1:] - corner[0]).T
-        degrees_from_metres[:2, 2] = corner[0] - degrees_from_metres[:2, :2] @ middle
-        ours = ours @ degrees_from_metres
-    return Fix(frame, "paper", image_from_ground=ours / ours[2, 2], landmark=marks.landmark, state=("used",) * n)
-
-
-def _by_inverse(
-    matrix: np.ndarray, covariance: np.ndarray | None, pixels: np.ndarray, sigma_px: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Eq. (11). A point that a picture from above would show mirrored lies beyond the horizon: NaN."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        try:
-            found = transfer(np.linalg.inv(matrix), pixels)
-        except np.linalg.LinAlgError:
-            found = np.full((len(pixels), 2), np.nan)
-        depth, by_ground, by_matrix = _slopes(found, matrix)
-        found = np.where((depth * np.linalg.det(matrix) < 0)[:, None], found, np.nan)
-        by_pixel = inverse_2x2(by_ground)
-        if covariance is None:
-            return found, np.full((len(pixels), 2, 2), np.nan)
-        seen = by_matrix @ covariance @ by_matrix.swapaxes(1, 2) + sigma_px**2 * np.eye(2)
-        spread_m2 = by_pixel @ seen @ by_pixel.swapaxes(1, 2)
-        spread_m2 = (spread_m2 + spread_m2.swapaxes(1, 2)) / 2
-    return found, np.where(np.isfinite(found).all(axis=1)[:, None, None], spread_m2, np.nan)

@@ -20,7 +20,7 @@ import numpy as np
 
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.projection import undistort
+from torchvision_dddas.geo.projection import normalize
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
 # Least standard deviation of a box's edges, in pixels.
@@ -131,10 +131,7 @@ def touches_border(box_px: Float[np.ndarray, "N 4"], size_px: tuple[int, int]) -
 
 def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Pixels to (right, down) per metre of depth, without distortion and roll; NaN where the lens has no such pixel."""
-    x, y = (u - camera.centre_px[0]) / camera.focal_px[0], (v - camera.centre_px[1]) / camera.focal_px[1]
-    right, down = x, y
-    if camera.k1 or camera.k2:
-        right, down = undistort(x, y, camera)
+    right, down = normalize(np.stack([u, v], axis=1), camera).T
     sine, cosine = np.sin(camera.roll_rad), np.cos(camera.roll_rad)
     return right * cosine - down * sine, right * sine + down * cosine
 
