@@ -107,7 +107,7 @@ def confirm(
         record = output.begin(facts, header, rows)
         record.notes += notes if rows else [*notes, f"{blobs} has no rows: nothing to confirm"]
         record_results(output, record, found, "confirm", quiet=quiet)
-    kinds = record.kinds
+    kinds = {"human": 0, "not_human": 0, "unseen": 0, **record.counts["kinds"]}
     counts = f"{kinds['human']} human, {kinds['not_human']} not human, {kinds['unseen']} unseen"
     first = f"{record.frames} frames, {record.targets} blobs: {counts}"
     print_lines(closing_lines(first, record, out, ["confirmed.csv", "run.json"]), quiet)

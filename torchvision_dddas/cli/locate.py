@@ -169,9 +169,9 @@ def ground(
         record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
             record.notes.append("the tables have no rows: nobody to locate")
-    by = record.by
+    by = record.counts["sightings"]
     counts = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"
-    lines = [f"{record.frames} frames, {record.targets} sightings ({counts}), {record.people} positions"]
+    lines = [f"{record.frames} frames, {record.targets} sightings ({counts}), {record.counts['people']} positions"]
     if by["bearing"]:
         lines.append(f"note: {by['bearing']} sightings have a bearing but no distance (see sightings.csv)")
     files = [*(name for name in GroundRecorder.files if name != "run.json" and (out / name).exists()), "run.json"]

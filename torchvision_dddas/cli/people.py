@@ -21,7 +21,7 @@ from torchvision_dddas.cli.progress import closing_lines, folders_for, record_re
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.io.output.run_record import PeopleRecord
+    from torchvision_dddas.io.output import RunRecord
     from torchvision_dddas.people import WindowScorer
     from torchvision_dddas.types import DetectionTable, Source
 
@@ -82,29 +82,32 @@ def people(
                 "backend": scorer.name,
                 "settings": settings.model_dump(),
             }
-            record = output.begin(facts, source.rate_hz, source.exact and source.count == 1)
+            is_single = source.exact and source.count == 1
+            overlay = "overlay.png" if is_single else "overlay.mp4"
+            record = output.begin(facts, source.rate_hz, is_single)
             frames = detector.detect_in_clip(source, scorer, settings, table)
             record_results(output, record, frames, source.name, source.count, quiet, source)
             record.notes += [] if table is None else _notes(record, str(around), table, source)
-        files = ["detections.csv", "detections.txt", *(record.overlay for _ in names), "run.json"]
+        files = ["detections.csv", "detections.txt", *(overlay for _ in names), "run.json"]
         print_lines(closing_lines(_counts(record), record, folder, files), quiet)
 
 
-def _notes(record: "PeopleRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:
+def _notes(record: "RunRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:
     """What the user should know of a table that said where to search."""
     if table.last > source.last:
         return [f"the clip ended after frame {source.last}, {name} goes on to {table.last}"]
-    if record.nowhere:
+    if nowhere := record.counts["searched"]["frames_nowhere"]:
         what = f"{name} has no box there that a window fits" if len(table) else f"{name} holds no rows"
-        return [f"{record.nowhere} of {record.frames} frames were not searched: {what}"]
+        return [f"{nowhere} of {record.frames} frames were not searched: {what}"]
     return []
 
 
-def _counts(record: "PeopleRecord") -> str:
+def _counts(record: "RunRecord") -> str:
     found = f"{record.targets} {'person' if record.targets == 1 else 'people'}"
     line = f"{record.frames} frame{'s' * (record.frames != 1)}, {found}"
-    if record.unlikely:
-        line += f", {record.unlikely} of them unlikely"
-    if record.cut:
-        line += f", {record.cut} of them cut by the border"
-    return line if record.share >= 1 else f"{line}; {record.share:.0%} of the windows searched"
+    if unlikely := record.counts["unlikely"]:
+        line += f", {unlikely} of them unlikely"
+    if cut := record.counts["cut"]:
+        line += f", {cut} of them cut by the border"
+    share = record.counts["searched"]["share_of_windows"]
+    return line if share >= 1 else f"{line}; {share:.0%} of the windows searched"

@@ -100,9 +100,12 @@ def track(
         )
         if source is not None and table is not None and table.last > source.last:
             record.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
-    found = f"{record.frames} frames, {record.targets} detections, {record.tracked.identities} identities"
+    counts = record.counts
+    found = f"{record.frames} frames, {record.targets} detections, {counts.get('identities', 0)} identities"
     files = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in names), "run.json"]
-    print_lines(closing_lines(f"{found}, {record.tracked.untracked} detections without one", record, out, files), quiet)
+    print_lines(
+        closing_lines(f"{found}, {counts.get('untracked', 0)} detections without one", record, out, files), quiet
+    )
 
 
 def _track(

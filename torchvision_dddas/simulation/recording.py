@@ -195,47 +195,35 @@ class RecordingOutput(RunRecorder[RecordedFrame]):
 
         scenario: the text of scenario.toml. lonlat: (N, 2) longitudes and latitudes of (N, 2) local metres.
         """
-        record = RunRecord(self.folder, {**facts, "outputs": ["tables", *self.save]})
         texts = {"camera.toml": camera_toml(camera), "scenario.toml": scenario}
         if len(colours):
             texts["colours.toml"] = format_colours(colours)
-        parts: list[Part[RecordedFrame]] = [_Kept(record), _Texts(self.folder, texts)]
-        parts += [_Reports(self.folder), _Truth(self, lonlat)]
+        parts: dict[str, Part[RecordedFrame]] = {
+            "texts": _Texts(self.folder, texts),
+            "reports": _Reports(self.folder),
+            "truth": _Truth(self, lonlat),
+        }
         if "frames" in self.save:
-            parts.append(_Frames(self.folder / "frames"))
+            parts["frames"] = _Frames(self.folder / "frames")
         if "video" in self.save:
-            parts.append(_Video(self.folder, rate_hz, camera.size_px))
+            parts["video"] = _Video(self.folder, rate_hz, camera.size_px)
         if "ground" in self.save:
-            parts.append(_Ground(self.folder / "ground", colours.names))
-        self.add_parts(record, parts)
+            parts["ground"] = _Ground(self.folder / "ground", colours.names)
+        record = self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+        record.counts = {"events": [], "dropped": 0}
         return record
+
+    def _count(self, item: RecordedFrame) -> None:
+        truth, counts = item.truth, self.record.counts
+        counts["events"] += [{"frame": truth.frame, "time_s": truth.time_s, "what": what} for what in truth.events]
+        counts["dropped"] += item.image is None
+        targets = len(np.unique(truth.bodies.target[truth.bodies.kind != "ugv"]))
+        self.record.note(truth.frame, targets, item.seconds, cause="dropped" if item.image is None else None)
 
     @property
     def masks(self) -> bool:
         """Whether masks are to be written."""
         return "masks" in self.save
-
-
-class _Kept:
-    """The record of the run: frames, events, dropped frames."""
-
-    def __init__(self, record: RunRecord) -> None:
-        self._record = record
-        self._events: list[dict[str, Any]] = []
-        record.counts = {"events": self._events, "dropped": 0}
-
-    def write(self, item: RecordedFrame) -> None:
-        truth = item.truth
-        self._events += [{"frame": truth.frame, "time_s": truth.time_s, "what": what} for what in truth.events]
-        self._record.counts["dropped"] += item.image is None
-        targets = len(np.unique(truth.bodies.target[truth.bodies.kind != "ugv"]))
-        self._record.note(truth.frame, targets, item.seconds, cause="dropped" if item.image is None else None)
-
-    def close(self, complete: bool) -> None:
-        self._record.close(complete)
-
-    def discard(self) -> None:
-        self._record.discard()
 
 
 class _Texts:

@@ -1,8 +1,8 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
-from torchvision_dddas.io.output.ground_maps import Site
 from torchvision_dddas.io.output.live_session import RESULTS, Event, SessionLog, make_session_folder
-from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder, parse_save
+from torchvision_dddas.io.output.map_files import Site
+from torchvision_dddas.io.output.recorder import Part, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
     AerialRecorder,
     ConfirmationRecorder,
@@ -29,7 +29,6 @@ __all__ = [
     "Event",
     "GroundRecorder",
     "Part",
-    "PartOf",
     "PeopleRecorder",
     "PipelineRecorder",
     "RunRecord",

@@ -3,7 +3,6 @@
 results.jsonl grows by a line per frame, events.log by a line per event; run.json is replaced whole.
 """
 
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -16,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
-from torchvision_dddas.io.output.run_record import RUN_JSON, finite, versions
+from torchvision_dddas.io.output.run_record import RUN_JSON, write_run_record
 
 RESULTS, EVENTS = "results.jsonl", "events.log"
 
@@ -78,8 +76,7 @@ class SessionLog:
 
     def write_state(self, state: str, now: dict[str, Any]) -> None:
         """Replace run.json. state: running, complete, stopped or failed."""
-        record = {"state": state, "versions": versions(), **self.facts, **now}
-        write_whole(self.folder / RUN_JSON, (json.dumps(finite(record), indent=2) + "\n").encode())
+        write_run_record(self.folder / RUN_JSON, state, {**self.facts, **now})
 
     def close(self) -> None:
         """Close events.log."""

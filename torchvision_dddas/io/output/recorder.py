@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
 from torchvision_dddas.io.images import MASK_NAME
-from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, read_run_record
+from torchvision_dddas.io.output.run_record import RunRecord, read_run_record
 
 Item = TypeVar("Item")
 Whole = TypeVar("Whole")
@@ -51,7 +51,7 @@ class RunRecorder(Generic[Item]):
     files: names of the files that a run may leave in the folder. saved: what `--save` may name.
     """
 
-    files: ClassVar[tuple[str, ...]] = ("overlay.mp4", RUN_JSON)
+    files: ClassVar[tuple[str, ...]] = ()
     saved: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, folder: Path, save: Sequence[str] | None = None) -> None:
@@ -63,15 +63,31 @@ class RunRecorder(Generic[Item]):
         self.save = self.saved if save is None else tuple(save)
         self._made = _claim(folder, self.files)
         self._parts: list[Part[Item]] = []
-        self.record: RunRecord | None = None
+        self._record: RunRecord | None = None
 
-    def add_parts(self, record: RunRecord, parts: Sequence[Part[Item]]) -> None:
-        """Set the record and the parts, written in this order and closed in the reverse."""
-        self.record, self._parts = record, list(parts)
+    @property
+    def record(self) -> RunRecord:
+        """The record of a run that has begun."""
+        assert self._record is not None
+        return self._record
+
+    def start(self, facts: Mapping[str, Any], parts: Mapping[str, Part[Item]]) -> RunRecord:
+        """Begin the record with some facts, and the parts, except those in `saved` that are not to be saved.
+
+        Parts are written in this order and closed in the reverse; run.json is closed last.
+        """
+        self._record = RunRecord(self.folder, facts)
+        self._parts = [part for name, part in parts.items() if name in self.save or name not in self.saved]
+        return self._record
+
+    def _count(self, item: Item) -> None:
+        """Note an item in the record."""
+        raise NotImplementedError
 
     def write(self, item: Item) -> None:
         """Write an item to every part, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
         with uninterrupted(), self._refusals():
+            self._count(item)
             for part in self._parts:
                 part.write(item)
 
@@ -80,13 +96,16 @@ class RunRecorder(Generic[Item]):
         with uninterrupted(), self._refusals():
             for part in reversed(self._parts):
                 part.close(complete)
+            self.record.close(complete)
 
     def discard(self) -> None:
         """Leave only what is whole, and no folder that was made for a run that never began."""
         with uninterrupted():
             for part in reversed(self._parts):
                 part.discard()
-            if self.record is None or self.record.frames == 0:
+            if self._record is not None:
+                self._record.discard()
+            if self._record is None or self._record.frames == 0:
                 for folder in self._made:
                     try:
                         folder.rmdir()
@@ -97,9 +116,9 @@ class RunRecorder(Generic[Item]):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        record = self.record
+        record = self._record
         if record is not None and isinstance(error, InputError):
-            record.problems = [*record.problems, str(error)]
+            record.problems.append(str(error))
         interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
         if record is None or not (kind is None or (interrupted and record.frames > 0)):
             self.discard()
@@ -107,7 +126,7 @@ class RunRecorder(Generic[Item]):
         try:
             self.close(complete=not interrupted)
         except InputError as refusal:
-            record.problems = [*record.problems, str(refusal)]
+            record.problems.append(str(refusal))
             self.discard()
             raise
 

@@ -1,41 +1,35 @@
 """What each command writes into its output folder."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove
 from torchvision_dddas.io.images import Masks
-from torchvision_dddas.io.output.ground_maps import COT, AerialMaps, GroundMaps, Site
+from torchvision_dddas.io.output import tables
+from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
 from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder, uninterrupted
 from torchvision_dddas.io.output.run_log import LOG_TXT
 from torchvision_dddas.io.output.run_record import (
     RUN_JSON,
-    AerialRecord,
-    ConfirmationRecord,
-    DetectionRecord,
-    GroundRecord,
-    IdentityCounts,
-    PeopleRecord,
+    LocationCounts,
     RunRecord,
     Spans,
-    TrackRecord,
+    count_identities,
+    count_tracks,
 )
 from torchvision_dddas.io.output.run_report import REPORT
 from torchvision_dddas.io.output.run_story import RunStory
-from torchvision_dddas.io.output.tables import (
-    ConfirmedPositions,
-    aerial_tables,
-    confirmed_table,
-    ground_tables,
-    landmark_table,
-    people_tables,
-    track_tables,
+from torchvision_dddas.io.overlay import (
+    LIKELY,
+    OverlayPicture,
+    OverlayVideo,
+    RunPictures,
+    TrackPictures,
+    draw_people,
+    draw_scene,
 )
-from torchvision_dddas.io.overlay import OverlayPicture, OverlayVideo, TrackPictures, draw_people, draw_scene
-from torchvision_dddas.io.overlay.layers import RunPictures
 from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import (
     AerialLocations,
@@ -51,108 +45,147 @@ from torchvision_dddas.types import (
 class DetectionRecorder(RunRecorder[Scene]):
     """The folder of `dddas detect`: tables, masks, overlay."""
 
-    files: ClassVar[tuple[str, ...]] = ("detections.txt", "detections.csv", *RunRecorder.files)
-    saved: ClassVar[tuple[str, ...]] = ("masks", "overlay")
+    files = ("detections.txt", "detections.csv", "overlay.mp4", RUN_JSON)
+    saved = ("masks", "overlay")
 
-    def begin(self, facts: Mapping[str, Any], rate_hz: float) -> DetectionRecord:
+    def begin(self, facts: Mapping[str, Any], rate_hz: float) -> RunRecord:
         """Start the run. facts: for run.json. rate_hz: of the overlay."""
-        record = DetectionRecord(self.folder, {**facts, "outputs": ["tables", *self.save]})
-        parts: list[Part[Scene]] = [record, detection_tables(self.folder)]
-        if "masks" in self.save:
-            parts.append(Masks(self.folder))
-        if "overlay" in self.save:
-            parts.append(OverlayVideo(self.folder, rate_hz, draw_scene))
-        self.add_parts(record, parts)
-        return record
+        parts: dict[str, Part[Scene]] = {
+            "tables": detection_tables(self.folder),
+            "masks": Masks(self.folder),
+            "overlay": OverlayVideo(self.folder, rate_hz, draw_scene),
+        }
+        return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+
+    def _count(self, item: Scene) -> None:
+        cause = None if item.reliable else item.cause
+        self.record.note(item.frame.number, len(item.detections), item.seconds, item.adjustments, cause)
 
 
 class TrackRecorder(RunRecorder[TrackedFrame]):
     """The folder of `dddas track`: tables, overlay."""
 
-    files: ClassVar[tuple[str, ...]] = ("tracks.txt", "tracks.csv", *RunRecorder.files)
-    saved: ClassVar[tuple[str, ...]] = ("overlay",)
+    files = ("tracks.txt", "tracks.csv", "overlay.mp4", RUN_JSON)
+    saved = ("overlay",)
 
-    def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> TrackRecord:
+    def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> RunRecord:
         """Start the run. rate_hz, size: of the overlay, (width, height)."""
-        record = TrackRecord(self.folder, {**facts, "outputs": ["tables", *self.save]})
-        parts: list[Part[TrackedFrame]] = [record, track_tables(self.folder)]
-        if "overlay" in self.save:
-            parts.append(OverlayVideo(self.folder, rate_hz, TrackPictures(size)))
-        self.add_parts(record, parts)
-        return record
+        overlay = OverlayVideo(self.folder, rate_hz, TrackPictures(size))
+        parts: dict[str, Part[TrackedFrame]] = {"tables": tables.track_tables(self.folder), "overlay": overlay}
+        return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+
+    def _count(self, item: TrackedFrame) -> None:
+        count_tracks(self.record, item)
 
 
 class PeopleRecorder(RunRecorder[PeopleFrame]):
-    """The folder of `dddas people`: tables, overlay."""
+    """The folder of `dddas people`: tables, overlay.
 
-    files: ClassVar[tuple[str, ...]] = ("detections.txt", "detections.csv", "overlay.png", *RunRecorder.files)
-    saved: ClassVar[tuple[str, ...]] = ("overlay",)
+    The record counts people that are unlikely, those whom the picture's border cuts, and how much was searched:
+    windows of all windows of all frames.
+    """
 
-    def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> PeopleRecord:
+    files = ("detections.txt", "detections.csv", "overlay.png", "overlay.mp4", RUN_JSON)
+    saved = ("overlay",)
+
+    def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> RunRecord:
         """Start the run. rate_hz: of the overlay. is_single: one image, whose overlay is no video."""
-        record = PeopleRecord(self.folder, {**facts, "outputs": ["tables", *self.save]})
-        parts: list[Part[PeopleFrame]] = [record, people_tables(self.folder)]
-        record.overlay = "overlay.png" if is_single else "overlay.mp4"
-        if "overlay" in self.save and is_single:
-            parts.append(OverlayPicture(self.folder, draw_people))
-        elif "overlay" in self.save:
-            parts.append(OverlayVideo(self.folder, rate_hz, draw_people))
-        self.add_parts(record, parts)
+        overlay: Part[PeopleFrame] = OverlayVideo(self.folder, rate_hz, draw_people)
+        if is_single:
+            overlay = OverlayPicture(self.folder, draw_people)
+        record = self.start(
+            {**facts, "outputs": ["tables", *self.save]},
+            {"tables": tables.people_tables(self.folder), "overlay": overlay},
+        )
+        searched = ("share_of_windows", "frames_everywhere", "frames_in_regions", "frames_nowhere")
+        record.counts = {"unlikely": 0, "cut": 0, "searched": dict.fromkeys(searched, 0)}
+        self._shares = 0.0
         return record
+
+    def _count(self, item: PeopleFrame) -> None:
+        counts, people = self.record.counts, item.people
+        counts["unlikely"] += int((people.score < LIKELY).sum())
+        counts["cut"] += int(people.cut.sum())
+        if not item.cause:
+            searched = counts["searched"]
+            kind = "everywhere" if item.regions_px is None else "nowhere" if item.share == 0 else "in_regions"
+            searched[f"frames_{kind}"] += 1
+            self._shares += item.share
+            frames = sum(searched.values()) - searched["share_of_windows"]
+            searched["share_of_windows"] = round(self._shares / frames, 4)
+        self.record.note(item.frame.number, len(people), item.seconds, item.adjustments, item.cause or None)
 
 
 class GroundRecorder(RunRecorder[GroundLocations]):
-    """The folder of `dddas locate ground`: tables, maps."""
+    """The folder of `dddas locate ground`: tables, maps.
 
-    files: ClassVar[tuple[str, ...]] = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
+    The record counts rows of positions.csv, and sightings by what gave their distance, `bearing` where nothing did.
+    """
 
-    def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> GroundRecord:
+    files = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
+
+    def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> RunRecord:
         """Start the run. cameras: their names. has_degrees: whether longitudes and latitudes are known."""
-        record = GroundRecord(self.folder, facts)
-        tables = ground_tables(self.folder, cameras, has_degrees)
-        self.add_parts(record, [record, tables, GroundMaps(self.folder, has_degrees)])
+        parts: dict[str, Part[GroundLocations]] = {
+            "tables": tables.ground_tables(self.folder, cameras, has_degrees),
+            "maps": GroundMaps(self.folder, has_degrees),
+        }
+        record = self.start(facts, parts)
+        record.counts = {"people": 0, "sightings": dict.fromkeys(("both", "height", "feet", "bearing"), 0)}
         return record
+
+    def _count(self, item: GroundLocations) -> None:
+        counts = self.record.counts
+        counts["people"] += len(item.positions)
+        for by in item.sightings.by.tolist():
+            counts["sightings"][by] += 1
+        self.record.note(item.frame, len(item.sightings), {})
 
 
 class ConfirmationRecorder(RunRecorder[Confirmation]):
-    """The folder of `dddas confirm`: the blobs' table with what was found of them."""
+    """The folder of `dddas confirm`: the blobs' table with what was found of them, and how many of each kind."""
 
-    files: ClassVar[tuple[str, ...]] = ("confirmed.csv", RUN_JSON)
+    files = ("confirmed.csv", RUN_JSON)
 
-    def begin(
-        self, facts: Mapping[str, Any], header: Sequence[str], cells: Sequence[Sequence[str]]
-    ) -> ConfirmationRecord:
+    def begin(self, facts: Mapping[str, Any], header: Sequence[str], cells: Sequence[Sequence[str]]) -> RunRecord:
         """Start the run. header, cells: of the blobs' table, sorted by frame."""
-        record = ConfirmationRecord(self.folder, facts)
-        self.add_parts(record, [record, confirmed_table(self.folder, header, cells)])
+        record = self.start(facts, {"table": tables.confirmed_table(self.folder, header, cells)})
+        record.counts = {"kinds": {}, "rows_looked_at": 0}
         return record
+
+    def _count(self, item: Confirmation) -> None:
+        counts = self.record.counts
+        for kind in item.kind:
+            counts["kinds"][kind] = counts["kinds"].get(kind, 0) + 1
+        counts["rows_looked_at"] += sum(bool(names) for names in item.seen_by)
+        self.record.note(item.frame, len(item.kind), {})
 
 
 class AerialRecorder(RunRecorder[AerialLocations]):
     """The folder of `dddas locate aerial`: tables, maps, a report."""
 
-    files: ClassVar[tuple[str, ...]] = ("positions.csv", "fixes.csv", *AerialMaps.files, RUN_JSON)
-    saved: ClassVar[tuple[str, ...]] = ("cot", "map", "report")
+    files = ("positions.csv", "fixes.csv", *AerialMaps.files, RUN_JSON)
+    saved = ("cot", "map", "report")
 
-    def begin(self, facts: Mapping[str, Any], site: Site) -> AerialRecord:
+    def begin(self, facts: Mapping[str, Any], site: Site) -> RunRecord:
         """Start the run."""
-        record = _aerial_record(self.folder, facts, site, self.save)
-        maps = AerialMaps(self.folder, record, self.save, site)
-        self.add_parts(record, [record, maps, aerial_tables(self.folder, site.origin_deg is not None)])
+        maps = AerialMaps(self.folder, self.save, site)
+        places = tables.aerial_tables(self.folder, site.origin_deg is not None)
+        parts: dict[str, Part[AerialLocations]] = {"maps": maps, "tables": places}
+        record = maps.record = self.start({**site.facts, **facts}, parts)
+        record.notes += _missing_maps(site, self.save)
+        self._counts = LocationCounts(record, site.names)
         return record
+
+    def _count(self, item: AerialLocations) -> None:
+        self._counts.add(item)
 
 
 class PipelineRecorder(RunRecorder[FrameResult]):
     """The folder of `dddas run`: tables, overlay, log, and where targets are located maps and a report of them."""
 
     found_files: ClassVar[tuple[str, ...]] = (
-        "detections.csv",
-        "detections.txt",
-        "tracks.csv",
-        "tracks.txt",
-        LOG_TXT,
-        REPORT,
-        *RunRecorder.files,
+        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", LOG_TXT, REPORT, "overlay.mp4", RUN_JSON),
     )
     """Files of a run that locates nothing."""
     files: ClassVar[tuple[str, ...]] = (
@@ -168,80 +201,65 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         folder, save = self.folder, self.save
         names = () if site is None else site.names
         pictures = RunPictures(size, names)
-        name = Path(str(facts.get("input", ""))).name
-        aerial = None if site is None else _aerial_record(folder, facts, site, save)
-        tracked = None if aerial is not None else TrackRecord(folder, facts)
-        record: RunRecord = aerial or tracked  # type: ignore[assignment]
-        self.story = RunStory(folder, name, record, names, pictures if "report" in save else None)
-        found: list[Part[FrameResult]] = [
-            PartOf(detection_tables(folder), _scene),
-            PartOf(track_tables(folder), _followed),
-        ]
-        if "overlay" in save:
-            found.append(OverlayVideo(folder, rate_hz, pictures))
-        self._is_located = site is not None
-        if aerial is not None and site is not None:
+        self.story = RunStory(folder, names, pictures if "report" in save else None)
+        parts: dict[str, Part[FrameResult]] = {}
+        if site is not None:
             has_degrees = site.origin_deg is not None
-            parts: list[Part[FrameResult]] = [
-                PartOf(aerial, _grounded),
-                PartOf(AerialMaps(folder, aerial, save, site, self.story), _grounded),
-                PartOf(aerial_tables(folder, has_degrees), _grounded),
-                _IdentityCounter(record),
-                landmark_table(folder, names, has_degrees),
-                ConfirmedPositions(folder, has_degrees),
-            ]
-        elif tracked is not None:
-            parts = [PartOf(tracked, _followed)]
-        self.add_parts(record, [*parts, *found, self.story])
+            maps = AerialMaps(folder, save, site, self.story)
+            parts |= {
+                "maps": PartOf(maps, _locations),
+                "positions": PartOf(tables.aerial_tables(folder, has_degrees), _locations),
+                "landmarks": tables.landmark_table(folder, names, has_degrees),
+                "confirmed": tables.ConfirmedPositions(folder, has_degrees),
+            }
+        parts |= {
+            "detections": PartOf(detection_tables(folder), _scene),
+            "tracks": PartOf(tables.track_tables(folder), lambda result: result.tracked),
+            "overlay": OverlayVideo(folder, rate_hz, pictures),
+            "story": self.story,
+        }
+        record = self.story.record = self.start({**(site.facts if site is not None else {}), **facts}, parts)
+        self._locations = None
+        if site is not None:
+            maps.record = record
+            record.notes += _missing_maps(site, save)
+            self._locations, self._not_found = LocationCounts(record, names), Spans(is_exact=True)
+            record.counts["nothing_found"] = self._not_found.rows
         return record
+
+    def _count(self, item: FrameResult) -> None:
+        tracked = item.tracked
+        if self._locations is None:
+            count_tracks(self.record, tracked)
+            return
+        self._locations.add(_locations(item))
+        count_identities(self.record.counts, tracked)
+        if tracked.cause:
+            self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place; a run that locates nothing removes the files of an earlier one that did."""
-        has_report = not self._is_located and "report" in self.save and self.story.record.frames > 0
+        has_report = self._locations is None and "report" in self.save and self.record.frames > 0
         if has_report:
             with uninterrupted(), self._refusals():
                 self.story.report(complete)
         super().close(complete)
-        if not self._is_located:
+        if self._locations is None:
             made = set(self.found_files) - (set() if has_report else {REPORT})
             for name in set(PipelineRecorder.files) - made:
                 remove(self.folder / name)
 
 
-class _IdentityCounter:
-    """Adds the counts of identities, and the frames in which nothing was found, to the record of a run that locates."""
-
-    def __init__(self, record: RunRecord) -> None:
-        self._record, self._counts, self._not_found = record, IdentityCounts(), Spans(is_exact=True)
-
-    def write(self, result: FrameResult) -> None:
-        followed = result.tracked
-        self._counts.add(followed)
-        if followed.cause:
-            self._not_found.add(followed.number, followed.number - 1, followed.cause)
-        self._record.counts |= {**vars(self._counts), "nothing_found": self._not_found.rows}
-
-    def close(self, complete: bool) -> None:
-        """Nothing to write."""
-
-    def discard(self) -> None:
-        """Nothing to remove."""
-
-
-def _aerial_record(folder: Path, facts: Mapping[str, Any], site: Site, save: Sequence[str]) -> AerialRecord:
-    record = AerialRecord(folder, {**site.facts, **facts}, site.names)
+def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:
+    """Notes on maps that are left out."""
     if site.origin_deg is None:
-        record.notes.append("no longitude and latitude are known: no maps for other tools, but local metres")
-    elif site.facts["start_utc"] is None and "cot" in save:
-        record.notes.append(f"no clock is known: no {COT}, and times are seconds since the first frame")
-    return record
+        return ["no longitude and latitude are known: no maps for other tools, but local metres"]
+    if site.facts["start_utc"] is None and "cot" in save:
+        return [f"no clock is known: no {COT}, and times are seconds since the first frame"]
+    return []
 
 
-def _followed(result: FrameResult) -> TrackedFrame:
-    return result.tracked
-
-
-def _grounded(result: FrameResult) -> AerialLocations:
+def _locations(result: FrameResult) -> AerialLocations:
     assert result.locations is not None
     return result.locations
 

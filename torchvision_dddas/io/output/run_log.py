@@ -3,12 +3,12 @@
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.io.overlay.layers import ToMetres, command_metres
-from torchvision_dddas.types import Adjustment, FrameResult, Order
+from torchvision_dddas.io.overlay import ToMetres, command_metres
+from torchvision_dddas.types import Adjustment, FrameResult
 
 LOG_TXT = "log.txt"
 
@@ -25,7 +25,6 @@ LANDMARK = "landmark"  # a landmark that the picture does not show
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 _CLOSE_FRAMES = 10
 _FAR_M = 15.0  # a goal that moved by less counts as the same: it follows a crowd
-_UAV = "uav"
 
 
 @dataclass
@@ -47,22 +46,18 @@ class Entry:
         self.last = max(self.last, self.first)
 
 
-@dataclass
 class RunLog:
     """The entries of a run in the order of their logging, about 300 bytes each."""
 
-    entries: list[Entry] = field(default_factory=list)
-    _open: dict[str, Entry] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self._open: dict[str, Entry] = {}
+        self._goal: dict[str, np.ndarray] = {}
 
     def add(self, frame: int, kind: str, text: str, time_s: float | None = None, short: str = "") -> None:
         """Add an entry."""
         text = " ".join(text.split())
         self.entries.append(Entry(frame, kind, text, time_s=time_s, short=short or text))
-
-    def adjusted(self, moved: Adjustment) -> None:
-        """Add the adjustment of a parameter."""
-        change = f"{moved.parameter} {_number(moved.old)} -> {_number(moved.new)}"
-        self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
     def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
         """Add an event that may last: repeated within a few frames it stays one entry, also if its numbers differ.
@@ -73,17 +68,48 @@ class RunLog:
         entry = self._open.get(key)
         if entry is not None and frame - entry.last <= max(_CLOSE_FRAMES, 2 * step):
             entry.last, entry.count = frame, entry.count + 1
+        else:
+            self.add(frame, kind, text)
+            self._open[key] = self.entries[-1]
+
+    def add_adjustment(self, moved: Adjustment) -> None:
+        """Add the adjustment of a parameter."""
+        old, new = (f"{value:.5g}" if math.isfinite(value) else "none" for value in (moved.old, moved.new))
+        change = f"{moved.parameter} {old} -> {new}"
+        self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
+
+    def add_orders(self, result: FrameResult, explained: Collection[str] = ()) -> None:
+        """Add the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
+        command, frame = result.command, result.tracked.number
+        if command is None:
             return
-        self.add(frame, kind, text)
-        self._open[key] = self.entries[-1]
+        scale = command_metres(result)
+        if command.look_at is not None and "uav" not in explained and self._is_new("uav", command.look_at, scale):
+            height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
+            text = f"the UAV keeps {_place(command.look_at, scale)} in view{height}"
+            self.add(frame, ORDERED, text, short="UAV sent")
+        for order in command.orders:
+            if order.vehicle not in explained and self._is_new(order.vehicle, order.goal, scale):
+                text = f"{order.vehicle} goes to {_place(order.goal, scale)} at {order.speed_m_s:g} m/s"
+                text += "" if order.look_at is None else f" and looks at {_place(order.look_at, scale)}"
+                self.add(frame, ORDERED, text, short=f"{order.vehicle} sent")
+
+    def _is_new(self, vehicle: str, goal: np.ndarray, scale: ToMetres | None) -> bool:
+        """Whether a goal is far from that of the vehicle's last order."""
+        there, far = (np.asarray(goal, float), 0.0) if scale is None else (scale(goal), _FAR_M)
+        last = self._goal.get(vehicle)
+        if last is not None and float(np.linalg.norm(there - last)) <= far:
+            return False
+        self._goal[vehicle] = there
+        return True
 
     def ordered(self) -> list[Entry]:
         """All entries by frame, those of one frame in the order of their logging."""
         return sorted(self.entries, key=lambda entry: entry.first)
 
 
-def _number(value: float) -> str:
-    return "none" if not math.isfinite(value) else f"{value:.5g}"
+def _place(place: np.ndarray, scale: ToMetres | None) -> str:
+    return "{:.7g}, {:.7g}".format(*place) if scale is None else "({:.1f}, {:.1f}) m".format(*scale(place))
 
 
 class Clock:
@@ -128,45 +154,3 @@ def format_log(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -
         lasted = "" if entry.last == entry.first else f" (to frame {entry.last}{occurrence and f', {occurrence}'})"
         out.append(f"{when}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted}")
     return "\n".join(out) + "\n"
-
-
-class CommandLog:
-    """Logs new orders to vehicles."""
-
-    def __init__(self) -> None:
-        self._goal: dict[str, np.ndarray] = {}
-
-    def add(self, result: FrameResult, log: RunLog, explained: Collection[str] = ()) -> None:
-        """Log the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
-        command, frame = result.command, result.tracked.number
-        if command is None:
-            return
-        scale = command_metres(result)
-        if command.look_at is not None and _UAV not in explained and self._new(_UAV, command.look_at, scale):
-            height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
-            log.add(frame, ORDERED, f"the UAV keeps {_place(command.look_at, scale)} in view{height}", short="UAV sent")
-        for order in command.orders:
-            if order.vehicle not in explained and self._new(order.vehicle, order.goal, scale):
-                log.add(frame, ORDERED, _words(order, scale), short=f"{order.vehicle} sent")
-
-    def _new(self, who: str, goal: np.ndarray, scale: ToMetres | None) -> bool:
-        there = np.asarray(goal, float) if scale is None else scale(goal)
-        far = _FAR_M if scale is not None else 0.0
-        last = self._goal.get(who)
-        if last is not None and float(np.linalg.norm(there - last)) <= far:
-            return False
-        self._goal[who] = there
-        return True
-
-
-def _place(place: np.ndarray, scale: ToMetres | None) -> str:
-    if scale is None:
-        return "{:.7g}, {:.7g}".format(*place)
-    return "({:.1f}, {:.1f}) m".format(*scale(place))
-
-
-def _words(order: Order, scale: ToMetres | None) -> str:
-    text = f"{order.vehicle} goes to {_place(order.goal, scale)} at {order.speed_m_s:g} m/s"
-    if order.look_at is not None:
-        text += f" and looks at {_place(order.look_at, scale)}"
-    return text

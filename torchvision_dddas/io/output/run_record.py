@@ -9,23 +9,14 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchvision_dddas.io.atomic_files import write_whole
-from torchvision_dddas.io.overlay.layers import LIKELY
 from torchvision_dddas.runtime import VERSION
-from torchvision_dddas.types import (
-    Adjustment,
-    AerialLocations,
-    Confirmation,
-    GroundLocations,
-    PeopleFrame,
-    Scene,
-    Source,
-    TrackedFrame,
-)
+from torchvision_dddas.types import Adjustment, AerialLocations, Source, TrackedFrame
 
 RUN_JSON = "run.json"
 NO_POSE = "nothing told where the camera was"
@@ -49,12 +40,11 @@ class Durations:
     @property
     def median_s(self) -> float:
         """The median to 1 %; 0 without any time."""
-        left = (sum(self._bins.values()) + 1) // 2
-        for place in sorted(self._bins):
-            left -= self._bins[place]
-            if left <= 0:
-                return math.exp(place * _STEP)
-        return 0.0
+        bins = sorted(self._bins)
+        if not bins:
+            return 0.0
+        count = np.cumsum([self._bins[place] for place in bins])
+        return math.exp(bins[int(np.searchsorted(count, (count[-1] + 1) // 2))] * _STEP)
 
 
 class Spans:
@@ -68,14 +58,14 @@ class Spans:
         self._is_exact = is_exact
         self._open: dict[str, dict[str, Any]] = {}
 
-    def add(self, frame: int, before: int, text: str, **more: Any) -> None:
-        """Add a remark on a frame. before: the number of the frame that came before it. more: further cells."""
-        key = text if self._is_exact else _NUMBER.sub("0", f"{text} {more}")
+    def add(self, frame: int, before: int, text: str, **cells: Any) -> None:
+        """Add a remark on a frame. before: the number of the frame that came before it. cells: further ones."""
+        key = text if self._is_exact else _NUMBER.sub("0", f"{text} {cells}")
         row = self._open.get(key)
         if row is not None and row["last"] in (before, frame):
             row["last"] = frame
         else:
-            self._open[key] = row = {"first": frame, "last": frame, **more, "cause": text}
+            self._open[key] = row = {"first": frame, "last": frame, **cells, "cause": text}
             self.rows.append(row)
 
 
@@ -97,7 +87,12 @@ class RunRecord:
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
-        self._last = 0  # number of the frame noted last
+        self.last_frame = 0
+
+    @property
+    def input_name(self) -> str:
+        """The name of the clip or table, without its folder; empty where there is none."""
+        return Path(str(self.facts.get("input", ""))).name
 
     def note(
         self,
@@ -119,8 +114,8 @@ class RunRecord:
         ]
         if cause is not None:
             self.unreliable_frames += 1
-            self.unreliable.add(number, self._last, cause)
-        self._last = number
+            self.unreliable.add(number, self.last_frame, cause)
+        self.last_frame = number
 
     def close(self, complete: bool) -> None:
         """Write the whole record."""
@@ -133,63 +128,29 @@ class RunRecord:
                 self._save("failed")
 
     def _save(self, state: str) -> None:
-        seconds = time.perf_counter() - self._begun
+        stages = {
+            stage: {"total": round(t.total_s, 4), "median": float(f"{t.median_s:.3g}")}
+            for stage, t in self._stages.items()
+        }
         record = {
-            "state": state,
             "interrupted": state == "interrupted",
-            "versions": versions(),
             **self.facts,
             "frames": {"written": self.frames, "unreliable": self.unreliable_frames},
             "targets": self.targets,
             **self.counts,
-            "notes": list(self.notes),
-            "problems": list(self.problems),
+            "notes": self.notes,
+            "problems": self.problems,
             "unreliable": self.unreliable.rows,
             "adjustments": self.adjustments,
-            "seconds": {
-                "wall": round(seconds, 3),
-                "stages": {
-                    stage: {"total": round(t.total_s, 4), "median": float(f"{t.median_s:.3g}")}
-                    for stage, t in self._stages.items()
-                },
-            },
+            "seconds": {"wall": round(time.perf_counter() - self._begun, 3), "stages": stages},
         }
-        write_whole(self._path, (json.dumps(finite(record), indent=2) + "\n").encode())
+        write_run_record(self._path, state, record)
 
 
-def clip_facts(source: Source) -> dict[str, Any]:
-    """What run.json says of a clip."""
-    return {
-        "name": source.name,
-        "size": source.size,
-        "rate_hz": source.rate_hz,
-        "announced_frames": source.count,
-    }
-
-
-def finite(value: Any) -> Any:
-    """A value that JSON can hold: numbers that are not finite become null, unknown types become text."""
-    if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [finite(v) for v in value]
-    if isinstance(value, bool) or value is None or isinstance(value, (str, int)):
-        return value
-    if hasattr(value, "item"):
-        return finite(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value)
-
-
-def versions() -> dict[str, str]:
-    """Versions of this package, of Python, and of those libraries that the run has loaded."""
-    found = {"torchvision_dddas": VERSION, "python": platform.python_version(), "machine": platform.machine()}
-    for name in ("numpy", "scipy", "cv2", "torch", "kornia", "onnxruntime", "av"):
-        version = getattr(sys.modules.get(name), "__version__", None)
-        if version:
-            found[name] = str(version)
-    return found
+def write_run_record(path: Path, state: str, record: Mapping[str, Any]) -> None:
+    """Replace run.json. state: running, complete, interrupted, stopped or failed. Raises OSError."""
+    content = finite({"state": state, "versions": versions(), **record})
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def read_run_record(folder: Path) -> dict[str, Any] | None:
@@ -202,127 +163,58 @@ def read_run_record(folder: Path) -> dict[str, Any] | None:
     return record if isinstance(versions, dict) and "torchvision_dddas" in versions else None
 
 
-class DetectionRecord(RunRecord):
-    """The record of `dddas detect`."""
-
-    def write(self, scene: Scene) -> None:
-        """Count a scene."""
-        cause = None if scene.reliable else scene.cause
-        self.note(scene.frame.number, len(scene.detections), scene.seconds, scene.adjustments, cause)
+def clip_facts(source: Source) -> dict[str, Any]:
+    """What run.json says of a clip."""
+    return {"name": source.name, "size": source.size, "rate_hz": source.rate_hz, "announced_frames": source.count}
 
 
-@dataclass
-class IdentityCounts:
-    """Identities so far, numbered from 1 without gaps; boxes between detections, and detections without identity."""
-
-    identities: int = 0
-    bridges: int = 0
-    untracked: int = 0
-
-    def add(self, followed: TrackedFrame) -> None:
-        """Count a frame."""
-        self.identities = int(followed.tracks.identity.max(initial=self.identities))
-        self.bridges += int((followed.tracks.row < 0).sum())
-        self.untracked += len(followed.untracked)
-
-
-class TrackRecord(RunRecord):
-    """The record of a run that gives identities."""
-
-    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
-        super().__init__(folder, facts)
-        self.tracked = IdentityCounts()
-        self._first = 0
-
-    def write(self, followed: TrackedFrame) -> None:
-        """Count a frame."""
-        self.tracked.add(followed)
-        targets, tracked = len(followed.detections), self.tracked
-        self._first = self._first or followed.number
-        self.counts |= {
-            "first_frame": self._first,
-            "last_frame": followed.number,
-            "identities": tracked.identities,
-            "tracked": self.targets + targets - tracked.untracked,
-            "untracked": tracked.untracked,
-            "bridges": tracked.bridges,
-        }
-        self.note(followed.number, targets, followed.seconds, followed.adjustments, followed.cause or None)
+def finite(value: Any) -> Any:
+    """A value that JSON can hold: numbers that are not finite become null, unknown types become text."""
+    if isinstance(value, dict):
+        return {str(k): finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [finite(v) for v in value]
+    if value is None or isinstance(value, (bool, str, int)):
+        return value
+    if hasattr(value, "item"):
+        return finite(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value)
 
 
-class PeopleRecord(RunRecord):
-    """The record of `dddas people`.
-
-    unlikely: people below LIKELY. cut: people whom the picture's border cuts. share: windows searched, of all windows
-    of all frames. overlay: name of the video, or of the picture of a single image.
-    """
-
-    unlikely = cut = everywhere = nowhere = unread = 0
-    share = 0.0
-    overlay = "overlay.mp4"
-
-    def write(self, found: PeopleFrame) -> None:
-        """Count a frame."""
-        self.unlikely += int((found.people.score < LIKELY).sum())
-        self.cut += int(found.people.cut.sum())
-        if found.cause:
-            self.unread += 1
-        else:
-            self.everywhere += found.regions_px is None
-            self.nowhere += found.share == 0
-            self.share += (found.share - self.share) / (self.frames + 1 - self.unread)
-        self.counts = {
-            "unlikely": self.unlikely,
-            "cut": self.cut,
-            "searched": {
-                "share_of_windows": round(self.share, 4),
-                "frames_everywhere": self.everywhere,
-                "frames_in_regions": self.frames + 1 - self.unread - self.everywhere - self.nowhere,
-                "frames_nowhere": self.nowhere,
-            },
-        }
-        self.note(found.frame.number, len(found.people), found.seconds, found.adjustments, found.cause or None)
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python, and of those libraries that the run has loaded."""
+    found = {"torchvision_dddas": VERSION, "python": platform.python_version(), "machine": platform.machine()}
+    for name in ("numpy", "scipy", "cv2", "torch", "kornia", "onnxruntime", "av"):
+        if version := getattr(sys.modules.get(name), "__version__", None):
+            found[name] = str(version)
+    return found
 
 
-class GroundRecord(RunRecord):
-    """The record of `dddas locate ground`.
-
-    people: rows of positions.csv. by: sightings by what gave their distance, `bearing` where nothing did.
-    """
-
-    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
-        super().__init__(folder, facts)
-        self.people = 0
-        self.by = dict.fromkeys(("both", "height", "feet", "bearing"), 0)
-        self.counts = {"people": 0, "sightings": self.by}
-
-    def write(self, located: GroundLocations) -> None:
-        """Count a frame."""
-        self.people += len(located.positions)
-        self.counts["people"] = self.people
-        for by in located.sightings.by.tolist():
-            self.by[by] += 1
-        self.note(located.frame, len(located.sightings), {})
+# --------------------------------------------------------------------------------------------------------------------
+# What several commands count.
 
 
-class ConfirmationRecord(RunRecord):
-    """The record of `dddas confirm`. kinds: rows of each kind."""
-
-    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
-        super().__init__(folder, facts)
-        self.kinds: Counter[str] = Counter()
-        self.counts = {"kinds": {}, "rows_looked_at": 0}
-
-    def write(self, confirmed: Confirmation) -> None:
-        """Count a frame."""
-        self.kinds.update(confirmed.kind)
-        self.counts["kinds"] = dict(self.kinds)
-        self.counts["rows_looked_at"] += sum(bool(names) for names in confirmed.seen_by)
-        self.note(confirmed.frame, len(confirmed.kind), {})
+def count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
+    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity."""
+    counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
+    counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
+    counts["untracked"] = counts.get("untracked", 0) + len(tracked.untracked)
 
 
-class AerialRecord(RunRecord):
-    """The record of a run that locates targets from the air.
+def count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
+    """Add a frame of a run that gives identities and locates nothing."""
+    counts, targets = record.counts, len(tracked.detections)
+    counts.setdefault("first_frame", tracked.number)
+    counts["last_frame"] = tracked.number
+    count_identities(counts, tracked)
+    counts["tracked"] = record.targets + targets - counts["untracked"]
+    record.note(tracked.number, targets, tracked.seconds, tracked.adjustments, tracked.cause or None)
+
+
+class LocationCounts:
+    """Counts what is located from the air in a record.
 
     positions: rows of positions.csv. by: frames by what gave the camera's pose, `nothing` for those not located.
     weak: spans of frames that were located with something amiss. repairs: what was changed and why.
@@ -330,23 +222,26 @@ class AerialRecord(RunRecord):
     which it was reassigned or excluded.
     """
 
-    def __init__(self, folder: Path, facts: Mapping[str, Any], names: Sequence[str]) -> None:
-        super().__init__(folder, facts)
-        self.names = tuple(names)
-        self.positions = 0
-        self.by = dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0)
-        self.weak, self.repairs = Spans(), Spans()
-        self.landmarks: dict[str, dict[str, Any]] = {
-            name: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for name in names
+    def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
+        """names: of the landmarks."""
+        self._record, self._names = record, tuple(names)
+        self._weak, self._repairs = Spans(), Spans()
+        record.counts |= {
+            "positions": 0,
+            "by": dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0),
+            "landmarks": {n: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for n in names},
+            "weak": self._weak.rows,
+            "repairs": self._repairs.rows,
         }
 
-    def write(self, grounded: AerialLocations) -> None:
+    def add(self, located: AerialLocations) -> None:
         """Count a frame."""
-        frame, fix, before = grounded.frame, grounded.fix, self._last
-        self.positions += len(grounded.positions)
-        self.by[fix.by or "nothing"] += 1
+        record, frame, fix = self._record, located.frame, located.fix
+        counts, before = record.counts, record.last_frame
+        counts["positions"] += len(located.positions)
+        counts["by"][fix.by or "nothing"] += 1
         for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
-            landmark = self.landmarks[self.names[which]]
+            landmark = counts["landmarks"][self._names[which]]
             landmark["seen"] += 1
             landmark["used"] += is_used
             landmark["left_out"] += bool(fix.by) and not is_used
@@ -357,15 +252,8 @@ class AerialRecord(RunRecord):
                 else:
                     spans.append([frame, frame])
         if fix.by and fix.cause:
-            self.weak.add(frame, before, fix.cause, by=fix.by)
+            self._weak.add(frame, before, fix.cause, by=fix.by)
         for change in fix.changes:
-            self.repairs.add(frame, before, change)
-        self.counts |= {
-            "positions": self.positions,
-            "by": self.by,
-            "landmarks": self.landmarks,
-            "weak": self.weak.rows,
-            "repairs": self.repairs.rows,
-        }
+            self._repairs.add(frame, before, change)
         cause = None if fix.by else fix.cause or NO_POSE
-        self.note(frame, len(grounded.box_px), grounded.seconds, grounded.adjustments, cause)
+        record.note(frame, len(located.box_px), located.seconds, located.adjustments, cause)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove
-from torchvision_dddas.io.overlay.layers import Trails
+from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
     BOX,
     COVARIANCE,
@@ -47,22 +47,22 @@ TRACKS = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("ro
 row: the detection's line in the file it comes from, or its number in the frame. Heading and speed are over the ground.
 """
 
-PEOPLE = Schema(
-    "people",
-    *(FRAME, TARGET, *BOX, SCORE, KIND, Column("margin", ".4f")),
-    *(Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"), Column("cut", "d")),
-)
+_FEET = (Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"))
+PEOPLE = Schema("people", FRAME, TARGET, *BOX, SCORE, KIND, Column("margin", ".4f"), *_FEET, Column("cut", "d"))
 """detections.csv of `dddas people`. The box is the body's. margin: the classifier's score. feet: between the feet.
 
 cut: 1 where the picture's border cuts the body, so that its height is not to be trusted.
 """
 
+_POSE = (
+    *(*EAST_NORTH, Column("up_m", ".4f")),
+    *(Column(name, ".4f") for name in ("heading_deg", "pitch_deg", "roll_deg", "upper_edge_deg")),
+    Column("focal", ".6f"),
+)
 FIXES = Schema(
     "fixes",
     *(FRAME, Column("time_s", ".4f"), Column("by"), Column("landmarks_seen", "d"), Column("landmarks_used", "d")),
-    *(Column("chi2", ".3f"), Column("freedom", "d"), *EAST_NORTH, Column("up_m", ".4f")),
-    *(Column(name, ".4f") for name in ("heading_deg", "pitch_deg", "roll_deg", "upper_edge_deg")),
-    *(Column("focal", ".6f"), Column("cause"), Column("changes")),
+    *(Column("chi2", ".3f"), Column("freedom", "d"), *_POSE, Column("cause"), Column("changes")),
 )
 """fixes.csv. Where the camera looks nearly straight down, heading and roll trade off against each other; the bearing of
 the picture's upper edge is steady there. focal: as a share of what the camera's file says.
@@ -81,44 +81,129 @@ CONFIRMATION = (
 """Columns that confirmed.csv adds to the blobs' own; theirs of the same names are replaced."""
 CONFIRMATION_NAMES = tuple(column.name for column in CONFIRMATION)
 
-_BOX_NAMES = tuple(column.name for column in BOX)
+_VELOCITY = (Column("velocity_east_m_s", ".4f"), Column("velocity_north_m_s", ".4f"))
 _AERIAL = (
-    *(PRECISE_SCORE, Column("time_s", ".4f"), Column("relative_sigma_m", ".6g")),
-    *(Column("velocity_east_m_s", ".4f"), Column("velocity_north_m_s", ".4f"), Column("by"), Column("landmarks", "d")),
+    *(Column("time_s", ".4f"), Column("relative_sigma_m", ".6g"), *_VELOCITY),
+    *(Column("by"), Column("landmarks", "d")),
 )
 
 
 def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
-    """tracks.txt and tracks.csv."""
-    return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, _TrackRows())})
+    """tracks.txt and tracks.csv, with heading and speed since the box before for identities that have one."""
+    trails = Trails(length=2)
+
+    def motion(identity: int) -> tuple[float, float]:
+        trail = trails.places[identity]
+        if len(trail) < 2:
+            return math.nan, math.nan
+        (before, u0, v0), (now, u1, v1) = trail
+        return compass_deg(math.atan2(v1 - v0, u1 - u0)), math.hypot(u1 - u0, v1 - v0) / (now - before)
+
+    def rows(tracked: TrackedFrame) -> Rows:
+        trails.add(tracked)
+        tracks, given, loose = tracked.tracks, tracked.detections, tracked.untracked
+        lines = tracked.lines if len(tracked.lines) else np.arange(1, len(given) + 1)
+        moves = [motion(identity) for identity in tracks.identity.tolist()] + [(math.nan, math.nan)] * len(loose)
+        return {
+            **_named(BOX, np.concatenate([tracks.box_px, given.box_px[loose]])),
+            "frame": tracked.number,
+            "identity": [*tracks.identity.tolist(), *[None] * len(loose)],
+            "score": [*tracks.score.tolist(), *given.score[loose].tolist()],
+            "kind": [*("detection" if row >= 0 else "bridge" for row in tracks.row), *["untracked"] * len(loose)],
+            "row": [*(lines[row] if row >= 0 else None for row in tracks.row), *(lines[row] for row in loose)],
+            "heading_deg": [heading for heading, _ in moves],
+            "speed_px_per_frame": [speed for _, speed in moves],
+        }
+
+    return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, rows)})
+
+
+def track_rows(tracked: TrackedFrame) -> Rows:
+    """The boxes with an identity, as MOTChallenge text has them."""
+    tracks = tracked.tracks
+    return mot_rows(tracked.number, tracks.box_px, tracks.score, tracks.identity)
 
 
 def people_tables(folder: Path) -> TableFiles[PeopleFrame]:
     """detections.txt and detections.csv of people."""
-    return TableFiles(
-        {folder / "detections.txt": (MOT, _person_boxes), folder / "detections.csv": (PEOPLE, _person_rows)}
-    )
+
+    def rows(found: PeopleFrame) -> Rows:
+        people = found.people
+        return {
+            **mot_rows(found.frame.number, people.box_px, people.score),
+            **_named(_FEET, people.feet_px),
+            "target": np.arange(1, len(people) + 1),
+            "kind": "person",
+            "margin": people.margin,
+            "cut": people.cut,
+        }
+
+    return TableFiles({folder / "detections.txt": (MOT, rows), folder / "detections.csv": (PEOPLE, rows)})
 
 
 def aerial_tables(folder: Path, has_degrees: bool) -> TableFiles[AerialLocations]:
     """positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known."""
-    schema = _position_schema(has_degrees, *_AERIAL)
-    return TableFiles({folder / "positions.csv": (schema, _aerial_rows), folder / "fixes.csv": (FIXES, fix_row)})
+    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *_AERIAL)
+
+    def rows(located: AerialLocations) -> Rows:
+        return {
+            **_position_rows(located.positions),
+            **_named(_VELOCITY, located.velocity_m_s),
+            "time_s": located.time_s,
+            "relative_sigma_m": np.sqrt(np.trace(located.relative_m2, axis1=1, axis2=2)),
+            "by": located.fix.by,
+            "landmarks": sum(located.fix.is_used),
+        }
+
+    return TableFiles({folder / "positions.csv": (schema, rows), folder / "fixes.csv": (FIXES, fix_row)})
+
+
+def fix_row(located: AerialLocations) -> Rows:
+    """The row of a frame in fixes.csv."""
+    fix = located.fix
+    pose = [math.nan] * len(_POSE)
+    if fix.pose is not None:
+        pose = [*fix.pose.place_m, *angles_deg(fix.pose), upper_edge_deg(fix.pose), fix.pose.focal]
+    return {
+        **_named(_POSE, np.array(pose)),
+        "frame": located.frame,
+        "time_s": located.time_s,
+        "by": fix.by,
+        "landmarks_seen": len(fix.landmark),
+        "landmarks_used": sum(fix.is_used),
+        "chi2": fix.chi2,
+        "freedom": fix.freedom,
+        "cause": " ".join(fix.cause.split()),
+        "changes": " ".join("; ".join(fix.changes).split()),
+    }
+
+
+def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
+    """Heading in [0, 360), pitch below the horizon, roll clockwise; straight down the upper edge gives the heading."""
+    heading, pitch, roll = pose.angles_rad
+    # Rounded first, so that a hair below north is not written as 360.
+    return round(math.degrees(heading), 4) % 360, math.degrees(pitch), math.degrees(roll)
+
+
+def upper_edge_deg(pose: CameraPose) -> float:
+    """The bearing of the picture's upper edge from its middle, in [0, 360); NaN where it is overhead."""
+    east, north, _ = -np.asarray(pose.axes, float)[:, 1]
+    return round(math.degrees(math.atan2(east, north)), 4) % 360 if math.hypot(east, north) > 1e-9 else math.nan
 
 
 def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> TableFiles[GroundLocations]:
     """positions.csv and sightings.csv. cameras: their names."""
-    schema = _position_schema(has_degrees, PRECISE_SCORE, Column("cameras", "d"))
+    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"))
 
     def rows(located: GroundLocations) -> Rows:
-        seen = (located.members >= 0).sum(axis=1)
-        return {**_position_rows(located.positions), "score": located.positions.score, "cameras": seen}
+        return {**_position_rows(located.positions), "cameras": (located.members >= 0).sum(axis=1)}
 
     def sightings(located: GroundLocations) -> Rows:
         seen = located.sightings
         return {
-            **_boxes(located.box_px),
-            **_covariance(seen.covariance_m2),
+            **_named(BOX, located.box_px),
+            **_named(EAST_NORTH, seen.east_north_m),
+            **_named(COVARIANCE, _variances(seen.covariance_m2)),
             "frame": located.frame,
             "camera": [cameras[which] for which in located.vehicle.tolist()],
             "target": located.target,
@@ -127,8 +212,6 @@ def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> Ta
             "by": seen.by,
             "distance_m": seen.distance_m,
             "bearing_deg": np.degrees(seen.bearing_rad),
-            "east_m": seen.east_north_m[:, 0],
-            "north_m": seen.east_north_m[:, 1],
         }
 
     return TableFiles({folder / "positions.csv": (schema, rows), folder / "sightings.csv": (SIGHTINGS, sightings)})
@@ -137,29 +220,25 @@ def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> Ta
 def landmark_table(folder: Path, names: Sequence[str], has_degrees: bool) -> TableFiles[FrameResult]:
     """landmarks.csv, as `dddas locate aerial --landmarks` takes it. names: of the landmarks."""
     place = DEGREES if has_degrees else EAST_NORTH
-    schema = Schema(
-        "landmarks",
-        *(FRAME, Column("landmark"), Column("u_px", ".3f"), Column("v_px", ".3f"), *place),
-        *(Column("sigma_m", ".4g"), Column("seen_by"), Column("state")),
-    )
+    pixel = (Column("u_px", ".3f"), Column("v_px", ".3f"))
+    own = (Column("sigma_m", ".4g"), Column("seen_by"), Column("state"))
+    schema = Schema("landmarks", FRAME, Column("landmark"), *pixel, *place, *own)
 
     def rows(result: FrameResult) -> Rows:
-        grounded = result.locations
-        if grounded is None:
+        located = result.locations
+        if located is None:
             return dict.fromkeys(schema.names, ())
-        marks, fix = grounded.marks, grounded.fix
+        marks, fix = located.marks, located.fix
         shown = np.flatnonzero(np.isfinite(marks.image_px).all(axis=1))
         places = marks.east_north_m if result.mark_lonlat_deg is None else result.mark_lonlat_deg
         state = dict(zip(fix.landmark.tolist(), fix.state, strict=True))
         seen_by = result.sighted_by or ("",) * len(marks)
         landmark = marks.landmark[shown].tolist()
         return {
-            "frame": grounded.frame,
+            **_named(pixel, marks.image_px[shown]),
+            **_named(place, places[shown]),
+            "frame": located.frame,
             "landmark": [names[which] for which in landmark],
-            "u_px": marks.image_px[shown, 0],
-            "v_px": marks.image_px[shown, 1],
-            place[0].name: places[shown, 0],
-            place[1].name: places[shown, 1],
             "sigma_m": marks.sigma_m[shown],
             "seen_by": [seen_by[row] for row in shown.tolist()],
             "state": [state.get(which, "") for which in landmark],
@@ -184,7 +263,8 @@ class ConfirmedPositions(TableFiles[FrameResult]):
 
     def __init__(self, folder: Path, has_degrees: bool) -> None:
         self._path, self._is_written = folder / "confirmed.csv", False
-        super().__init__({self._path: (_position_schema(has_degrees, *CONFIRMATION), _confirmed_position_rows)})
+        schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION)
+        super().__init__({self._path: (schema, self._rows)})
 
     def write(self, item: FrameResult) -> None:
         """Add the targets of a frame."""
@@ -199,117 +279,12 @@ class ConfirmedPositions(TableFiles[FrameResult]):
         else:
             remove(self._path)
 
-
-def track_rows(followed: TrackedFrame) -> Rows:
-    """The boxes with an identity, as MOTChallenge text has them."""
-    tracks = followed.tracks
-    return mot_rows(followed.number, tracks.box_px, tracks.score, tracks.identity)
-
-
-def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
-    """Heading in [0, 360), pitch below the horizon, roll clockwise; straight down the upper edge gives the heading."""
-    heading, pitch, roll = pose.angles_rad
-    # Rounded first, so that a hair below north is not written as 360.
-    return round(math.degrees(heading), 4) % 360, math.degrees(pitch), math.degrees(roll)
-
-
-def upper_edge_deg(pose: CameraPose) -> float:
-    """The bearing of the picture's upper edge from its middle, in [0, 360); NaN where it is overhead."""
-    east, north, _ = -np.asarray(pose.axes, float)[:, 1]
-    return round(math.degrees(math.atan2(east, north)), 4) % 360 if math.hypot(east, north) > 1e-9 else math.nan
-
-
-def fix_row(grounded: AerialLocations) -> Rows:
-    """The row of a frame in fixes.csv."""
-    fix = grounded.fix
-    pose = [math.nan] * 8
-    if fix.pose is not None:
-        pose = [*fix.pose.place_m, *angles_deg(fix.pose), upper_edge_deg(fix.pose), fix.pose.focal]
-    names = ("east_m", "north_m", "up_m", "heading_deg", "pitch_deg", "roll_deg", "upper_edge_deg", "focal")
-    return {
-        "frame": grounded.frame,
-        "time_s": grounded.time_s,
-        "by": fix.by,
-        "landmarks_seen": len(fix.landmark),
-        "landmarks_used": sum(fix.is_used),
-        "chi2": fix.chi2,
-        "freedom": fix.freedom,
-        **dict(zip(names, pose, strict=True)),
-        "cause": " ".join(fix.cause.split()),
-        "changes": " ".join("; ".join(fix.changes).split()),
-    }
-
-
-class _TrackRows:
-    """Rows of tracks.csv with heading and speed since the box before, for identities that have one."""
-
-    def __init__(self) -> None:
-        self._trails = Trails(length=2)
-
-    def __call__(self, followed: TrackedFrame) -> Rows:
-        self._trails.add(followed)
-        tracks, given = followed.tracks, followed.detections
-        lines = followed.lines if len(followed.lines) else np.arange(1, len(given) + 1)
-        loose = followed.untracked
-        moves = [self._move(identity) for identity in tracks.identity.tolist()] + [(math.nan, math.nan)] * len(loose)
-        return {
-            **_boxes(np.concatenate([tracks.box_px, given.box_px[loose]])),
-            "frame": followed.number,
-            "identity": [*tracks.identity.tolist(), *[None] * len(loose)],
-            "score": [*tracks.score.tolist(), *given.score[loose].tolist()],
-            "kind": [*("detection" if row >= 0 else "bridge" for row in tracks.row), *["untracked"] * len(loose)],
-            "row": [*(lines[row] if row >= 0 else None for row in tracks.row), *(lines[row] for row in loose)],
-            "heading_deg": [heading for heading, _ in moves],
-            "speed_px_per_frame": [speed for _, speed in moves],
-        }
-
-    def _move(self, identity: int) -> tuple[float, float]:
-        trail = self._trails.places[identity]
-        if len(trail) < 2:
-            return math.nan, math.nan
-        (before, u0, v0), (now, u1, v1) = trail
-        return compass_deg(math.atan2(v1 - v0, u1 - u0)), math.hypot(u1 - u0, v1 - v0) / (now - before)
-
-
-def _person_boxes(found: PeopleFrame) -> Rows:
-    return mot_rows(found.frame.number, found.people.box_px, found.people.score)
-
-
-def _person_rows(found: PeopleFrame) -> Rows:
-    people = found.people
-    return {
-        **_person_boxes(found),
-        "target": np.arange(1, len(people) + 1),
-        "kind": "person",
-        "margin": people.margin,
-        "feet_u_px": people.feet_px[:, 0],
-        "feet_v_px": people.feet_px[:, 1],
-        "cut": people.cut,
-    }
-
-
-def _aerial_rows(grounded: AerialLocations) -> Rows:
-    return {
-        **_position_rows(grounded.positions),
-        "score": grounded.positions.score,
-        "time_s": grounded.time_s,
-        "relative_sigma_m": np.sqrt(np.trace(grounded.relative_m2, axis1=1, axis2=2)),
-        "velocity_east_m_s": grounded.velocity_m_s[:, 0],
-        "velocity_north_m_s": grounded.velocity_m_s[:, 1],
-        "by": grounded.fix.by,
-        "landmarks": sum(grounded.fix.is_used),
-    }
-
-
-def _confirmed_position_rows(result: FrameResult) -> Rows:
-    assert result.confirmed is not None
-    assert result.locations is not None
-    own = _position_rows(result.locations.positions)
-    rows = result.confirmed.row
-    return {
-        **{name: values if values is None else np.asarray(values)[rows] for name, values in own.items()},
-        **_confirmation_rows(result.confirmed),
-    }
+    @staticmethod
+    def _rows(result: FrameResult) -> Rows:
+        assert result.confirmed is not None
+        assert result.locations is not None
+        own, rows = _position_rows(result.locations.positions), result.confirmed.row
+        return {name: np.asarray(values)[rows] for name, values in own.items()} | _confirmation_rows(result.confirmed)
 
 
 def _confirmation_rows(confirmed: Confirmation) -> dict[str, Any]:
@@ -324,27 +299,28 @@ def _confirmation_rows(confirmed: Confirmation) -> dict[str, Any]:
     }
 
 
-def _position_schema(has_degrees: bool, *more: Column) -> Schema:
-    return Schema("positions", FRAME, TARGET, *EAST_NORTH, *COVARIANCE, *(DEGREES if has_degrees else ()), *more)
+def _position_columns(has_degrees: bool) -> tuple[Column, ...]:
+    return (FRAME, TARGET, *EAST_NORTH, *COVARIANCE, *(DEGREES if has_degrees else ()))
 
 
 def _position_rows(positions: Positions) -> dict[str, Any]:
     degrees = positions.lonlat_deg
     return {
-        **_covariance(positions.covariance_m2),
+        **_named(EAST_NORTH, positions.east_north_m),
+        **_named(COVARIANCE, _variances(positions.covariance_m2)),
+        **_named(DEGREES, np.full((len(positions), 2), np.nan) if degrees is None else degrees),
         "frame": positions.frame,
         "target": positions.target,
-        "east_m": positions.east_north_m[:, 0],
-        "north_m": positions.east_north_m[:, 1],
-        "longitude_deg": None if degrees is None else degrees[:, 0],
-        "latitude_deg": None if degrees is None else degrees[:, 1],
+        "score": positions.score,
     }
 
 
-def _covariance(covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
-    places = ((0, 0), (0, 1), (1, 1))
-    return {column.name: covariance_m2[:, i, j] for column, (i, j) in zip(COVARIANCE, places, strict=True)}
+def _variances(covariance_m2: np.ndarray) -> np.ndarray:
+    """(N, 3) east, both, north."""
+    return covariance_m2.reshape(-1, 4)[:, [0, 1, 3]]
 
 
-def _boxes(box_px: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip(_BOX_NAMES, np.reshape(box_px, (-1, 4)).T, strict=True))
+def _named(columns: Sequence[Column], values: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of (N, K) values by their names."""
+    named = np.reshape(values, (-1, len(columns))).T
+    return {column.name: cells for column, cells in zip(columns, named, strict=True)}

@@ -1,4 +1,4 @@
-"""Timelines of a run: figures of each frame, kept in arrays, and the panels that show them."""
+"""The timeline of a run: figures of each frame, kept in arrays, and the panels that show them."""
 
 import math
 from array import array
@@ -10,149 +10,117 @@ from markupsafe import Markup
 
 from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Entry
 from torchvision_dddas.io.report import Events, Line, Panel, time_chart
-from torchvision_dddas.types import Adjustment, AerialLocations, Confirmation, FrameResult
+from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult
 
-KINDS = ("human", "not_human", "unseen")
-"""Kinds of a target in a Confirmation."""
-
-_MOST_PARAMETERS, _MOST_STAGES = 12, 7
-_STAGE_COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)
+_KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours
 _EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2}
+_COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)  # of stages and parameters
+_MOST_PARAMETERS, _MOST_STAGES = 12, 7
 
 
 class Timeline:
-    """Rows of figures, one a frame, 8 bytes a figure; the space grows by doubling.
+    """Figures of the frames of a run by name, 8 bytes each, 4 for the time spent in a stage.
 
-    Columns `frame` and `time_s` are the time axis; frames with `located` 0 are shaded.
+    `frame` and `time_s` are the time axis; frames with `located` 0 are shaded.
+    entries: those of the log that are shown as events.
     """
-
-    columns: Sequence[str] = ("frame", "time_s", "located")
-
-    def __init__(self) -> None:
-        self._rows = np.zeros(256, np.dtype([(name, "f8") for name in self.columns]))
-        self._count = 0
-
-    @property
-    def rows(self) -> np.ndarray:
-        """(N,) structured array with `columns`."""
-        return self._rows[: self._count]
-
-    def panels(self) -> list[Panel]:
-        """The panels to draw."""
-        raise NotImplementedError
-
-    def chart(self, more: Sequence[Panel] = ()) -> Markup:
-        """Draw the panels. more: panels of the same frames that are drawn above."""
-        at, unit = self.axis()
-        return time_chart([*more, *self.panels()], at, self.rows["located"] == 0, unit)
-
-    def axis(self) -> tuple[np.ndarray, str]:
-        """(N,) places of the frames on the time axis and its unit: seconds where all are known."""
-        if np.isfinite(self.rows["time_s"]).all():
-            return self.rows["time_s"], "time, s"
-        return self.rows["frame"], "frame"
-
-    def _append(self, row: tuple[float, ...]) -> None:
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._count] = row
-        self._count += 1
-
-    def _lines(self, columns: Mapping[str, tuple[str, int]], band: bool = False) -> list[Line]:
-        at, _ = self.axis()
-        return [Line(name, at, self.rows[column], colour, band=band) for column, (name, colour) in columns.items()]
-
-
-class LocationTimeline(Timeline):
-    """Landmarks seen and used, standard deviations, chi-squared with its 95 % limit."""
-
-    columns = ("frame", "time_s", "seen", "used", "sigma_m", "relative_m", "chi2", "limit", "located")
-
-    def add(self, grounded: AerialLocations) -> None:
-        """Add a frame. sigma_m, relative_m: the median of its targets' roots of the covariance's trace."""
-        fix = grounded.fix
-        self._append(
-            (
-                grounded.frame,
-                grounded.time_s,
-                len(fix.landmark),
-                sum(fix.is_used),
-                _median_sigma(grounded.positions.covariance_m2),
-                _median_sigma(grounded.relative_m2),
-                fix.chi2,
-                chi2_limit(fix.freedom),
-                bool(fix.by),
-            )
-        )
-
-    def panels(self) -> list[Panel]:
-        """The landmarks, the standard deviations and chi-squared."""
-        at, _ = self.axis()
-        sigmas = {"sigma_m": ("absolute", 2), "relative_m": ("relative to the team", 3)}
-        limit = Line("95 % limit", at, self.rows["limit"], 6, dashed=True)
-        return [
-            ("landmarks", self._lines({"seen": ("seen", 6), "used": ("used", 1)})),
-            ("standard deviation of a target's place, m (median of the frame)", self._lines(sigmas, band=True)),
-            ("chi-squared of the landmarks", [*self._lines({"chi2": ("chi-squared", 7)}, band=True), limit]),
-        ]
-
-
-class RunTimeline(Timeline):
-    """Targets detected and tracked, confirmations, adjusted parameters, events, and the time spent by stage."""
-
-    columns = ("frame", "time_s", "found", "tracked", "placed", *KINDS, "located")
 
     def __init__(self, vehicles: Collection[str] = ()) -> None:
         """vehicles: names of the ground vehicles; the same parameter of all of them shares a panel."""
-        super().__init__()
+        self.entries: Sequence[Entry] = ()
         self._vehicles = frozenset(vehicles)
+        self._figures: dict[str, array[float]] = {}
         self._seconds: dict[str, array[float]] = {}
         self._moves: dict[str, list[tuple[int, float, float]]] = {}
-        self.entries: Sequence[Entry] = ()
-        """The entries of the log that are shown as events."""
 
-    def add(self, result: FrameResult, seconds: Mapping[str, float], adjustments: Sequence[Adjustment]) -> None:
-        """Add a frame, the time spent on it, and what was adjusted."""
-        followed, grounded = result.tracked, result.locations
-        time_s = math.nan if followed.frame is None else followed.frame.time_s
-        for stage in seconds:
-            if stage not in self._seconds:
-                self._seconds[stage] = array("f", bytes(4 * self._count))
+    def __len__(self) -> int:
+        return len(self._figures.get("frame", ()))
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """(N,) a figure of each frame, NaN where it is not known."""
+        return np.array(self._figures[name]) if name in self._figures else np.full(len(self), np.nan)
+
+    @property
+    def last_time_s(self) -> float:
+        """The time of the frame added last."""
+        return self._figures["time_s"][-1]
+
+    def add_result(self, result: FrameResult) -> None:
+        """Add a frame with its targets, confirmations, the time spent, and what was adjusted."""
+        tracked, located, confirmed = result.tracked, result.locations, result.confirmed
+        figures = {
+            "frame": tracked.number,
+            "time_s": math.nan if tracked.frame is None else tracked.frame.time_s,
+            "located": not tracked.cause,
+            "found": len(tracked.detections),
+            "tracked": int((tracked.tracks.row >= 0).sum()),
+            **{kind: math.nan if confirmed is None else confirmed.kind.count(kind) for kind in _KINDS},
+            **({} if located is None else {"placed": len(located.positions), **_location_figures(located)}),
+        }
+        source = tracked if located is None else located
+        self._add(figures, source.seconds, source.adjustments)
+
+    def add_locations(self, located: AerialLocations) -> None:
+        """Add a frame of which only the places are known."""
+        self._add(_location_figures(located))
+
+    def _add(
+        self,
+        figures: Mapping[str, float],
+        seconds: Mapping[str, float] | None = None,
+        adjustments: Sequence[Adjustment] = (),
+    ) -> None:
+        count = len(self)
+        for name in figures.keys() - self._figures.keys():
+            self._figures[name] = array("d", [math.nan]) * count
+        for stage in (seconds or {}).keys() - self._seconds.keys():
+            self._seconds[stage] = array("f", [0.0]) * count
+        for name, values in self._figures.items():
+            values.append(figures.get(name, math.nan))
         for stage, spent in self._seconds.items():
-            spent.append(seconds.get(stage, 0.0))
+            spent.append((seconds or {}).get(stage, 0.0))
         for moved in adjustments:
             self._moves.setdefault(moved.parameter, []).append((moved.frame, moved.old, moved.new))
-        self._append(
-            (
-                followed.number,
-                time_s if grounded is None else grounded.time_s,
-                len(followed.detections),
-                int((followed.tracks.row >= 0).sum()),
-                math.nan if grounded is None else len(grounded.positions),
-                *_counts(result.confirmed),
-                bool(grounded.fix.by) if grounded is not None else not followed.cause,
-            )
-        )
 
-    def values(self, parameter: str) -> np.ndarray:
+    def parameter(self, name: str) -> np.ndarray:
         """(N,) values of a parameter in each frame; NaN where it is not finite."""
-        moves = sorted(self._moves[parameter], key=lambda move: move[0])
+        moves = sorted(self._moves[name], key=lambda move: move[0])
         levels = np.array([moves[0][1], *(new for _, _, new in moves)], float)
-        since = np.array([frame for frame, _, _ in moves])
-        found = levels[np.searchsorted(since, self.rows["frame"], side="right")]
+        found = levels[np.searchsorted([frame for frame, _, _ in moves], self["frame"], side="right")]
         return np.where(np.isfinite(found), found, np.nan)
 
+    def axis(self) -> tuple[np.ndarray, str]:
+        """(N,) places of the frames on the time axis and its unit: seconds where all are known."""
+        time_s = self["time_s"]
+        return (time_s, "time, s") if np.isfinite(time_s).all() else (self["frame"], "frame")
+
+    def chart(self) -> Markup:
+        """Draw the panels."""
+        at, unit = self.axis()
+        return time_chart(self.panels(), at, self["located"] == 0, unit)
+
     def panels(self) -> list[Panel]:
-        """Events, targets, confirmations, adjusted parameters, and the time spent."""
-        targets = self._lines({"found": ("found", 6), "tracked": ("with an identity", 1), "placed": ("located", 2)})
-        kinds = {kind: (kind.replace("_", " "), colour) for kind, colour in zip(KINDS, (3, 2, 6), strict=True)}
+        """Events, targets, confirmations, adjusted parameters, the time spent, and how well frames were located."""
+        found = [("found", "found", 6), ("tracked", "with an identity", 1), ("placed", "located", 2)]
+        kinds = [(kind, kind.replace("_", " "), colour) for kind, colour in _KINDS.items()]
+        sigmas = [("sigma_m", "absolute", 2), ("relative_m", "relative to the team", 3)]
+        limit = Line("95 % limit", self.axis()[0], self["limit"], 6, dashed=True)
         return [
             ("what happened", self._events()),
-            ("targets", [line for line in targets if np.isfinite(line.y).any()]),
+            ("targets", self._lines(found)),
             ("targets by what ground vehicles say", self._lines(kinds)),
             *self._parameters(),
-            *self._time_spent(),
+            ("time spent on a frame, ms, stacked", self._time_spent()),
+            ("landmarks", self._lines([("seen", "seen", 6), ("used", "used", 1)])),
+            ("standard deviation of a target's place, m (median of the frame)", self._lines(sigmas, band=True)),
+            ("chi-squared of the landmarks", [*self._lines([("chi2", "chi-squared", 7)], band=True), limit]),
         ]
+
+    def _lines(self, figures: Sequence[tuple[str, str, int]], band: bool = False) -> list[Line]:
+        """Lines of those figures that are known in any frame. figures: their names, titles and colours."""
+        at, _ = self.axis()
+        lines = [Line(title, at, self[name], colour, band=band) for name, title, colour in figures]
+        return [line for line in lines if np.isfinite(line.y).any()]
 
     def _events(self) -> list[Events]:
         at, _ = self.axis()
@@ -160,28 +128,28 @@ class RunTimeline(Timeline):
         for kind, colour in _EVENT_COLOURS.items():
             entries = [entry for entry in self.entries if entry.kind == kind]
             if entries and len(at):
-                places = np.interp([entry.first for entry in entries], self.rows["frame"], at)
+                places = np.interp([entry.first for entry in entries], self["frame"], at)
                 found.append(Events(kind, places, [f"frame {e.first}: {e.text}" for e in entries], colour))
         return found
 
     def _parameters(self) -> list[Panel]:
         """The panels of the parameters moved most often, without those that never changed."""
         at, _ = self.axis()
-        values = {parameter: self.values(parameter) for parameter in self._moves}
+        values = {parameter: self.parameter(parameter) for parameter in self._moves}
         panels: dict[str, list[str]] = {}
         for parameter in sorted(name for name, v in values.items() if len(np.unique(v[np.isfinite(v)])) > 1):
-            who, _, what = parameter.partition(".")
-            title = f"{what} of each ground vehicle" if who in self._vehicles else parameter
+            owner, _, name = parameter.partition(".")
+            title = f"{name} of each ground vehicle" if owner in self._vehicles else parameter
             panels.setdefault(title, []).append(parameter)
         by_moves = sorted(panels, key=lambda title: -sum(len(self._moves[name]) for name in panels[title]))
         found: list[Panel] = []
         for title in sorted(by_moves[:_MOST_PARAMETERS]):
             names = {p: "" if panels[title] == [title] else p.partition(".")[0] for p in panels[title]}
-            shown = zip(names.items(), cycle(_STAGE_COLOURS), strict=False)
+            shown = zip(names.items(), cycle(_COLOURS), strict=False)
             found.append((title, [Line(name, at, values[p], colour, steps=True) for (p, name), colour in shown]))
         return found
 
-    def _time_spent(self) -> list[Panel]:
+    def _time_spent(self) -> list[Line]:
         """The slowest stages, each stacked on those below; the highest is drawn first, so that none is hidden."""
         at, _ = self.axis()
         spent_ms = {stage: 1000 * np.asarray(times, float) for stage, times in self._seconds.items()}
@@ -189,12 +157,28 @@ class RunTimeline(Timeline):
         shown = {stage: spent_ms[stage] for stage in by_time[:_MOST_STAGES]}
         if rest := [spent_ms[stage] for stage in by_time[_MOST_STAGES:]]:
             shown["other"] = np.sum(rest, axis=0)
-        if not shown:
-            return []
         heights = np.cumsum([*shown.values()], axis=0)
-        stages = zip(shown, heights, _STAGE_COLOURS, strict=False)
-        lines = [Line(stage, at, height, colour, area=True) for stage, height, colour in stages]
-        return [("time spent on a frame, ms, stacked", lines[::-1])]
+        stages = zip(shown, heights, _COLOURS, strict=False)
+        return [Line(stage, at, height, colour, area=True) for stage, height, colour in stages][::-1]
+
+
+def _location_figures(located: AerialLocations) -> dict[str, float]:
+    """Landmarks seen and used, standard deviations, chi-squared with its 95 % limit.
+
+    sigma_m, relative_m: the median of the frame's targets' roots of the covariance's trace.
+    """
+    fix = located.fix
+    return {
+        "frame": located.frame,
+        "time_s": located.time_s,
+        "located": bool(fix.by),
+        "seen": len(fix.landmark),
+        "used": sum(fix.is_used),
+        "sigma_m": _median_sigma(located.positions.covariance_m2),
+        "relative_m": _median_sigma(located.relative_m2),
+        "chi2": fix.chi2,
+        "limit": chi2_limit(fix.freedom),
+    }
 
 
 def chi2_limit(freedom: int) -> float:
@@ -209,9 +193,3 @@ def _median_sigma(covariance_m2: np.ndarray) -> float:
     sigma = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
     sigma = sigma[np.isfinite(sigma)]
     return float(np.median(sigma)) if len(sigma) else math.nan
-
-
-def _counts(confirmed: Confirmation | None) -> list[float]:
-    if confirmed is None:
-        return [math.nan] * len(KINDS)
-    return [confirmed.kind.count(kind) for kind in KINDS]

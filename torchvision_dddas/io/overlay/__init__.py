@@ -1,16 +1,31 @@
 """The overlay of a run: the clip with everything found drawn in."""
 
 from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, drawable, identity_colour, label, rectangle
-from torchvision_dddas.io.overlay.layers import RunPictures, TrackPictures, draw_people, draw_scene
+from torchvision_dddas.io.overlay.layers import (
+    LETTERS,
+    LIKELY,
+    RunPictures,
+    ToMetres,
+    TrackPictures,
+    Trails,
+    command_metres,
+    draw_people,
+    draw_scene,
+)
 from torchvision_dddas.io.overlay.video import OverlayPicture, OverlayVideo
 
 __all__ = [
+    "LETTERS",
+    "LIKELY",
     "Colour",
     "OverlayPicture",
     "OverlayVideo",
     "RunPictures",
+    "ToMetres",
     "TrackPictures",
+    "Trails",
     "colour_picture",
+    "command_metres",
     "draw_people",
     "draw_scene",
     "drawable",
