@@ -11,7 +11,7 @@ import pytest
 from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import MotionDetector, detect_motion
-from torchvision_dddas.detection.windows import look_ahead, settling_delay
+from torchvision_dddas.detection.interval import look_ahead, settling_delay
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Frame, Scene, Telemetry
 

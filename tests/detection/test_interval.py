@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import IntervalParameters, Settings, load_config, with_parameters
-from torchvision_dddas.detection import windows
+from torchvision_dddas.detection import interval as windows
 from torchvision_dddas.detection.interval import (
     AltitudeSettings,
     Gates,

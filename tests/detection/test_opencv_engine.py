@@ -12,7 +12,6 @@ from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.detection import opencv_engine as onboard_half
 from torchvision_dddas.detection import opencv_foreground as onboard_pixels
-from torchvision_dddas.detection import opencv_registration as onboard_registration
 from torchvision_dddas.detection.blobs import close_mask
 from torchvision_dddas.detection.engine import Foreground, View, Window
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
@@ -76,7 +75,7 @@ def test_gradients_and_corners_in_strips_are_those_of_the_whole(size: tuple[int,
     assert np.array_equal(onboard_pixels.measure_texture(grey), whole)
     for block in (3, 5, 7):
         corners = cv2.cornerMinEigenVal(grey, block, ksize=3)
-        np.testing.assert_allclose(onboard_registration._corners(grey, block), corners, rtol=1e-3, atol=1e-8)
+        np.testing.assert_allclose(onboard_half.measure_corners(grey, block), corners, rtol=1e-3, atol=1e-8)
 
 
 @pytest.mark.parametrize("side", [1, 3, 4, 15, 25])
@@ -123,7 +122,7 @@ def test_any_size_is_halved_and_made_whole_again(size: tuple[int, int]) -> None:
     grey = np.full((size[1], size[0]), 9, np.uint8)
     half = onboard_half.halve_view(View(grey, grey))
     assert half.size == (max(size[0] // 2, 1), max(size[1] // 2, 1))
-    assert np.array_equal(onboard_half._double(half.grey, size), grey)
+    assert np.array_equal(onboard_half.double(half.grey, size), grey)
 
 
 def test_registration_at_half_the_size_has_the_whole_pictures_pixels(half_images: list[np.ndarray]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
 from torchvision_dddas.detection import View, Window, load_engine
-from torchvision_dddas.detection.registration import fit_exposure, match_exposure
+from torchvision_dddas.detection.engine import fit_exposure, match_exposure
 from torchvision_dddas.geometry import corner_error
 
 SIZE = (320, 240)

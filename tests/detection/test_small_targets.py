@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import SmallParameters
-from torchvision_dddas.detection.small_targets import SmallTracks, find_candidates
+from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 
 KNOBS = SmallParameters()
 

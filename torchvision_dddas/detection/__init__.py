@@ -1,35 +1,58 @@
 """Moving targets from a moving camera: frames to targets. `MotionDetector` is the way in."""
 
+from typing import TYPE_CHECKING, Any
+
 from torchvision_dddas.detection.blobs import fill_hull
-from torchvision_dddas.detection.detector import (
-    Clip,
-    MotionDetector,
-    Retune,
-    check_length,
-    detect_motion,
-    load_engine,
+from torchvision_dddas.detection.detector import Clip, MotionDetector, Retune, check_length, detect_motion, load_engine
+from torchvision_dddas.detection.engine import (
+    EVIDENCE_CAP,
+    EVIDENCE_SCALE,
+    Engine,
+    Foreground,
+    View,
+    Window,
+    cell_side,
+    match_exposure,
 )
-from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, Engine, Foreground, View, Window
 from torchvision_dddas.detection.interval import interval_from_flow, interval_from_telemetry, pixels_per_metre
-from torchvision_dddas.detection.registration import cell_side, match_exposure
+from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
+
+if TYPE_CHECKING:
+    from torchvision_dddas.detection.torch_engine import TorchEngine, absolute_difference, find_seen_by_both
 
 __all__ = [
     "EVIDENCE_CAP",
     "EVIDENCE_SCALE",
+    "LAST_TOLERANCE",
     "Clip",
     "Engine",
     "Foreground",
     "MotionDetector",
     "Retune",
+    "TorchEngine",
     "View",
     "Window",
+    "absolute_difference",
     "cell_side",
     "check_length",
+    "detect_keypoints",
     "detect_motion",
     "fill_hull",
+    "find_seen_by_both",
+    "fit_motion",
     "interval_from_flow",
     "interval_from_telemetry",
     "load_engine",
     "match_exposure",
     "pixels_per_metre",
+    "track_both_ways",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The names of the torch engine, which is loaded when one of them is first used."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from torchvision_dddas.detection import torch_engine
+
+    return getattr(torch_engine, name)

@@ -68,8 +68,7 @@ class DenseFlow:
 def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> Motion:
     """The motion of one blob from two flow fields (half resolution) to frames that are `offsets` away."""
     x, y, width, height = blob.box
-    rows, columns = flows[0].shape[:2]
-    far = _RING_FAR_PX
+    (rows, columns), far = flows[0].shape[:2], _RING_FAR_PX
     top, left = max(y // 2 - far, 0), max(x // 2 - far, 0)
     bottom, right = min((y + height) // 2 + far, rows), min((x + width) // 2 + far, columns)
     near = [flow[top:bottom, left:right] for flow in flows]
@@ -83,10 +82,8 @@ def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int
         inside[row[fits], column[fits]] = True
         return inside
 
-    body = at_half(blob.mask)
-    core = at_half(blob.core)
-    if not core.any():
-        core = body
+    body, core = at_half(blob.mask), at_half(blob.core)
+    core = core if core.any() else body
     if not core.any():
         return Motion(np.full(2, np.nan), frame=(float(x), float(y), 1.0))
     a, b = near[0] / offsets[0], near[1] / offsets[1]
@@ -101,9 +98,8 @@ def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int
     alike = np.linalg.norm(a[core] - b[core], axis=1) < _STEADY * speed
     unlike = np.linalg.norm(v - around, axis=1) > _UNLIKE * speed
     steady = float((alike & unlike & (speed > _MIN_SPEED_PX)).mean())
-    row, column = np.nonzero(core)
-    step = max(1, len(row) // _SAMPLES)
-    row, column = row[::step], column[::step]
+    places = np.argwhere(core)
+    row, column = places[:: max(1, len(places) // _SAMPLES)].T
     centre_u, centre_v = 2 * (left + column.mean()) + 0.5, 2 * (top + row.mean()) + 0.5
     scale = float(max(width, height))
     u, w = (2 * (left + column) + 0.5 - centre_u) / scale, (2 * (top + row) + 0.5 - centre_v) / scale
@@ -176,8 +172,7 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
     for _ in range(_ROUNDS):
         if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
             return None
-        fits = fit(~second), fit(second)
-        misses = [np.linalg.norm(flow - columns @ one, axis=1) for one in fits]
+        misses = [np.linalg.norm(flow - columns @ one, axis=1) for one in (fit(~second), fit(second))]
         second = misses[1] < misses[0]
     if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
         return None
@@ -187,11 +182,13 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
         return None
     if a @ b > np.cos(_ASIDE_RAD) * speeds[0] * speeds[1]:
         return None
-    explained = [float((misses[i][chosen] < difference / 2).mean()) for i, chosen in enumerate((~second, second))]
     part = np.zeros(core.shape, bool)
     part[row[second], column[second]] = True
-    if min(explained) < _EXPLAINED or min(_largest_share(part), _largest_share(core & ~part)) < _ONE_PIECE:
-        return None
+    for miss, chosen, mask in zip(misses, (~second, second), (core & ~part, part), strict=True):
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+        largest = stats[1:, cv2.CC_STAT_AREA].max() / chosen.sum()
+        if (miss[chosen] < difference / 2).mean() < _EXPLAINED or largest < _ONE_PIECE:
+            return None
     return part
 
 
@@ -206,9 +203,3 @@ def _find_second_cluster(flow_px: np.ndarray) -> np.ndarray:
             break
         means = [flow_px[~second].mean(axis=0), flow_px[second].mean(axis=0)]
     return second
-
-
-def _largest_share(part: np.ndarray) -> float:
-    """Share of a mask's pixels that its largest connected region holds."""
-    count, _, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8))
-    return float(stats[1:count, cv2.CC_STAT_AREA].max() / part.sum()) if count > 1 else 0.0

@@ -11,6 +11,12 @@ from torchvision_dddas.geometry import occupied
 Box = tuple[int, int, int, int]
 
 
+def box_slices(box: Box, left: int = 0, top: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of a box, x, y, width, height, in a picture whose first pixel is at (left, top)."""
+    x, y, width, height = box
+    return slice(y - top, y - top + height), slice(x - left, x - left + width)
+
+
 @dataclass(frozen=True)
 class Blob:
     """A connected region of the core mask.
@@ -37,12 +43,6 @@ class Blob:
         x, y, width, height = self.box
         return np.array([x + (width - 1) / 2, y + (height - 1) / 2])
 
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the box in the picture."""
-        x, y, width, height = self.box
-        return slice(y, y + height), slice(x, x + width)
-
     def cut(self, share: np.ndarray) -> "Blob":
         """The part of the blob that lies in `share`, (height, width) bool of its box."""
         mask = self.mask & share
@@ -61,12 +61,11 @@ def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
     """Close a mask with an ellipse: the result of OpenCV bit for bit, computed only around set pixels."""
     if side <= 1:
         return mask
-    kernel = ellipse(side)
     out = np.zeros_like(mask)
     # The closing of a pixel depends on what lies less than 2 x side away.
-    for x, y, width, height in occupied(mask, 2 * side):
-        part = np.s_[y : y + height, x : x + width]
-        cv2.morphologyEx(mask[part], cv2.MORPH_CLOSE, kernel, dst=out[part])
+    for box in occupied(mask, 2 * side):
+        part = box_slices(box)
+        cv2.morphologyEx(mask[part], cv2.MORPH_CLOSE, ellipse(side), dst=out[part])
     return out
 
 
@@ -80,25 +79,36 @@ def find_blobs(
     areas and blobs are given.
     """
     blobs = []
-    for left, top, wide, high in occupied(core, 2):
-        part = np.s_[top : top + high, left : left + wide]
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(core[part], ltype=cv2.CV_32S)
-        for label in range(1, count):
-            x, y, width, height, area = (int(v) for v in stats[label])
+    for part in occupied(core, 2):
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(core[box_slices(part)], ltype=cv2.CV_32S)
+        for label, (x, y, width, height, area) in enumerate(stats[1:count].tolist(), 1):
             if area * scale**2 < min_area_px:
                 continue
-            window = np.s_[y : y + height, x : x + width]
-            region = labels[window] == label
-            seen = evidence[part][window]
+            region = labels[y : y + height, x : x + width] == label
+            box = part[0] + x, part[1] + y, width, height
+            seen = evidence[box_slices(box)]
             if (highest := float(seen[region].max())) < peak:
                 continue
-            certain, box = region & (seen > threshold), (left + x, top + y, width, height)
+            certain = region & (seen > threshold)
             if scale > 1:
                 region, certain = (kept.repeat(scale, axis=0).repeat(scale, axis=1) for kept in (region, certain))
                 box = box[0] * scale, box[1] * scale, width * scale, height * scale
             blobs.append(Blob(box, fill_hull(region) if hull else region, certain, highest))
     blobs.sort(key=lambda blob: (blob.box[1], blob.box[0]))
-    return _drop_contained(blobs) if hull else blobs
+    if not hull:
+        return blobs
+    kept: list[Blob] = []
+    for blob in sorted(blobs, key=lambda b: -b.box[2] * b.box[3]):
+        if not any(_contains(larger, blob.box) for larger in kept):
+            kept.append(blob)
+    return kept
+
+
+def _contains(larger: Blob, box: Box) -> bool:
+    x, y = box[0] - larger.box[0], box[1] - larger.box[1]
+    if x < 0 or y < 0 or x + box[2] > larger.box[2] or y + box[3] > larger.box[3]:
+        return False
+    return bool(larger.mask[y : y + box[3], x : x + box[2]].mean() > 0.9)
 
 
 def find_weak_blobs(
@@ -114,9 +124,9 @@ def find_weak_blobs(
     core = close_mask(cv2.erode(core, ellipse(parameters.erode_px)), parameters.close_px)
     taken = np.zeros(wide.shape, bool)
     for blob in found:
-        taken[blob.window] |= blob.mask
+        taken[box_slices(blob.box)] |= blob.mask
     others = find_blobs(core, wide, threshold, min_area_px, peak, parameters.hull)
-    return [replace(blob, weak=True) for blob in others if not taken[blob.window][blob.mask].any()]
+    return [replace(blob, weak=True) for blob in others if not taken[box_slices(blob.box)][blob.mask].any()]
 
 
 def fill_hull(region: np.ndarray) -> np.ndarray:
@@ -128,21 +138,6 @@ def fill_hull(region: np.ndarray) -> np.ndarray:
     return canvas > 0
 
 
-def _drop_contained(blobs: list[Blob]) -> list[Blob]:
-    kept: list[Blob] = []
-    for blob in sorted(blobs, key=lambda b: -b.box[2] * b.box[3]):
-        if not any(_contains(other, blob.box) for other in kept):
-            kept.append(blob)
-    return kept
-
-
-def _contains(other: Blob, box: Box) -> bool:
-    (x, y, width, height), (ox, oy, ow, oh) = box, other.box
-    if x < ox or y < oy or x + width > ox + ow or y + height > oy + oh:
-        return False
-    return bool(other.mask[y - oy : y - oy + height, x - ox : x - ox + width].mean() > 0.9)
-
-
 def group_fragments(boxes_px: np.ndarray, velocities_px: np.ndarray) -> list[list[int]]:
     """Indices of boxes that are fragments of one target.
 
@@ -150,29 +145,17 @@ def group_fragments(boxes_px: np.ndarray, velocities_px: np.ndarray) -> list[lis
     are at most a fifth of the larger one's size apart along either axis, overlap along one of them by half of the
     smaller one, move by more than 1 px a frame, and differ in velocity by at most a fifth of it.
     """
-    leader = list(range(len(boxes_px)))
-
-    def root(i: int) -> int:
-        while leader[i] != i:
-            i = leader[i]
-        return i
-
+    low, size = boxes_px[:, :2], boxes_px[:, 2:]
+    speed = np.hypot(*velocities_px.T)
+    groups: list[list[int]] = []
     for i in range(len(boxes_px)):
-        for j in range(i):
-            if _are_fragments(boxes_px[i], boxes_px[j], velocities_px[i], velocities_px[j]):
-                leader[root(i)] = root(j)
-    groups: dict[int, list[int]] = {}
-    for i in range(len(boxes_px)):
-        groups.setdefault(root(i), []).append(i)
-    return list(groups.values())
-
-
-def _are_fragments(a: np.ndarray, b: np.ndarray, va: np.ndarray, vb: np.ndarray) -> bool:
-    if not (np.isfinite(va).all() and np.isfinite(vb).all()):
-        return False
-    gap = np.maximum(a[:2], b[:2]) - np.minimum(a[:2] + a[2:], b[:2] + b[2:])
-    reach = 0.2 * np.maximum(a[2:], b[2:])
-    speed = max(float(np.hypot(*va)), float(np.hypot(*vb)))
-    alike = float(np.hypot(*(va - vb))) <= 0.2 * speed and speed > 1.0
-    overlap = -gap / np.minimum(a[2:], b[2:])
-    return bool((gap <= reach).all() and overlap.max() > 0.5 and alike)
+        gap = np.maximum(low[i], low[:i]) - np.minimum(low[i] + size[i], low[:i] + size[:i])
+        overlap = (-gap / np.minimum(size[i], size[:i])).max(axis=1)
+        near = (gap <= 0.2 * np.maximum(size[i], size[:i])).all(axis=1) & (overlap > 0.5)
+        faster = np.maximum(speed[i], speed[:i])
+        alike = (np.hypot(*(velocities_px[i] - velocities_px[:i]).T) <= 0.2 * faster) & (faster > 1.0)
+        fragments = set(np.flatnonzero(near & alike).tolist())
+        joined = [group for group in groups if fragments.intersection(group)]
+        groups = [group for group in groups if group not in joined]
+        groups.append(sorted([*(k for group in joined for k in group), i]))
+    return sorted(groups)

@@ -10,28 +10,23 @@ from typing import Protocol
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection import windows
 from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.engine import Engine, View, Window
 from torchvision_dddas.detection.interval import (
     AltitudeSettings,
     adjust_interval,
+    choose_pairs,
     follow_altitude,
     interval_from_flow,
     interval_from_telemetry,
+    look_ahead,
     settings_at,
+    settling_delay,
 )
 from torchvision_dddas.detection.motion_history import MotionHistory
-from torchvision_dddas.detection.observation import (
-    Observation,
-    Target,
-    build_core_mask,
-    build_detections,
-    draw_targets,
-    observe,
-)
+from torchvision_dddas.detection.observation import Observation, Target, build_detections, draw_targets, observe
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-from torchvision_dddas.detection.small_targets import SmallTracks, find_candidates
+from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.runtime import wants_torch
@@ -88,7 +83,7 @@ def detect_motion(
             detector.change_settings(new)
         yield from detector._settle(frame, adjustments)
     if telemetry is not None:
-        telemetry.check_overlap(detector.last_time_s)
+        telemetry.check_overlap(detector._last.time_s)
     yield from detector._settle_rest(getattr(source, "last", 0))
 
 
@@ -114,28 +109,22 @@ def check_length(frames: int) -> None:
 
 @dataclass
 class _Slot:
-    """One frame in flight. step: registration to the next frame; None while unknown and at the end.
+    """One frame in flight. look: its number if frames that are skipped on purpose did not count.
 
-    look: its number if frames that are skipped on purpose did not count.
+    step: registration to the next frame; None while unknown and at the end. interval: 0 until it is chosen.
     """
 
     frame: Frame
     view: View
     look: int
+    is_blank: bool
+    altitude: AltitudeSettings
+    adjustments: tuple[Adjustment, ...]
+    seconds: dict[str, float]
     step: Registration | None = None
     interval: int = 0
-    altitude: AltitudeSettings | None = None
-    adjustments: tuple[Adjustment, ...] = ()
-    observation: Observation | None = None
+    observation: Observation = field(default_factory=Observation)
     cause: str = ""
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def is_blank(self) -> bool:
-        if "blank" not in self.view.kept:  # needed as the later frame of one step and the earlier of the next
-            self.view.kept["blank"] = float(self.view.grey[::4, ::4].std()) < _BLANK_LEVELS
-        blank: bool = self.view.kept["blank"]
-        return blank
 
     @property
     def next_from_this(self) -> np.ndarray | None:
@@ -167,16 +156,14 @@ class MotionDetector:
         self.batch = batch or (_TORCH_BATCH if self.engine.name == "torch" else 1)
         self.rate_hz, self.telemetry = rate_hz, telemetry
         self.interval = self.settings.interval.frames
-        self.last_time_s = 0.0
         self._slots: deque[_Slot] = deque()
         self._memory = _memory_frames(self.settings)
-        self._shape: tuple[int, ...] = (0, 0)  # of the frames
         self._first = 0  # index of _slots[0]; indices count the frames that were read
         # Slots below these indices are registered, observed, have their targets, are in the history, were returned.
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
         self._total = 0
+        self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest one
         self._last_number = 0  # of the scenes returned
-        self._last_given = 0  # of the frames taken
         self._skipped = 0  # frames skipped on purpose so far
         self._ended = False
         self._flows: deque[float] = deque(maxlen=self.settings.interval.memory_frames)
@@ -213,15 +200,28 @@ class MotionDetector:
         else:
             self._altitude = settings_at(altitude_m, self.rate_hz, settings)
 
+    def _as_frame(self, frame: Frame | np.ndarray) -> Frame:
+        image = frame.image if isinstance(frame, Frame) else frame
+        if not isinstance(image, np.ndarray):
+            raise InputError(f"a frame must be a Frame or a NumPy image, got {type(image).__name__}")
+        if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or image.shape[2:] == (3,)):
+            raise InputError(
+                f"an image must be uint8 of shape (H, W) or (H, W, 3), got {image.dtype} of shape {image.shape}"
+            )
+        if isinstance(frame, Frame):
+            return frame
+        return Frame(self._last.number + 1, self._last.number / self.rate_hz, image)
+
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """As `update`, one scene at a time."""
         start = time.perf_counter()
         self._skipped += frame.skipped
         view = self.engine.prepare(frame.image)
-        slot = _Slot(frame, view, frame.number - self._skipped, adjustments=adjustments)
-        slot.seconds["prepare"] = time.perf_counter() - start
-        self._shape, self._last_given, self.last_time_s = frame.image.shape, frame.number, frame.time_s
-        self._slots.append(slot)
+        is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
+        seconds = {"prepare": time.perf_counter() - start}
+        look = frame.number - self._skipped
+        self._slots.append(_Slot(frame, view, look, is_blank, self._altitude, adjustments, seconds))
+        self._last = frame
         self._total += 1
         if self._total - self._registered > self.batch:
             yield from self._advance()
@@ -233,30 +233,26 @@ class MotionDetector:
         yield from self._advance()
         yield from self._fill_gap(last_number + 1)
 
-    def _as_frame(self, frame: Frame | np.ndarray) -> Frame:
-        image = frame.image if isinstance(frame, Frame) else frame
-        if not isinstance(image, np.ndarray):
-            raise InputError(f"a frame must be a Frame or a NumPy image, got {type(image).__name__}")
-        if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or image.shape[2:] == (3,)):
-            raise InputError(
-                f"an image must be uint8 of shape (H, W) or (H, W, 3), got {image.dtype} of shape {image.shape}"
-            )
-        if isinstance(frame, Frame):
-            return frame
-        return Frame(self._last_given + 1, self._last_given / self.rate_hz, image)
-
     def _advance(self) -> Iterator[Scene]:
         self._register()
         while ready := self._find_ready():
             self._observe(ready)
             for index in ready:
-                self._follow_small(index)
+                if self.settings.small.on:
+                    self._follow_small(index)
                 self._observed = index + 1
                 self._draw()
                 yield from self._emit()  # after every frame: what is settled must not depend on the batch
 
     def _at(self, index: int) -> _Slot:
         return self._slots[index - self._first]
+
+    def _from_before(self, index: int) -> Registration | None:
+        """The registration from the frame before."""
+        return self._at(index - 1).step if index > self._first else None
+
+    def _this_from_last(self, index: int) -> np.ndarray | None:
+        return self._at(index - 1).next_from_this if index > self._first else None
 
     # -- registration ------------------------------------------------------------------------------------------------
 
@@ -278,33 +274,18 @@ class MotionDetector:
             slot.seconds["register"] = seconds
         self._registered += len(steps)
 
-    def _step_to(self, index: int) -> Registration | None:
-        """The step from the frame before."""
-        return self._at(index - 1).step if index > self._first else None
-
-    def _linked_range(self, index: int, back: int, ahead: int) -> tuple[int, int]:
-        """The first and last frame that reliable steps link to `index`, at most so many frames away."""
-        first = last = index
-        while first > max(self._first, index - back) and self._at(first - 1).next_from_this is not None:
-            first -= 1
-        while last < min(self._registered, index + ahead) and self._at(last).next_from_this is not None:
-            last += 1
-        return first, last
-
     # -- observation -------------------------------------------------------------------------------------------------
 
     def _find_ready(self) -> list[int]:
         """Up to `batch` frames whose windows are complete."""
         ready: list[int] = []
-        while len(ready) < self.batch and self._observed + len(ready) < self._total:
-            index = self._observed + len(ready)
+        for index in range(self._observed, min(self._observed + self.batch, self._total)):
             slot = self._at(index)
             if not slot.interval:
                 if slot.step is None and not self._ended:
                     break
                 self._steer(index, slot)
-            ahead = windows.look_ahead(slot.interval, self.settings)
-            if not self._ended and self._registered < index + ahead:
+            if not self._ended and self._registered < index + look_ahead(slot.interval, self.settings):
                 break
             ready.append(index)
         # Whole batches only while the clip runs: a batching engine takes as long for four windows as for eight.
@@ -321,128 +302,110 @@ class MotionDetector:
         slot.altitude = self._altitude
         if slot.step is not None and slot.step.reliable:
             self._flows.append(slot.step.flow_px / (self._at(index + 1).frame.skipped + 1))
-        if parameters.rule:
-            wanted, cause = None, ""
-            if flight is not None and altitude_m is not None and np.isfinite(flight.speed_m_s):
-                wanted = interval_from_telemetry(altitude_m, flight.speed_m_s, self.rate_hz, parameters)
-                cause = f"altitude {altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
-            elif self._flows:
-                wanted = interval_from_flow(self._flows, slot.view.size[0], parameters)
-                cause = f"background flow {np.median(self._flows):.2f} px a frame"
-            if wanted is not None:
-                wanted /= slot.frame.skipped + 1
-                self.interval, moved = adjust_interval(number, self.interval, wanted, cause, parameters)
-                slot.adjustments += moved
+        wanted, cause = None, ""
+        if not parameters.rule:
+            pass
+        elif flight is not None and altitude_m is not None and np.isfinite(flight.speed_m_s):
+            wanted = interval_from_telemetry(altitude_m, flight.speed_m_s, self.rate_hz, parameters)
+            cause = f"altitude {altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+        elif self._flows:
+            wanted = interval_from_flow(self._flows, slot.view.size[0], parameters)
+            cause = f"background flow {np.median(self._flows):.2f} px a frame"
+        if wanted is not None:
+            wanted /= slot.frame.skipped + 1
+            self.interval, moved = adjust_interval(number, self.interval, wanted, cause, parameters)
+            slot.adjustments += moved
         slot.interval = self.interval
 
     def _observe(self, indices: list[int]) -> None:
         start = time.perf_counter()
-        made = []
-        for index in indices:
-            window = self._build_window(index)
-            if window is None:
-                self._at(index).observation = Observation(None, None)
-            else:
-                made.append((index, window))
+        made = [(index, window) for index in indices if (window := self._build_window(index)) is not None]
         foregrounds = self.engine.foreground([window for _, window in made]) if made else []
         seconds = (time.perf_counter() - start) / max(len(made), 1)
         for (index, window), foreground in zip(made, foregrounds, strict=True):
             slot = self._at(index)
             start = time.perf_counter()
-            history = self._move_history(index) if self.settings.history.on else None
-            slot.observation = observe(window, foreground, self._flow, self._settings_of(slot), history)
+            history = None
+            if self.settings.history.on:
+                history = self._history
+                for i in range(max(self._remembered, self._first), index + 1):
+                    history.move(self._at(i).look, self._this_from_last(i))
+                self._remembered = index + 1
+            slot.observation = observe(window, foreground, self._flow, slot.altitude.settings, history)
             slot.seconds |= {"foreground": seconds, "blobs": time.perf_counter() - start}
 
-    def _settings_of(self, slot: _Slot) -> Settings:
-        return slot.altitude.settings if slot.altitude else self.settings
-
-    def _move_history(self, index: int) -> MotionHistory:
-        """The motion history, moved on to a frame."""
-        for i in range(max(self._remembered, self._first), index + 1):
-            self._history.move(self._at(i).look, self._at(i - 1).next_from_this if i > self._first else None)
-        self._remembered = index + 1
-        return self._history
-
     def _build_window(self, index: int) -> Window | None:
-        slot = self._at(index)
-        before = self._step_to(index)
+        slot, settings = self._at(index), self._at(index).altitude.settings
+        before = self._from_before(index)
         if before is not None and not before.reliable:  # a cut or a blank picture: reported once, at this frame
             slot.cause = before.cause
             return None
-        parameters = self.settings.difference
-        back = max(parameters.wide_frames, 2 * slot.interval, 2 * max(parameters.near_frames))
-        first, last = self._linked_range(index, back, 2 * slot.interval)
-        near, wide, small = windows.choose_pairs(index, slot.interval, first, last, self._settings_of(slot))
+        # The first and last frame that reliable steps link to this one.
+        parameters, first, last = self.settings.difference, index, index
+        back = index - max(parameters.wide_frames, 2 * slot.interval, 2 * max(parameters.near_frames))
+        while first > max(self._first, back) and self._this_from_last(first) is not None:
+            first -= 1
+        while last < min(self._registered, index + 2 * slot.interval) and self._at(last).next_from_this is not None:
+            last += 1
+        near, wide, small = choose_pairs(index, slot.interval, first, last, settings)
         if not near:
-            step = slot.step
-            slot.cause = (
-                step.cause if step is not None and not step.reliable else "too few frames hang together with it"
-            )
+            is_cut = slot.step is not None and not slot.step.reliable
+            slot.cause = slot.step.cause if slot.step and is_cut else "too few frames hang together with it"
             return None
         used = sorted({i for pair in [*near, wide, small] if pair for i in pair})
         place = {i: k for k, i in enumerate(used)}
-
-        def places(pair: windows.Pair) -> windows.Pair:
-            return place[pair[0]], place[pair[1]]
-
+        matrices = []
+        for other in used:
+            steps = [self._at(i).step for i in range(min(index, other), max(index, other))]
+            last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
+            matrices.append(last_from_first if other > index else np.linalg.inv(last_from_first))
         return Window(
             slot.view,
             tuple(self._at(i).view for i in used),
-            np.array([self._neighbour_from_reference(index, i) for i in used]),
+            np.array(matrices),
             tuple(i - index for i in used),
-            tuple(places(pair) for pair in near),
-            places(wide) if wide else None,
-            places(small) if small else None,
-            self._settings_of(slot).morphology.close_px,
+            tuple((place[a], place[b]) for a, b in near),
+            (place[wide[0]], place[wide[1]]) if wide else None,
+            (place[small[0]], place[small[1]]) if small else None,
+            settings.morphology.close_px,
         )
 
-    def _neighbour_from_reference(self, index: int, other: int) -> np.ndarray:
-        steps = [self._at(i).step for i in range(min(index, other), max(index, other))]
-        last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
-        return last_from_first if other > index else np.linalg.inv(last_from_first)
-
     def _follow_small(self, index: int) -> None:
-        slot = self._at(index)
-        if not self.settings.small.on:
-            return
-        start = time.perf_counter()
-        boxes = []
-        observation = slot.observation
-        if observation is not None and observation.foreground is not None and observation.foreground.small is not None:
+        start, observation, boxes = time.perf_counter(), self._at(index).observation, []
+        if observation.foreground is not None and observation.foreground.small is not None:
             boxes = find_candidates(observation.foreground.small, self.settings.small)
             observation.foreground = replace(observation.foreground, small=None)  # not needed again
-        this_from_last = self._at(index - 1).next_from_this if index > self._first else None
-        self._small_tracks.step(index, this_from_last, boxes)
-        slot.seconds["small"] = time.perf_counter() - start
+        self._small_tracks.step(index, self._this_from_last(index), boxes)
+        self._at(index).seconds["small"] = time.perf_counter() - start
 
     # -- targets -----------------------------------------------------------------------------------------------------
-
-    @property
-    def _all_observed(self) -> bool:
-        return self._ended and self._observed == self._total
 
     def _draw(self) -> None:
         """Draw the targets of the frames whose following frames, as far as persistence needs them, are observed."""
         followers = 2 if self.settings.persistence.on else 0
         while self._drawn < self._observed and (self._drawn + followers < self._observed or self._all_observed):
-            index = self._drawn
-            start = time.perf_counter()
-            low = max(index - 2, self._first)
-            slots = [self._at(i) for i in range(low, min(index + 3, self._observed))]
-            observations = [slot.observation or Observation(None, None) for slot in slots]
-            steps = [slot.next_from_this for slot in slots]
-            slot = self._at(index)
-            assert slot.observation is not None
-            slot.observation.targets = draw_targets(observations, steps, index - low, self._settings_of(slot))
+            index, start = self._drawn, time.perf_counter()
+            slot, slots, at = self._at(index), *self._around(index)
+            observations, steps = [s.observation for s in slots], [s.next_from_this for s in slots]
+            slot.observation.targets = draw_targets(observations, steps, at, slot.altitude.settings)
             slot.observation.window = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self._drawn += 1
+
+    @property
+    def _all_observed(self) -> bool:
+        return self._ended and self._observed == self._total
+
+    def _around(self, index: int) -> tuple[list[_Slot], int]:
+        """The observed frames at most two away, and the place of this one among them."""
+        first = max(index - 2, self._first)
+        return [self._at(i) for i in range(first, min(index + 3, self._observed))], index - first
 
     def _emit(self) -> Iterator[Scene]:
         """The scenes that no later frame can change, and let go of what no window needs again."""
         while self._emitted < self._drawn:
             slot = self._at(self._emitted)
-            delay = windows.settling_delay(slot.interval, self.settings)
+            delay = settling_delay(slot.interval, self.settings)
             if not self._all_observed and self._emitted + delay >= self._observed:
                 break
             yield from self._fill_gap(slot.frame.number - slot.frame.skipped)
@@ -451,34 +414,30 @@ class MotionDetector:
             # Colour is most of the memory: the scene has it, and windows use the view's only.
             slot.frame = replace(slot.frame, image=slot.view.grey)
             self._emitted += 1
-            self._forget()
-
-    def _forget(self) -> None:
-        if (old := self._emitted - 1 - self.settings.difference.wide_frames) >= self._first:
-            view = self._at(old).view
-            view.image = view.grey
-        while self._first < min(self._emitted - 2, self._observed - self._memory):
-            self._slots.popleft()
-            self._first += 1
+            if (old := self._emitted - 1 - self.settings.difference.wide_frames) >= self._first:
+                view = self._at(old).view
+                view.image = view.grey
+            while self._first < min(self._emitted - 2, self._observed - self._memory):
+                self._slots.popleft()
+                self._first += 1
 
     def _fill_gap(self, until: int) -> Iterator[Scene]:
         """Empty scenes for the frame numbers below `until` that could not be read."""
         for number in range(self._last_number + 1, until):
-            missing = Frame(number, (number - 1) / self.rate_hz, np.zeros(self._shape, np.uint8))
-            detections, mask = build_detections([], (self._shape[1], self._shape[0]))
+            image = np.zeros_like(self._last.image)
+            missing = Frame(number, (number - 1) / self.rate_hz, image)
+            detections, mask, _ = build_detections([], (image.shape[1], image.shape[0]))
             yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
         self._last_number = until
 
     def _build_scene(self, slot: _Slot, index: int) -> Scene:
-        assert slot.observation is not None
-        targets = list(slot.observation.targets or [])
-        targets += self._small_targets(index, targets)
+        targets = slot.observation.targets
+        targets = targets + self._small_targets(index, targets)
         if slot.frame.skipped:  # what moved from look to look, per frame
             targets = [replace(t, velocity_px=t.velocity_px / (slot.frame.skipped + 1)) for t in targets]
-        gates = slot.altitude.gates if slot.altitude else None
-        if gates is not None:
-            targets = [t for t in targets if gates.admit(t.box[2], t.box[3], t.velocity_px)]
-        detections, mask = build_detections(targets, slot.view.size)
+        if slot.altitude.gates is not None:
+            targets = [t for t in targets if slot.altitude.gates.admit(t.box[2], t.box[3], t.velocity_px)]
+        detections, mask, core = build_detections(targets, slot.view.size)
         return Scene(
             frame=slot.frame,
             mask=mask,
@@ -488,8 +447,8 @@ class MotionDetector:
             cause=slot.cause,
             adjustments=slot.adjustments,
             seconds=slot.seconds,
-            step=self._step_to(index),
-            core=build_core_mask(targets, slot.view.size),
+            step=self._from_before(index),
+            core=core,
         )
 
     def _small_targets(self, index: int, targets: list[Target]) -> list[Target]:
@@ -497,17 +456,19 @@ class MotionDetector:
         parameters = self.settings.small
         if not parameters.on:
             return []
-        slots = [self._at(i) for i in range(max(index - 2, self._first), min(index + 3, self._observed))]
-        blobs = [len(slot.observation.blobs) for slot in slots if slot.observation is not None]
+        slots, _ = self._around(index)
         errors = [slot.step.error_px for slot in slots if slot.step is not None]
-        if np.median(blobs) > parameters.max_blobs and errors and np.median(errors) > parameters.parallax_px:
+        blobs = np.median([len(slot.observation.blobs) for slot in slots])
+        if blobs > parameters.max_blobs and errors and np.median(errors) > parameters.parallax_px:
             return []
         found = []
         for track in self._small_tracks.tracks:
             if track.confirmed and index in track.frames:
                 x, y, width, height = box = track.boxes[track.frames.index(index)]
-                if not any(target.covers(x + width / 2, y + height / 2) for target in targets):
-                    found.append(Target(box, np.ones((height, width), bool), track.velocity_px, 0.5))
+                u, v, full = x + width / 2, y + height / 2, np.ones((height, width), bool)
+                boxes = (target.box for target in targets)
+                if not any(left <= u <= left + w and top <= v <= top + h for left, top, w, h in boxes):
+                    found.append(Target(box, full, track.velocity_px, 0.5, full))
         return found
 
 

@@ -1,6 +1,6 @@
-"""What flight and scene decide about detection: the interval between frames, and the sizes that targets may have."""
+"""What flight and scene decide about detection: the interval, the frames of a window, and the sizes of targets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,8 @@ from torchvision_dddas.types import Adjustment
 
 # A smaller relative change of altitude does not move the gates.
 _ALTITUDE_STEP = 0.2
+
+Pair = tuple[int, int]
 
 
 def interval_from_telemetry(
@@ -42,12 +44,76 @@ def adjust_interval(
     A change by one frame happens only when the rule is a quarter of a frame past the middle, so that noise does not
     make the interval flutter.
     """
-    new = int(np.clip(round(min(wanted, 1e6)), parameters.minimum_frames, parameters.maximum_frames))
-    if new == current or (
-        abs(new - current) == 1 and abs(wanted - current) < 0.75 and parameters.minimum_frames <= current
-    ):
+    least = parameters.minimum_frames
+    new = int(np.clip(round(min(wanted, 1e6)), least, parameters.maximum_frames))
+    if new == current or (abs(new - current) == 1 and abs(wanted - current) < 0.75 and least <= current):
         return current, ()
     return new, (Adjustment(frame, "interval.frames", current, new, cause),)
+
+
+def look_ahead(interval: int, settings: Settings) -> int:
+    """How many frames ahead of its reference a window looks: at most two intervals, as in the source."""
+    if settings.difference.kind == "between_later":
+        return 2 * interval
+    gap = max(settings.difference.near_frames)
+    # At the start of a range the window looks ahead only, as far as the frames of `settling_delay` leave room.
+    near = max(gap, min(2 * gap, 2 * interval - (2 if settings.persistence.on else 0)))
+    wide = min(settings.difference.wide_frames, max(2 * interval - 2, 0))
+    return max(near, wide, _small_gap(interval, settings))
+
+
+def settling_delay(interval: int, settings: Settings) -> int:
+    """How many further frames are observed before a frame is settled; with `look_ahead`, at most two intervals."""
+    if settings.persistence.on or settings.small.on:
+        return max(2, 2 * interval - look_ahead(interval, settings))
+    return 0
+
+
+def _small_gap(interval: int, settings: Settings) -> int:
+    """Frames between the pictures that show small slow targets; 0: the interval is too short to show any."""
+    small = settings.small
+    return min(interval, small.gap_frames) if small.on and interval >= small.from_interval else 0
+
+
+def choose_pairs(
+    at: int, interval: int, first: int, last: int, settings: Settings
+) -> tuple[list[Pair], Pair | None, Pair | None]:
+    """(near pairs, wide pair, small pair) of frame indices for reference `at`, within first..last; near may be empty.
+
+    A window looks both ways where it can; at the ends of the range it looks one way only.
+    """
+    parameters = settings.difference
+    if parameters.kind == "between_later":
+        later = [(at + side * gap, at + 2 * side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
+        # The middle one of three frames has a neighbour on either side only.
+        pair = _first_within([*later, (at - 1, at + 1)], first, last)
+        return [] if pair is None else [pair], None, None
+    # No further than `look_ahead`, even if more is known: the result must not depend on how frames are batched.
+    ahead = min(last, at + look_ahead(interval, settings))
+
+    def symmetric(gap: int) -> Pair | None:
+        return _first_within([(at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap)], first, ahead)
+
+    near = list(dict.fromkeys(p for gap in parameters.near_frames if (p := symmetric(gap))))
+    if not near and (p := symmetric(1)):
+        near = [p]
+    # One-sided pairs show a target's next places too, the more of them the longer the gap: only the closest is used,
+    # and only where no pair looks both ways.
+    near = [p for p in near if p[0] < at < p[1]] or near[:1]
+    wide = None
+    if parameters.wide_frames and near:
+        forward = min(parameters.wide_frames, max(2 * interval - 2, 0), ahead - at)
+        back = min(parameters.wide_frames, at - first)
+        if back >= 3 and forward >= 2:
+            wide = (at - back, at + forward)
+        else:
+            wide = next((p for gap in range(parameters.wide_frames, 2, -1) if (p := symmetric(gap))), None)
+    gap = _small_gap(interval, settings)
+    return near, wide, symmetric(gap) if gap else None
+
+
+def _first_within(pairs: Iterable[Pair], first: int, last: int) -> Pair | None:
+    return next((pair for pair in pairs if first <= min(pair) and max(pair) <= last), None)
 
 
 @dataclass(frozen=True)
@@ -77,14 +143,11 @@ class AltitudeSettings:
 
     def values(self) -> dict[str, float]:
         """The numbers in force, by name."""
-        gates = self.gates or Gates()
         return {
             "gates.min_area_px": self.settings.gates.min_area_px,
             "small.on": float(self.settings.small.on),
             "morphology.close_px": self.settings.morphology.close_px,
-            "gates.min_size_px": gates.min_size_px,
-            "gates.max_size_px": gates.max_size_px,
-            "gates.max_speed_px": gates.max_speed_px,
+            **{f"gates.{name}": bound for name, bound in vars(self.gates or Gates()).items()},
         }
 
 
@@ -124,9 +187,9 @@ def follow_altitude(
     """
     before_m = current.altitude_m
     if altitude_m is None:
+        new, cause = AltitudeSettings(base), "no telemetry for this frame"
         if before_m is None:
             return current, ()
-        new, cause = AltitudeSettings(base), "no telemetry for this frame"
     else:
         if before_m is not None and abs(altitude_m - before_m) <= _ALTITUDE_STEP * max(before_m, 1.0):
             return current, ()

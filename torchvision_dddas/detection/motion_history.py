@@ -6,12 +6,13 @@ clearly different ways, the blob is several targets that touch.
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.config import HistoryParameters
-from torchvision_dddas.detection.blobs import Blob, Box
+from torchvision_dddas.detection.blobs import Blob, Box, box_slices
 from torchvision_dddas.geometry import transfer
 
 NEWEST = 255
@@ -75,22 +76,16 @@ class MotionHistory:
 
     def stamps(self, box: Box) -> np.ndarray:
         """(height, width) uint8 stamps inside a box of the current frame: x, y, width, height."""
-        x, y, width, height = box
         if not self._past:
-            return np.zeros((height, width), np.uint8)
+            return np.zeros(box[:1:-1], np.uint8)
         if self._painted is None:
-            self._painted = self._paint()
-        return self._painted[y : y + height, x : x + width].copy()
-
-    def _paint(self) -> np.ndarray:
-        stamps = np.zeros(self._shape, np.uint8)
-        for past in self._past:  # the newest is last and overwrites
-            if len(past.ends):
-                places = np.clip(transfer(past.now_from_then, past.outlines), -_FAR_PX, _FAR_PX)
-                corners = np.round(places * 2**_SHIFT).astype(np.int32)
-                outlines = np.split(corners, past.ends[:-1])
-                cv2.fillPoly(stamps, outlines, NEWEST - (self.number - past.number), shift=_SHIFT)
-        return stamps
+            self._painted = np.zeros(self._shape, np.uint8)
+            for past in self._past:  # the newest is last and overwrites
+                if len(past.ends):
+                    places = np.clip(transfer(past.now_from_then, past.outlines), -_FAR_PX, _FAR_PX)
+                    outlines = np.split(np.round(places * 2**_SHIFT).astype(np.int32), past.ends[:-1])
+                    cv2.fillPoly(self._painted, outlines, NEWEST - (self.number - past.number), shift=_SHIFT)
+        return self._painted[box_slices(box)].copy()
 
 
 def motion_gradient(
@@ -101,8 +96,10 @@ def motion_gradient(
     The Sobel gradient over aperture x aperture px (odd), valid where the stamps under it span at least
     delta_min_frames and at most delta_max_frames, as in OpenCV's calcMotionGradient, which the source used.
     """
-    along_u = cv2.Sobel(stamps, cv2.CV_32F, 1, 0, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
-    along_v = cv2.Sobel(stamps, cv2.CV_32F, 0, 1, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
+    along_u, along_v = (
+        cv2.Sobel(stamps, cv2.CV_32F, *order, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
+        for order in ((1, 0), (0, 1))
+    )
     under = np.ones((aperture, aperture), np.uint8)
     span = cv2.dilate(stamps, under) - cv2.erode(stamps, under)
     steep = np.maximum(np.abs(along_u), np.abs(along_v)) > 1e-4 * aperture**2
@@ -118,8 +115,7 @@ def region_orientation(
     The weighted circular mean of the valid gradients: a stamp weighs 1 when new and 0 after the duration.
     """
     inside = region & valid
-    age = NEWEST - stamps[inside].astype(np.float32)
-    weight = np.clip(1 - age / duration_frames, 0, 1)
+    weight = np.clip(1 - (NEWEST - stamps[inside].astype(np.float32)) / duration_frames, 0, 1)
     angle = orientation_rad[inside]
     cos, sin = float((weight * np.cos(angle)).sum()), float((weight * np.sin(angle)).sum())
     agreement = float(np.hypot(cos, sin)) / max(float(weight.sum()), 1e-6)
@@ -133,8 +129,7 @@ def flood_regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float
     stamps: (H, W) uint8. seeds: (H, W) bool.
     """
     # OpenCV's mask is one pixel larger on every side; nonzero is a wall.
-    wall = np.ones((stamps.shape[0] + 2, stamps.shape[1] + 2), np.uint8)
-    wall[1:-1, 1:-1] = stamps == 0
+    wall = np.pad((stamps == 0).astype(np.uint8), 1, constant_values=1)
     threshold = int(min(threshold_frames, 254))  # stamps are whole frames
     flags = 8 | (2 << 8) | cv2.FLOODFILL_MASK_ONLY
     left, found = seeds & (stamps > 0), []
@@ -161,63 +156,58 @@ def split_by_trail(
     left, top = max(x - _REACH_PX, 0), max(y - _REACH_PX, 0)
     right, bottom = min(x + width + _REACH_PX, size[0]), min(y + height + _REACH_PX, size[1])
     stamps = history.stamps((left, top, right - left, bottom - top))
-    inside = np.s_[y - top : y - top + height, x - left : x - left + width]
+    inside = box_slices(blob.box, left, top)
     body = np.zeros(stamps.shape, bool)
     body[inside] = blob.mask
     body &= stamps == NEWEST
-    angle, valid = motion_gradient(stamps, parameters.delta_min_frames, parameters.delta_max_frames)
+    orientations, valid = motion_gradient(stamps, parameters.delta_min_frames, parameters.delta_max_frames)
+
+    def grow(region: np.ndarray) -> np.ndarray:
+        return cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
     def orientation(trail: np.ndarray) -> tuple[float, float]:
-        return region_orientation(angle, valid, stamps, _grow(trail), parameters.duration_frames)
+        return region_orientation(orientations, valid, stamps, grow(trail), parameters.duration_frames)
 
     old = np.where(stamps == NEWEST, np.uint8(0), stamps)
-    trails = flood_regions(old, _grow(body), parameters.segmentation_threshold_frames)
+    trails = flood_regions(old, grow(body), parameters.segmentation_threshold_frames)
     total = sum(int(trail.sum()) for trail in trails)
     trails = [trail for trail in trails if trail.sum() >= _MIN_SHARE * total]
     if not trails:
         return [(blob, np.full(2, np.nan))]
-    headings, agreement = zip(*map(orientation, trails), strict=True)
-    pair = _furthest_apart([h if a >= _MIN_AGREEMENT else np.nan for h, a in zip(headings, agreement, strict=True)])
+    headings = [heading if agreement >= _MIN_AGREEMENT else np.nan for heading, agreement in map(orientation, trails)]
+    # The two trails that point furthest apart, if far enough.
+    best, pair = _APART_RAD, None
+    for j, i in combinations(range(len(trails)), 2):
+        angle = abs(np.angle(np.exp(1j * (headings[i] - headings[j]))))
+        if angle > best:
+            best, pair = angle, (j, i)
     if pair is not None:
-        shares = _share_out(body, [trails[i] for i in pair], [headings[i] for i in pair])
+        ways = [(trails[i], headings[i]) for i in pair]
+        shares = _share_out(body, ways)
         if all(share.sum() >= _MIN_SHARE * body.sum() for share in shares):
-            velocities = [_velocity(stamps, s, trails[i], headings[i]) for s, i in zip(shares, pair, strict=True)]
+            velocities = [_velocity(stamps, share, *way) for share, way in zip(shares, ways, strict=True)]
             if all(np.hypot(*velocity) >= _MIN_SPEED_PX for velocity in velocities):
                 return [(blob.cut(s[inside]), velocity) for s, velocity in zip(shares, velocities, strict=True)]
     trail = np.logical_or.reduce(trails)
     return [(blob, _velocity(stamps, body, trail, orientation(trail)[0]))]
 
 
-def _grow(region: np.ndarray) -> np.ndarray:
-    return cv2.dilate(region.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+def _share_out(body: np.ndarray, ways: list[tuple[np.ndarray, float]]) -> np.ndarray:
+    """Each pixel of the body goes to the trail that it lies ahead of; if that holds for both, to the nearer.
 
-
-def _furthest_apart(headings: list[float]) -> tuple[int, int] | None:
-    """The two trails that point furthest apart, if far enough."""
-    best, pair = _APART_RAD, None
-    for i in range(len(headings)):
-        for j in range(i):
-            angle = abs(np.angle(np.exp(1j * (headings[i] - headings[j]))))
-            if angle > best:
-                best, pair = angle, (j, i)
-    return pair
-
-
-def _share_out(body: np.ndarray, trails: list[np.ndarray], headings: list[float]) -> list[np.ndarray]:
-    """Each pixel of the body goes to the trail that it lies ahead of; if that holds for both, to the nearer."""
+    ways: trails and their headings.
+    """
     row, column = np.nonzero(body)
     costs = []
-    for trail, heading in zip(trails, headings, strict=True):
+    for trail, heading in ways:
         along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-        r, c = np.nonzero(trail)
-        side, ahead = np.c_[c, r] @ across, np.c_[column, row] @ along
-        lane = np.c_[column, row] @ across
+        place, behind = np.c_[column, row], np.c_[np.nonzero(trail)[::-1]]
+        side, lane = behind @ across, place @ across
         beside = np.maximum(np.maximum(side.min() - lane, lane - side.max()), 0)
-        costs.append(1e3 * np.round(beside) + np.abs(ahead - (np.c_[c, r] @ along).max()))
-    nearest = np.argmin(costs, axis=0)
-    shares = np.zeros((len(trails), *body.shape), bool)
-    shares[nearest, row, column] = True
-    return list(shares)
+        costs.append(1e3 * np.round(beside) + np.abs(place @ along - (behind @ along).max()))
+    shares = np.zeros((len(ways), *body.shape), bool)
+    shares[np.argmin(costs, axis=0), row, column] = True
+    return shares
 
 
 def _velocity(stamps: np.ndarray, body: np.ndarray, trail: np.ndarray, heading: float) -> np.ndarray:
@@ -225,7 +215,6 @@ def _velocity(stamps: np.ndarray, body: np.ndarray, trail: np.ndarray, heading: 
     if not np.isfinite(heading) or not body.any():
         return np.full(2, np.nan)
     age = NEWEST - stamps[trail].astype(int)
-    frames = int(age.max())
     row, column = np.nonzero(body)
     breadth = len(np.unique(np.round(column * np.sin(heading) - row * np.cos(heading))))
-    return len(age) / (frames * breadth) * np.array([np.cos(heading), np.sin(heading)])
+    return len(age) / (int(age.max()) * breadth) * np.array([np.cos(heading), np.sin(heading)])

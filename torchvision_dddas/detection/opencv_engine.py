@@ -1,26 +1,44 @@
 """The engine for one stream on a small CPU: OpenCV on 8-bit pictures, no torch.
 
-It can work at half the resolution, for a quarter of the cost. A pixel of the half picture is the mean of 2 x 2 pixels,
-so that place p there is place 2 p + 1/2 in the whole picture.
+Two frames are registered by grid keypoints, Lucas-Kanade, RANSAC, and refits on the inliers. With
+`registration.redetect_frames` above 1 the inliers of one step are the start points of the next, and its homography
+predicts where they go: a short search is then enough.
+
+The engine can work at half the resolution, for a quarter of the cost. A pixel of the half picture is the mean of 2 x 2
+pixels, so that place p there is place 2 p + 1/2 in the whole picture.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.config import RegistrationParameters, Settings
-from torchvision_dddas.detection.engine import Foreground, View, Window
+from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, cell_side, judge_points, match_exposure
 from torchvision_dddas.detection.opencv_foreground import find_foreground, no_texture
-from torchvision_dddas.detection.opencv_registration import register
+from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
 _WHOLE_FROM_HALF = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _HALF_FROM_WHOLE = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
 
+# The short search around a prediction: pyramid levels above the full resolution, and steps a level.
+_SHORT_LEVELS, _SHORT_STEPS = 1, 5
+# The window of the deep search from a cold start is at least this wide.
+_DEEP_WINDOW_PX = 21
+# Below this share of inliers a short step is done again, deep and from new keypoints.
+_LEAST_SHARE = 0.4
+# Keypoints are detected anew below this share of those detected, or of the coarse cells that they covered.
+_LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
+_STRIP_ROWS = 64
+# Inliers of the refits, in RANSAC's tolerance. On half pictures 0.08 px at the corners with or without the rest.
+_TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
+LAST_TOLERANCE = _TOLERANCES[-1]
 
-class OpenCVEngine:
+
+class OpenCVEngine(Engine):
     """Implements `Engine` one pair and one window at a time."""
 
     name = "onboard"
@@ -28,28 +46,35 @@ class OpenCVEngine:
     def __init__(self, settings: Settings) -> None:
         self.parameters = settings
 
-    def prepare(self, image: np.ndarray) -> View:
-        """The frame and its grey picture."""
-        return View(image, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image)
-
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
-        """Keypoints, pyramidal Lucas-Kanade, RANSAC, refits on the inliers."""
+        """See `Engine.register`."""
         parameters = self.parameters.registration
-        if parameters.halved:
-            small = halve_parameters(parameters)
-            return [double_registration(register(halve_view(a), halve_view(b), small)) for a, b in pairs]
-        return [register(earlier, later, parameters) for earlier, later in pairs]
+        if not parameters.halved:
+            return [_register(earlier, later, parameters) for earlier, later in pairs]
+        # Search windows keep their size, and so reach twice as far.
+        lengths = {"cell_px": max(parameters.cell_px // 2, 4), "ransac_px": parameters.ransac_px / 2}
+        lengths["forward_backward_px"] = parameters.forward_backward_px / 2
+        small = parameters.model_copy(update=lengths)
+        steps = [_register(halve_view(earlier), halve_view(later), small) for earlier, later in pairs]
+        matrices = [_WHOLE_FROM_HALF @ step.later_from_earlier @ _HALF_FROM_WHOLE for step in steps]
+        return [
+            replace(step, later_from_earlier=m / m[2, 2], error_px=2 * step.error_px, flow_px=2 * step.flow_px)
+            for step, m in zip(steps, matrices, strict=True)
+        ]
 
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
-        """Differences to the warped neighbours, threshold, morphology."""
-        if not self.parameters.difference.halved:
-            return [find_foreground(window, self.parameters) for window in windows]
+        """See `Engine.foreground`."""
         settings = self.parameters
+        if not settings.difference.halved:
+            return [find_foreground(window, settings) for window in windows]
         found = [find_foreground(halve_window(window), halve_settings(settings)) for window in windows]
         flow = settings.persistence.on or settings.refine.on
         if not (flow or settings.history.on or settings.small.on):  # blobs alone are found on the half maps as well
             return [replace(half, scale=2) for half in found]
         return [double_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
+
+
+# -- half pictures -----------------------------------------------------------------------------------------------------
 
 
 def halve_view(view: View) -> View:
@@ -69,74 +94,223 @@ def halve_window(window: Window) -> Window:
         reference=halve_view(window.reference),
         neighbours=tuple(halve_view(neighbour) for neighbour in window.neighbours),
         neighbour_from_reference=_HALF_FROM_WHOLE @ window.neighbour_from_reference @ _WHOLE_FROM_HALF,
-        close_px=halve_side(window.close_px) if window.close_px else 0,
-    )
-
-
-def halve_parameters(parameters: RegistrationParameters) -> RegistrationParameters:
-    """The parameters with the lengths of half pictures; search windows keep their size, and so reach twice as far."""
-    return parameters.model_copy(
-        update={"cell_px": max(parameters.cell_px // 2, 4), "ransac_px": parameters.ransac_px / 2}
-        | {"forward_backward_px": parameters.forward_backward_px / 2}
+        close_px=_halve_side(window.close_px) if window.close_px else 0,
     )
 
 
 def halve_settings(settings: Settings) -> Settings:
     """Settings of the difference whose lengths are those of the half picture, where slopes are twice as steep."""
     difference, morphology, small = settings.difference, settings.morphology, settings.small
+    border_px, gradient_share = -(-difference.border_px // 2), difference.gradient_share / 2
+    sides = {"blur_px": _halve_side(difference.blur_px), "border_px": border_px, "gradient_share": gradient_share}
+    cleaning = {"erode_px": _halve_side(morphology.erode_px), "close_px": _halve_side(morphology.close_px)}
     return settings.model_copy(
         update={
-            "difference": difference.model_copy(
-                update={"blur_px": halve_side(difference.blur_px), "border_px": -(-difference.border_px // 2)}
-                | {"gradient_share": difference.gradient_share / 2}
-            ),
-            "morphology": morphology.model_copy(
-                update={"erode_px": halve_side(morphology.erode_px), "close_px": halve_side(morphology.close_px)}
-            ),
-            "small": small.model_copy(update={"close_px": halve_side(small.close_px)}),
+            "difference": difference.model_copy(update=sides),
+            "morphology": morphology.model_copy(update=cleaning),
+            "small": small.model_copy(update={"close_px": _halve_side(small.close_px)}),
         }
     )
 
 
-def halve_side(side: int) -> int:
+def _halve_side(side: int) -> int:
     """The odd side nearest to half of an odd one: 25 -> 13, 7 -> 3, 3 -> 1."""
     return 2 * (side // 4) + 1
-
-
-def double_registration(found: Registration) -> Registration:
-    """A registration of half pictures as one of the whole ones."""
-    later_from_earlier = _WHOLE_FROM_HALF @ found.later_from_earlier @ _HALF_FROM_WHOLE
-    return replace(
-        found,
-        later_from_earlier=later_from_earlier / later_from_earlier[2, 2],
-        error_px=2 * found.error_px,
-        flow_px=2 * found.flow_px,
-    )
 
 
 def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foreground:
     """The maps of half pictures at the whole size (width, height). flow: whether the warped pictures are needed."""
     is_needed = half.texture.strides != (0, 0)
-    texture = _double(cv2.convertScaleAbs(half.texture, alpha=0.5), size) if is_needed else no_texture(size[::-1])
-    evidence = _double(half.evidence, size)
+    texture = double(cv2.convertScaleAbs(half.texture, alpha=0.5), size) if is_needed else no_texture(size[::-1])
+    evidence = double(half.evidence, size)
+    one, other = half.warped
     return Foreground(
-        _double(half.core, size),
+        double(half.core, size),
         evidence,
-        evidence if half.wide is half.evidence else _double(half.wide, size),
+        evidence if half.wide is half.evidence else double(half.wide, size),
         texture,
-        None if half.small is None else _double(half.small, size),
-        (_double(half.warped[0], size, smooth=True), _double(half.warped[1], size, smooth=True))
-        if flow
-        else half.warped,
+        None if half.small is None else double(half.small, size),
+        (double(one, size, smooth=True), double(other, size, smooth=True)) if flow else half.warped,
         half.offsets,
     )
 
 
-def _double(picture: np.ndarray, size: tuple[int, int], smooth: bool = False) -> np.ndarray:
-    """Twice as large; an odd last row or column is repeated."""
+def double(picture: np.ndarray, size: tuple[int, int], smooth: bool = False) -> np.ndarray:
+    """A picture twice as large, of (width, height); an odd last row or column is repeated."""
     twice = picture.shape[1] * 2, picture.shape[0] * 2
     large = cv2.resize(picture, twice, interpolation=cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST)
     if twice == size:
         return large
     more = max(size[1] - twice[1], 0), max(size[0] - twice[0], 0)
     return cv2.copyMakeBorder(large, 0, more[0], 0, more[1], cv2.BORDER_REPLICATE)[: size[1], : size[0]]
+
+
+# -- registration ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Carried:
+    """What a step leaves to the next one.
+
+    points: (N, 2) float32, its inliers. step: (3, 3) its homography, None before the first step. age: steps since
+    detection. count, cover: points and coarse cells that the detection gave.
+    """
+
+    points: np.ndarray
+    step: np.ndarray | None
+    age: int
+    count: int
+    cover: int
+
+
+def _register(earlier: View, later: View, parameters: RegistrationParameters) -> Registration:
+    """The background's motion from `earlier` to `later`; what the next step needs is left in `later.kept`."""
+    carrying = parameters.redetect_frames > 1
+
+    def detect(step: np.ndarray | None) -> _Carried:
+        points = detect_keypoints(earlier.grey, parameters, halved=carrying and not parameters.halved)
+        return _Carried(points, step, 0, len(points), _cover(points, earlier.size))
+
+    carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
+    if carried is not None:
+        # Anew where the points carried on are too old, too few or too much in one place.
+        if (
+            carried.age >= parameters.redetect_frames
+            or len(carried.points) < _LEAST_LEFT * carried.count
+            or _cover(carried.points, earlier.size) < _LEAST_COVER * carried.cover
+        ):
+            carried = detect(carried.step)
+        found, inliers = _register_points(earlier, later, carried, parameters)
+        if found.inliers < _LEAST_SHARE * len(carried.points) or not found.reliable:
+            carried = None
+    if carried is None:
+        carried = detect(None)
+        found, inliers = _register_points(earlier, later, carried, parameters)
+    if carrying and found.reliable:
+        step = found.later_from_earlier
+        later.kept["carried"] = replace(carried, points=inliers, step=step, age=carried.age + 1)
+    return found
+
+
+def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
+    """(N, 2) float32: the best pixel of every grid cell, by the smaller eigenvalue of the structure tensor.
+
+    halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
+    """
+    height, width = grey.shape
+    cell, factor = cell_side(width, height, parameters), 1
+    if halved and min(width, height) > 1:
+        # Half a pixel to the left and top of where the corner stands: a search window does not mind.
+        grey, factor = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA), 2
+        cell = max(cell // 2, 1)
+    rows, columns = grey.shape[0] // cell, grey.shape[1] // cell
+    if not rows or not columns:
+        return np.zeros((0, 2), np.float32)
+    corner = measure_corners(grey, parameters.block_px)
+    cells = corner[: rows * cell, : columns * cell].reshape(rows, cell, columns * cell)
+    # Down the columns first: that runs along whole rows of memory.
+    best = cells.max(axis=1).reshape(rows, columns, cell)
+    column = best.argmax(axis=2) + cell * np.arange(columns)
+    value = best.max(axis=2)
+    at_best = cells[np.arange(rows)[:, None], :, column] == value[..., None]
+    row = at_best.argmax(axis=2) + cell * np.arange(rows)[:, None]
+    good = value > max(parameters.quality * float(corner.max()), 1e-7)
+    return factor * np.stack([column[good], row[good]], axis=1).astype(np.float32)
+
+
+def measure_corners(grey: np.ndarray, block: int) -> np.ndarray:
+    """(H, W) float32: `cv2.cornerMinEigenVal`, in strips, because it holds six float pictures of what it is given."""
+    corner = np.empty(grey.shape, np.float32)
+    reach = 1 + block // 2
+    for top in range(0, len(grey), _STRIP_ROWS):
+        above, bottom = min(top, reach), top + _STRIP_ROWS
+        strip = cv2.cornerMinEigenVal(grey[top - above : bottom + reach], block, ksize=3)
+        corner[top:bottom] = strip[above : above + _STRIP_ROWS]
+    return corner
+
+
+def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
+    """In how many cells of a coarse grid over the picture there are points."""
+    cells = np.clip(points * (_COARSE / np.array(size)), 0, _COARSE - 1).astype(int)
+    return len(np.unique(cells @ (1, _COARSE)))
+
+
+def _register_points(
+    earlier: View, later: View, carried: _Carried, parameters: RegistrationParameters
+) -> tuple[Registration, np.ndarray]:
+    """The registration by the points that are carried, and its inliers' places in the later frame."""
+    start = end = carried.points if len(carried.points) >= 4 else carried.points[:0]
+    if len(start):
+        end, found, missed_px = track_both_ways(*match_exposure(earlier, later), start, parameters, carried.step)
+        tracked = found & (missed_px <= parameters.forward_backward_px)
+        start, end = start[tracked], end[tracked]
+    later_from_earlier = fit_motion(start, end, parameters)
+    registration, inliers = judge_points(later_from_earlier, start, end, earlier.size, parameters)
+    return registration, end[inliers]
+
+
+def track_both_ways(
+    earlier: np.ndarray,
+    later: np.ndarray,
+    start: np.ndarray,
+    parameters: RegistrationParameters,
+    predicted: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the points went, (N, 2) float32, which were found there and on the way back, and by how much that missed.
+
+    missed_px: (N,) of the start; 0 where the way back is left out. predicted: (3, 3), where to look first.
+    """
+    levels, steps, side, flags = parameters.levels, parameters.iterations, parameters.window_px, 0
+    guess: Any = None  # OpenCV's stubs know no None here
+    if predicted is not None:
+        levels, steps, flags = min(levels, _SHORT_LEVELS), min(steps, _SHORT_STEPS), cv2.OPTFLOW_USE_INITIAL_FLOW
+        guess = transfer(predicted, start).astype(np.float32)
+    elif parameters.redetect_frames > 1:
+        side = max(side, _DEEP_WINDOW_PX)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, parameters.epsilon_px)
+    search: dict[str, Any] = {"winSize": (side, side), "maxLevel": levels, "criteria": criteria, "flags": flags}
+    end, found, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess, **search)
+    tracked, missed_px = found.ravel() == 1, np.zeros(len(start))
+    if parameters.forward_backward_px > 0:
+        # The way back is searched from where it should end, at full resolution: a true match stays there. From nothing
+        # it costs three times as much and moves the homography by 0.03 px at most.
+        search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+        back, found, _ = cv2.calcOpticalFlowPyrLK(later, earlier, end, start.copy(), **search)
+        tracked &= found.ravel() == 1
+        missed_px = np.linalg.norm(back - start, axis=1)
+    height, width = later.shape
+    return end, tracked & ((end >= 0) & (end <= (width - 1, height - 1))).all(axis=1), missed_px
+
+
+def fit_motion(start: np.ndarray, end: np.ndarray, parameters: RegistrationParameters) -> np.ndarray:
+    """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy.
+
+    The identity for fewer than four points, and where RANSAC finds none.
+    """
+    if len(start) < 4:
+        return np.eye(3)
+    is_affine, model = parameters.model == "affine", None
+    if is_affine:
+        found: np.ndarray | None = cv2.estimateAffine2D(start, end, None, cv2.RANSAC, parameters.ransac_px)[0]
+        model = None if found is None else np.vstack([found, [0, 0, 1]])
+    else:
+        model, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, parameters.ransac_px, None, 2000, 0.999)
+    if model is None:
+        return np.eye(3)
+    fitted = np.zeros(0, bool)
+    for share in _TOLERANCES_HALVED if parameters.halved else _TOLERANCES:
+        near = np.linalg.norm(transfer(model, start) - end, axis=1) < share * parameters.ransac_px
+        if near.sum() < 12:
+            break
+        if np.array_equal(near, fitted):  # the same points again give the same model
+            continue
+        fitted = near
+        if is_affine:
+            rows = np.c_[start[near], np.ones(near.sum())].astype(np.float64)
+            refit = np.vstack([np.linalg.lstsq(rows, end[near].astype(np.float64), rcond=None)[0].T, [0, 0, 1]])
+        else:
+            refit = cv2.findHomography(start[near], end[near], 0)[0]
+            if refit is None:
+                break
+        model = refit
+    return model

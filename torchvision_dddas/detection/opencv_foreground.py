@@ -1,14 +1,22 @@
 """The foreground of a window on OpenCV, in as few passes over 8-bit memory as possible."""
 
 from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.config import DifferenceParameters, Settings
 from torchvision_dddas.detection.blobs import close_mask, ellipse
-from torchvision_dddas.detection.engine import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Foreground, Window
-from torchvision_dddas.detection.registration import exposure_between
+from torchvision_dddas.detection.engine import (
+    EVIDENCE_CAP,
+    EVIDENCE_SCALE,
+    WHITE,
+    Foreground,
+    Window,
+    evidence_scale,
+    exposure_between,
+)
 from torchvision_dddas.geometry import transfer
 
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
@@ -30,10 +38,8 @@ def find_foreground(window: Window, settings: Settings) -> Foreground:
         return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
     normalized = parameters.kind == "normalized"
     texture = measure_texture(grey) if normalized or settings.refine.on else no_texture(grey.shape)
-    scale = 1.0
     if normalized:
-        scale = EVIDENCE_SCALE
-        noise = np.sqrt((np.arange(256) * parameters.gradient_share / 4) ** 2 + parameters.noise_levels**2)
+        noise = np.sqrt((_LEVELS * parameters.gradient_share / 4) ** 2 + parameters.noise_levels**2)
         weight = cv2.LUT(texture, (EVIDENCE_SCALE / noise).astype(np.float32))
         textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
     neighbours = _Neighbours(window, parameters)
@@ -58,10 +64,9 @@ def find_foreground(window: Window, settings: Settings) -> Foreground:
     neighbours.keep_for(window.wide, window.small)
     wide = near if window.wide is None else evidence(window.wide)
     neighbours.keep_for(window.small)
-    core = cv2.threshold(near, int(parameters.threshold * scale), 255, cv2.THRESH_BINARY)[1]
-    close_px = window.close_px or settings.morphology.close_px
-    core = close_mask(cv2.erode(core, ellipse(settings.morphology.erode_px)), close_px)
-    small = None
+    core = cv2.threshold(near, int(parameters.threshold * evidence_scale(settings)), 255, cv2.THRESH_BINARY)[1]
+    core = cv2.erode(core, ellipse(settings.morphology.erode_px))
+    core, small = close_mask(core, window.close_px or settings.morphology.close_px), None
     if window.small is not None:
         small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
         small = cv2.bitwise_and(small, neighbours.both(window.small), dst=small)
@@ -129,31 +134,23 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     1/32 px to which both round places.
     """
     height, width = picture.shape
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    settings: dict[str, Any] = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     # The error falls with the square of the number of tiles across: that of a single one gives the number needed.
     tiles = np.array([[0, 0, width - 1, height - 1]])
     maps, error = _affine_maps(picture_from_reference, tiles)
     count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
     if not 0 <= count <= _MOST_TILES:
-        return cv2.warpPerspective(
-            picture, picture_from_reference, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
-        )
+        return cv2.warpPerspective(picture, picture_from_reference, (width, height), **settings)
     if count > 1:
-        tiles = _tiles(width, height, int(count))
+        ends = (sorted({i * side // int(count) for i in range(int(count) + 1)}) for side in (width, height))
+        columns, rows = ([(low, high - 1) for low, high in pairwise(side)] for side in ends)
+        tiles = np.array([(left, top, right, bottom) for top, bottom in rows for left, right in columns])
         maps, _ = _affine_maps(picture_from_reference, tiles)
     warped = np.empty_like(picture)
     for (left, top, right, bottom), affine in zip(tiles.tolist(), maps, strict=True):
         tile, size = warped[top : bottom + 1, left : right + 1], (right - left + 1, bottom - top + 1)
-        cv2.warpAffine(picture, affine, size, dst=tile, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        cv2.warpAffine(picture, affine, size, dst=tile, **settings)
     return warped
-
-
-def _tiles(width: int, height: int, count: int) -> np.ndarray:
-    """(N, 4) first column, first row, last column, last row of count x count tiles."""
-    across, down = (sorted({i * side // count for i in range(count + 1)}) for side in (width, height))
-    return np.array(
-        [(left, top, right - 1, bottom - 1) for top, bottom in pairwise(down) for left, right in pairwise(across)]
-    )
 
 
 def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, float]:
@@ -186,20 +183,18 @@ def find_seen(picture_from_reference: np.ndarray, size: tuple[int, int], border:
     size: (width, height) of both.
     """
     width, height = size
-    first, last = (border, border), (width - 1 - border, height - 1 - border)
+    right, bottom = width - 1 - border, height - 1 - border
     mask = np.zeros((height, width), np.uint8)
-    if first[0] > last[0] or first[1] > last[1]:
+    if border > min(right, bottom):
         return mask
-    corners = np.array([first, (last[0], first[1]), last, (first[0], last[1])], float)
+    corners = np.array([(border, border), (right, border), (right, bottom), (border, bottom)], float)
     reference_from_picture = np.linalg.inv(picture_from_reference)
-    homogeneous = np.ones((4, 3))
-    homogeneous[:, :2] = corners
-    depth = homogeneous @ (reference_from_picture / reference_from_picture[2, 2])[2]
+    depth = np.c_[corners, np.ones(4)] @ (reference_from_picture / reference_from_picture[2, 2])[2]
     if (depth > 0.1).all():
         outline = transfer(reference_from_picture, corners)
         cv2.fillConvexPoly(mask, np.round(16 * outline).astype(np.int32), 255, shift=4)
         return mask
-    mask[first[1] : last[1] + 1, first[0] : last[0] + 1] = 255
+    mask[border : bottom + 1, border : right + 1] = 255
     return cv2.warpPerspective(mask, picture_from_reference, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
 
 
@@ -232,7 +227,9 @@ def match_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> 
     for _ in range(4):
         before = gain, offset
         middle = gain * x + offset
-        n, y = pairs.near(middle, pairs.trimming(middle))
+        low, high = pairs.band(middle, pairs.trimming(middle))
+        n = pairs.below.take(high) - pairs.below.take(low)
+        y = pairs.sum_below.take(high) - pairs.sum_below.take(low)
         total = n.sum()
         mean_x, mean_y = n @ x / total, y.sum() / total
         spread = n @ (x - mean_x) ** 2 / total
@@ -261,19 +258,18 @@ class _GreyPairs:
 
     def __init__(self, times: np.ndarray) -> None:
         """times: (256, 256), x down, y across."""
-        self.below = _sums_along(times)
-        self.sum_below = _sums_along(times * np.arange(256, dtype=np.float32))
+        # (256, 257) float64 sums of all values to the left: five times as quick as `np.cumsum`.
+        self.below, self.sum_below = (
+            np.diff(cv2.integral(values, sdepth=cv2.CV_64F), axis=0)
+            for values in (times, times * np.arange(256, dtype=np.float32))
+        )
         self.count = float(self.below[:, -1].sum())
 
-    def near(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """(256,) for each x: how many y lie within `reach` of `middle`, and their sum."""
-        low, high = self._band(middle, reach)
-        return self.below.take(high) - self.below.take(low), self.sum_below.take(high) - self.sum_below.take(low)
-
-    def share(self, middle: np.ndarray, reach: float) -> float:
-        """The share of all pairs whose y lies within `reach` of `middle`."""
-        low, high = self._band(middle, reach)
-        return float(self.below.take(high).sum() - self.below.take(low).sum()) / self.count
+    def band(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """(256,) for each x: where the sums of the y within `reach` of `middle` begin and end, as flat indices."""
+        low = np.clip(np.ceil(middle - reach), 0, 256)
+        high = np.maximum(np.clip(np.floor(middle + reach) + 1, 0, 256), low)
+        return _ROWS + low.astype(np.intp), _ROWS + high.astype(np.intp)
 
     def median_offset(self) -> float:
         """The median of y - x."""
@@ -289,22 +285,15 @@ class _GreyPairs:
     def trimming(self, middle: np.ndarray) -> float:
         """How far y may lie from `middle`: 3.7 times the median distance, at least 3 levels."""
         near, held = _LEAST_DISTANCE, 0.0
-        while (more := self.share(middle, near)) < 0.5:
-            near, held = 1.25 * near, more
+        while True:
+            low, high = self.band(middle, near)
+            share = float(self.below.take(high).sum() - self.below.take(low).sum()) / self.count
+            if share >= 0.5:
+                break
+            near, held = 1.25 * near, share
         if near == _LEAST_DISTANCE:
             return 3.7 * near
-        return 3.7 * float(np.interp(0.5, [held, more], [near / 1.25, near]))
-
-    def _band(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """Where the sums begin and end, as flat indices."""
-        low = np.clip(np.ceil(middle - reach), 0, 256)
-        high = np.maximum(np.clip(np.floor(middle + reach) + 1, 0, 256), low)
-        return _ROWS + low.astype(np.intp), _ROWS + high.astype(np.intp)
-
-
-def _sums_along(values: np.ndarray) -> np.ndarray:
-    """(H, W + 1) float64 sums of all values to the left: five times as quick as `np.cumsum`."""
-    return np.diff(cv2.integral(values, sdepth=cv2.CV_64F), axis=0)
+        return 3.7 * float(np.interp(0.5, [held, share], [near / 1.25, near]))
 
 
 def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int = 500) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.blob_motion import Motion
-from torchvision_dddas.detection.blobs import Blob, Box, ellipse
+from torchvision_dddas.detection.blobs import Blob, Box, box_slices, ellipse
 from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, View
 
 _MAX_MISFIT = 15.0  # noise units
@@ -37,19 +37,29 @@ def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foregroun
     view: the reference frame. foreground: its maps; `motion.affine` describes the motion to its warped neighbours.
     """
     x, y, width, height = blob.box
-    box = blob.window
-    parameters = settings.difference
+    box, own = box_slices(blob.box), view.grey[box_slices(blob.box)]
     slope = foreground.texture[box].astype(np.float32) / 4
-    noise = np.sqrt(parameters.noise_levels**2 + (parameters.gradient_share * slope) ** 2)
-    own = view.grey[box]
-    still = cv2.blur(np.minimum(*(_misfit(own, picture[box], noise) for picture in foreground.warped)), (3, 3))
-    moved = [
-        _move_into_box(picture, affine, motion.frame, blob.box)
-        for picture, affine in zip(foreground.warped, motion.affine, strict=True)
-    ]
-    moving = cv2.blur(np.minimum(*(_misfit(own, picture, noise) for picture in moved)), (3, 3))
-    scale = np.float32(EVIDENCE_SCALE)
-    near, far = foreground.evidence[box] / scale, foreground.wide[box] / scale
+    noise = np.sqrt(settings.difference.noise_levels**2 + (settings.difference.gradient_share * slope) ** 2)
+
+    def misfit(pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """The smaller difference to two pictures of the box, noise units."""
+        misses = (np.minimum(cv2.absdiff(own, p) / noise, _MAX_MISFIT).astype(np.float32) for p in pictures)
+        return cv2.blur(np.minimum(*misses), (3, 3))
+
+    still = misfit([picture[box] for picture in foreground.warped])
+    # The parts of the neighbours that the target's motion brings into its box.
+    centre_u, centre_v, scale = motion.frame
+    moved = []
+    for picture, (shift, by_u, by_v) in zip(foreground.warped, motion.affine, strict=True):
+        # u + shift + by_u (u - cu) / s + by_v (v - cv) / s, with (u, v) counted from the box's corner
+        slopes = np.c_[by_u, by_v]
+        origin = np.array([x, y]) + shift + slopes @ np.array([x - centre_u, y - centre_v]) / scale
+        matrix = np.c_[np.eye(2) + slopes / scale, origin]
+        moved.append(
+            cv2.warpAffine(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
+        )
+    moving = misfit(moved)
+    near, far = foreground.evidence[box] / np.float32(EVIDENCE_SCALE), foreground.wide[box] / np.float32(EVIDENCE_SCALE)
     certain = np.clip((near - 2) / 2, 0, 1) * np.clip(1.5 - moving / np.maximum(still, 1), 0, 1)
     filled = np.clip((far - 2) / 2, 0, 1) * np.clip(1.5 - moving / 2, 0, 1)
     certain = np.where(certain < 0.2, np.maximum(certain, filled), certain) * blob.mask
@@ -59,7 +69,7 @@ def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foregroun
 
     left, top = max(x - _PAD, 0), max(y - _PAD, 0)
     right, bottom = min(x + width + _PAD, view.size[0]), min(y + height + _PAD, view.size[1])
-    inside = np.s_[y - top : y - top + height, x - left : x - left + width]
+    inside = box_slices(blob.box, left, top)
     seeds: np.ndarray = np.zeros((bottom - top, right - left, 2), np.float32)
     seeds[..., 1] = 1
     seeds[inside] = np.dstack([certain, background])
@@ -67,25 +77,8 @@ def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foregroun
     guide = cv2.resize(view.image[top:bottom, left:right], half, interpolation=cv2.INTER_AREA)
     seeds = cv2.resize(seeds, half, interpolation=cv2.INTER_AREA)
     weight = smooth_along_edges(seeds, guide, settings.refine.spatial_px / 2, settings.refine.colour_levels)
-    share = weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6)
-    share = cv2.resize(share, (right - left, bottom - top))
+    share = cv2.resize(weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6), (right - left, bottom - top))
     return (share[inside] > settings.refine.share) & blob.mask
-
-
-def _misfit(a: np.ndarray, b: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    return np.minimum(cv2.absdiff(a, b) / noise, _MAX_MISFIT).astype(np.float32)
-
-
-def _move_into_box(picture: np.ndarray, affine: np.ndarray, frame: tuple[float, float, float], box: Box) -> np.ndarray:
-    """The part of a picture that the target's motion brings into its box."""
-    x, y, width, height = box
-    centre_u, centre_v, scale = frame
-    shift, by_u, by_v = affine
-    # u + shift + by_u (u - cu) / s + by_v (v - cv) / s, with (u, v) counted from the box's corner
-    linear = np.eye(2) + np.c_[by_u, by_v] / scale
-    origin = np.array([x, y]) + shift + np.c_[by_u, by_v] @ np.array([x - centre_u, y - centre_v]) / scale
-    matrix = np.c_[linear, origin]
-    return cv2.warpAffine(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
 
 
 def smooth_along_edges(
@@ -99,27 +92,26 @@ def smooth_along_edges(
     """
     colours = np.atleast_3d(guide).astype(np.float32)
     colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
-    across = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=1)).sum(axis=2)
-    down = 1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=0)).sum(axis=2)
+    across, down = (1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=axis)).sum(axis=2) for axis in (1, 0))
+
+    def filter_both_ways(lines: np.ndarray, keep: np.ndarray) -> None:
+        """Over the first axis and back: each line takes the share `keep` from the line before it."""
+        keep = np.ascontiguousarray(keep)[:, :, None]
+        for i in range(1, len(lines)):
+            lines[i] += keep[i - 1] * (lines[i - 1] - lines[i])
+        for i in range(len(lines) - 2, -1, -1):
+            lines[i] += keep[i] * (lines[i + 1] - lines[i])
+
     # Rows are made contiguous for either direction: each step then works on whole rows.
     rows = np.ascontiguousarray(values, np.float32)
     for i in range(rounds):
         sigma = spatial_px * np.sqrt(3) * 2 ** (rounds - i - 1) / np.sqrt(4**rounds - 1)
         decay = np.log(np.float32(np.exp(-np.sqrt(2) / sigma)))
         columns = np.ascontiguousarray(rows.transpose(1, 0, 2))
-        _filter_both_ways(columns, np.exp(decay * across).T)
+        filter_both_ways(columns, np.exp(decay * across).T)
         rows = np.ascontiguousarray(columns.transpose(1, 0, 2))
-        _filter_both_ways(rows, np.exp(decay * down))
+        filter_both_ways(rows, np.exp(decay * down))
     return rows
-
-
-def _filter_both_ways(lines: np.ndarray, keep: np.ndarray) -> None:
-    """Over the first axis and back: each line takes the share `keep` from the line before it."""
-    keep = np.ascontiguousarray(keep)[:, :, None]
-    for i in range(1, len(lines)):
-        lines[i] += keep[i - 1] * (lines[i - 1] - lines[i])
-    for i in range(len(lines) - 2, -1, -1):
-        lines[i] += keep[i] * (lines[i + 1] - lines[i])
 
 
 def remove_shadow(
@@ -136,10 +128,15 @@ def remove_shadow(
     """
     if len(grounds) != 2 or any(picture.ndim != 3 for picture in [image, *grounds]):
         return mask
-    x, y, width, height = box
-    first, second = (_warp_box(ground, matrix, box) for ground, matrix in zip(grounds, ground_from_image, strict=True))
+    pictures = [image[box_slices(box)]]
+    for ground, matrix in zip(grounds, ground_from_image, strict=True):
+        ground_from_box = matrix @ np.array([[1, 0, box[0]], [0, 1, box[1]], [0, 0, 1]], float)
+        pictures.append(
+            cv2.warpPerspective(ground, ground_from_box, box[2:], flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
+        )
+    own, first, second = (cv2.blur(picture, (3, 3)).astype(np.float32) for picture in pictures)
     bare = np.abs(first - second).max(axis=2) < _GROUNDS_ALIKE
-    light = (_smooth(image[y : y + height, x : x + width]) + 2) / ((first + second) / 2 + 2)
+    light = (own + 2) / ((first + second) / 2 + 2)
     mean = light.mean(axis=2)
     alike = np.abs(light - mean[..., None]).max(axis=2) < _COLOURS_ALIKE * mean
     low, high = _LIGHT_LEFT
@@ -154,15 +151,3 @@ def remove_shadow(
     kept[0] = False
     left = kept[labels]
     return left if left.sum() >= _LEAST_LEFT * mask.sum() else mask
-
-
-def _smooth(picture: np.ndarray) -> np.ndarray:
-    return cv2.blur(picture, (3, 3)).astype(np.float32)
-
-
-def _warp_box(picture: np.ndarray, picture_from_image: np.ndarray, box: Box) -> np.ndarray:
-    """The part of another frame that lies under the box, as the image sees it."""
-    x, y, width, height = box
-    matrix = picture_from_image @ np.array([[1, 0, x], [0, 1, y], [0, 0, 1]], float)
-    warped = cv2.warpPerspective(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
-    return _smooth(warped)

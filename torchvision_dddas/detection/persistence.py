@@ -1,20 +1,30 @@
-"""Persistence: blobs that are linked from frame to frame and move steadily are targets, flicker is not."""
+"""What lasts over frames: blobs that are linked and move steadily, and small candidates that travel."""
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 
-from torchvision_dddas.config import PersistenceParameters
+from torchvision_dddas.config import PersistenceParameters, SmallParameters
 from torchvision_dddas.detection.blob_motion import Motion
-from torchvision_dddas.detection.blobs import Blob
-from torchvision_dddas.geometry import transfer
+from torchvision_dddas.detection.blobs import Blob, Box, box_slices
+from torchvision_dddas.geometry import occupied, transfer
 
 # Two blobs may be one target when their areas differ by less than this factor ...
 _SIZE_RATIO = 2.5
 # ... and the predicted box overlaps the found one, or lies close and moves alike (px a frame).
 _LEAST_IOU, _VELOCITY_PX = 0.3, 0.6
+
+# A small track is straight when its points lie this close to a constant velocity, px (root mean square).
+_STRAIGHT_PX = 2.0
+# Its motion is measured over so many frames at most.
+_MEMORY_FRAMES = 30
+# It has travelled when it has gone so many of its own lengths, and more of them for each other candidate in the frame:
+# clutter, parallax above all, drifts too.
+_LENGTHS, _LENGTHS_EACH = 0.25, 0.005
 
 
 @dataclass(frozen=True)
@@ -26,24 +36,14 @@ class Sighting:
     next_from_this: np.ndarray | None
 
     @cached_property
-    def areas_px(self) -> np.ndarray:
-        """(N,) of the blobs."""
-        return np.array([blob.area_px for blob in self.blobs])
-
-    @cached_property
-    def centres_px(self) -> np.ndarray:
-        """(N, 2)."""
-        return np.array([blob.centre_px for blob in self.blobs])
-
-    @cached_property
-    def sizes_px(self) -> np.ndarray:
-        """(N, 2) widths and heights."""
-        return np.array([blob.box[2:] for blob in self.blobs])
-
-    @cached_property
-    def velocities_px(self) -> np.ndarray:
-        """(N, 2), 0 where unknown."""
-        return np.nan_to_num([motion.velocity_px for motion in self.motions])
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the N blobs: areas (N,), centres, sizes, and velocities (0 where unknown), (N, 2) each."""
+        return (
+            np.array([blob.area_px for blob in self.blobs]),
+            np.array([blob.centre_px for blob in self.blobs]),
+            np.array([blob.box[2:] for blob in self.blobs]),
+            np.nan_to_num([motion.velocity_px for motion in self.motions]),
+        )
 
 
 def find_persistent(
@@ -60,7 +60,16 @@ def find_persistent(
     possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
     verdicts = []
     for blob, motion in zip(sightings[index].blobs, sightings[index].motions, strict=True):
-        links, passes = _seen((blob, motion), sightings, index, parameters.flow_share)
+        # The frames in which it is seen, and those of them in which it moves steadily.
+        links, passes = 1, int(motion.steady > parameters.flow_share)
+        for direction in (1, -1):
+            seen = blob, motion
+            for at in (index, index + direction):
+                if (following := _follow(*seen, sightings, at, direction)) is None:
+                    break
+                seen = following
+                links += 1
+                passes += seen[1].steady > parameters.flow_share
         if blob.weak:
             verdicts.append(links >= parameters.weak_links and passes >= parameters.weak_passes)
             continue
@@ -74,51 +83,116 @@ def find_persistent(
     return verdicts
 
 
-def _seen(blob: tuple[Blob, Motion], sightings: Sequence[Sighting], index: int, flow_share: float) -> tuple[int, int]:
-    """In how many of up to five frames around `index` a blob is seen, and in how many of those it moves steadily."""
-    links, passes = 1, int(blob[1].steady > flow_share)
-    for direction in (1, -1):
-        here, at = blob, index
-        for _ in range(2):
-            found = _follow(here, sightings, at, direction)
-            if found is None:
-                break
-            here, at = found, at + direction
-            links += 1
-            passes += here[1].steady > flow_share
-    return links, passes
-
-
 def _follow(
-    here: tuple[Blob, Motion], sightings: Sequence[Sighting], at: int, direction: int
+    blob: Blob, motion: Motion, sightings: Sequence[Sighting], at: int, direction: int
 ) -> tuple[Blob, Motion] | None:
     """The blob one frame on (or back) that continues this one, if any."""
     if not 0 <= at + direction < len(sightings):
         return None
-    step = sightings[at].next_from_this if direction > 0 else sightings[at - 1].next_from_this
-    if step is None:
+    step, there = sightings[at if direction > 0 else at - 1].next_from_this, sightings[at + direction]
+    if step is None or not there.blobs:
         return None
-    blob, motion = here
-    velocity = np.nan_to_num(motion.velocity_px)
     there_from_here = step if direction > 0 else np.linalg.inv(step)
+    areas, centres, sizes, velocities = there.columns
+    size, velocity = np.array(blob.box[2:]), np.nan_to_num(motion.velocity_px)
     # Where it is by its own motion, and where it is if that was measured wrongly.
-    centre, unmoved = transfer(there_from_here, np.vstack([blob.centre_px + direction * velocity, blob.centre_px]))
-    there = sightings[at + direction]
-    if not there.blobs:
-        return None
-    ratio = there.areas_px / max(blob.area_px, 1)
-    size = np.array(blob.box[2:])
-    overlap = np.maximum(*(_ious(place, size, there.centres_px, there.sizes_px) for place in (centre, unmoved)))
-    away, unlike = there.centres_px - centre, there.velocities_px - velocity
+    places = transfer(there_from_here, np.vstack([blob.centre_px + direction * velocity, blob.centre_px]))[:, None]
+    low, high = np.maximum(places - size / 2, centres - sizes / 2), np.minimum(places + size / 2, centres + sizes / 2)
+    both = np.prod(np.maximum(high - low, 0), axis=2)
+    overlap = (both / (np.prod(size) + np.prod(sizes, axis=1) - both)).max(axis=0)
+    away, unlike = centres - places[0], velocities - velocity
     near = (np.hypot(*away.T) < 0.5 * np.hypot(*size)) & (np.hypot(*unlike.T) < _VELOCITY_PX)
+    ratio = areas / max(blob.area_px, 1)
     fits = (ratio > 1 / _SIZE_RATIO) & (ratio < _SIZE_RATIO) & ((overlap >= _LEAST_IOU) | near)
     best = int(np.argmax(np.where(fits, overlap, -1.0)))
     return (there.blobs[best], there.motions[best]) if fits[best] else None
 
 
-def _ious(centre: np.ndarray, size: np.ndarray, centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(N,) IoU of a box with others, all by centre and (width, height)."""
-    common = np.minimum(centre + size / 2, centres + sizes / 2) - np.maximum(centre - size / 2, centres - sizes / 2)
-    both = np.prod(np.maximum(common, 0), axis=1)
-    shares: np.ndarray = both / (np.prod(size) + np.prod(sizes, axis=1) - both)
-    return shares
+@dataclass
+class SmallTrack:
+    """One small candidate over time. points_px: (N, 2) centres, all in the coordinates of the latest frame.
+
+    frames: their numbers. boxes: their boxes in their own frames.
+    """
+
+    frames: list[int]
+    points_px: np.ndarray
+    boxes: list[Box]
+    velocity_px: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    confirmed: bool = False
+
+
+def find_candidates(small: np.ndarray, parameters: SmallParameters) -> list[Box]:
+    """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to tell them apart."""
+    boxes: list[Box] = []
+    for part in occupied(small, 2):
+        count, _, stats, _ = cv2.connectedComponentsWithStats(small[box_slices(part)], ltype=cv2.CV_32S)
+        boxes += [
+            (part[0] + x, part[1] + y, w, h)
+            for x, y, w, h, area in stats[1:count].tolist()
+            if area >= parameters.min_area_px and w * h <= parameters.max_box_px
+        ]
+    return sorted(boxes, key=lambda box: (box[1], box[0])) if len(boxes) <= parameters.max_candidates else []
+
+
+class SmallTracks:
+    """The tracks of small slow targets, confirmed once they have travelled steadily. Feed it every frame in order."""
+
+    def __init__(self, parameters: SmallParameters) -> None:
+        self.parameters = parameters
+        self.tracks: list[SmallTrack] = []
+        self.counts: deque[int] = deque(maxlen=20)
+
+    def step(self, frame: int, this_from_last: np.ndarray | None, boxes: Sequence[Box]) -> None:
+        """Take the candidates of one frame. this_from_last: (3, 3) registration; None at a cut drops all tracks."""
+        self.counts.append(len(boxes))
+        if this_from_last is None:
+            self.tracks = []
+        else:
+            for track in self.tracks:
+                tip = np.vstack([track.points_px[-1] - track.velocity_px, track.points_px])
+                moved = transfer(this_from_last, tip)
+                track.points_px, track.velocity_px = moved[1:], moved[-1] - moved[0]
+        centres = np.array([[x + (w - 1) / 2, y + (h - 1) / 2] for x, y, w, h in boxes]).reshape(-1, 2)
+        pairs = []
+        if self.tracks and boxes:
+            ahead = np.array([t.points_px[-1] + t.velocity_px * (frame - t.frames[-1]) for t in self.tracks])
+            distance = np.linalg.norm(ahead[:, None] - centres[None], axis=2)
+            near = np.argwhere(distance <= self.parameters.gate_px)
+            pairs = near[np.argsort(distance[near[:, 0], near[:, 1]], kind="stable")].tolist()
+        # The nearest first. Gates hardly ever overlap, and where they do the best sum is the same but for odd cases;
+        # an exact assignment would bring 44 MB of SciPy into memory.
+        rows: set[int] = set()
+        taken: set[int] = set()
+        for row, column in pairs:
+            if row not in rows and column not in taken:
+                rows.add(row)
+                taken.add(column)
+                track = self.tracks[row]
+                track.frames.append(frame)
+                track.points_px = np.vstack([track.points_px, centres[column]])
+                track.boxes.append(boxes[column])
+                self._judge(track)
+        new = [SmallTrack([frame], centres[i : i + 1], [boxes[i]]) for i in range(len(boxes)) if i not in taken]
+        self.tracks = [t for t in self.tracks + new if frame - t.frames[-1] <= self.parameters.misses]
+
+    def _judge(self, track: SmallTrack) -> None:
+        """Fit a constant velocity to the latest frames; confirm a track that travels straight, far and surely."""
+        recent = np.array(track.frames) > track.frames[-1] - _MEMORY_FRAMES
+        time, points = np.array(track.frames, float)[recent], track.points_px[recent]
+        if len(time) < 2:
+            return
+        span = time - time.mean()
+        spread = float((span**2).sum())
+        velocity = (span[:, None] * points).sum(axis=0) / spread
+        if len(time) >= 3:
+            track.velocity_px = velocity
+        if len(time) < self.parameters.hits:
+            return
+        miss = points - points.mean(axis=0) - span[:, None] * velocity
+        rms = float(np.sqrt((miss**2).sum(axis=1).mean()))
+        speed, sigma = float(np.hypot(*velocity)), max(rms, 0.3) / np.sqrt(spread)
+        length = float(np.median([max(w, h) for _, _, w, h in track.boxes]))
+        lengths = _LENGTHS + _LENGTHS_EACH * float(np.median(self.counts))
+        far = speed * (time[-1] - time[0]) >= max(self.parameters.min_travel_px, lengths * length)
+        track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.parameters.sureness)

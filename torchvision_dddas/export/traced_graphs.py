@@ -19,9 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from torchvision_dddas.config import DifferenceParameters, MorphologyParameters, RegistrationParameters, Settings
-from torchvision_dddas.detection import cell_side
-from torchvision_dddas.detection.torch_engine import absolute_difference, find_seen_by_both
-from torchvision_dddas.detection.torch_registration import LEVEL
+from torchvision_dddas.detection import absolute_difference, cell_side, find_seen_by_both
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph
 from torchvision_dddas.export.tracing import open_session, trace_graph
@@ -33,6 +31,7 @@ HYPOTHESES = 128
 # all searching would take three times the nodes' work. With 64 scouts, or 3 steps, a motion in some dozens is lost.
 SCOUTS, STEPS, REACH_PX = 96, 6, 3
 REFITS = 1.0, 0.5  # of the tolerance of RANSAC
+LEVEL = 255.0
 # Ties between keypoints and hypotheses fall differently in torch and in the runtime: places agree, not numbers.
 CORNER_PX, MASK_OFF, LEVELS_OFF = 0.1, 0.02, 1e-3
 LEAST_KEYPOINTS = 48

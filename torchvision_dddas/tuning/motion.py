@@ -19,17 +19,11 @@ from torchvision_dddas.detection import (
     Engine,
     Foreground,
     MotionDetector,
+    TorchEngine,
     View,
     Window,
     fill_hull,
     load_engine,
-)
-from torchvision_dddas.detection.torch_engine import (
-    TEXTURED,
-    TorchEngine,
-    compare_to_reference,
-    find_seen_by_both,
-    smaller_difference,
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
@@ -331,16 +325,12 @@ class _Recorder:
 @torch.inference_mode()
 def differences_of(window: Window, settings: Settings) -> Differences:
     """The part of a window that depends on no tunable parameter, on the CPU; a batch of one."""
-    grey, warped, seen, texture = TorchEngine(settings, "cpu").warp_neighbours([window])
-    parameters = settings.difference
-    distance = compare_to_reference(window, grey, warped, parameters)
-    least = [smaller_difference(pair, distance, warped) for pair in window.near]
-    both = [find_seen_by_both(seen[a], seen[b], grey.shape[-1]) for a, b in window.near]
+    views = TorchEngine(settings, "cpu").warp_neighbours([window])
     return Differences(
-        torch.cat(least, 1).clone(),
-        torch.cat(both, 1),
-        texture.to(torch.uint8),
-        texture > TEXTURED,
+        torch.cat([views.least(pair) for pair in window.near], 1).clone(),
+        torch.cat([views.both(pair) for pair in window.near], 1),
+        views.texture.to(torch.uint8),
+        views.textured,
         EVIDENCE_SCALE,
         EVIDENCE_CAP,
     )

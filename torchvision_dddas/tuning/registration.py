@@ -12,11 +12,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.config import RegistrationParameters, Settings
-from torchvision_dddas.detection import Engine, load_engine, match_exposure
-from torchvision_dddas.detection.opencv_registration import (
+from torchvision_dddas.detection import (
     LAST_TOLERANCE,
+    Engine,
     detect_keypoints,
     fit_motion,
+    load_engine,
+    match_exposure,
     track_both_ways,
 )
 from torchvision_dddas.errors import InputError
