@@ -24,8 +24,8 @@ from robustness import corner_distance
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion, load_engine
-from torchvision_dddas.evaluation.datasets import folder
-from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import labels_of
@@ -135,7 +135,7 @@ def measure_default(options: bench.Options) -> tuple[str, Any]:
 def film_clip(place: Path, seed: int, size: tuple[int, int]) -> Clip:
     """A synthetic scene on disk, as a clip of a data set."""
     clips.film_into(place / f"scene-{seed}", seed, FRAMES, size)
-    (clip,) = folder.read(place, {}, lambda name: name == f"scene-{seed}").clips
+    (clip,) = read(Source("folder", place, (f"scene-{seed}",)), place).clips
     return clip
 
 

@@ -7,8 +7,8 @@ from tests.synthetic_clip import film_into
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets import folder
-from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.family import Example, load_family
@@ -25,7 +25,7 @@ CPU = torch.device("cpu")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     place = tmp_path_factory.mktemp("films")
     film_into(place / "film", 3, 9, (240, 180))
-    (found,) = folder.read(place, {}, lambda name: True).clips
+    (found,) = read(Source("folder", place), place).clips
     return found
 
 

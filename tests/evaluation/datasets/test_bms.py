@@ -8,7 +8,7 @@ import pytest
 
 from tests.evaluation.datasets.layouts import clip, colours, complaint, mask, pictures, read, text
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.bms import read_definition
+from torchvision_dddas.evaluation.datasets.labelled_masks import read_definition
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 
 CAR, MAN = (2, 2, 8, 8), (20, 10, 6, 10)

@@ -19,7 +19,7 @@ def make(folder: Path, *names: str) -> None:
 @pytest.mark.parametrize("kind", kinds.KINDS)
 def test_each_kind_tells_of_a_folder_that_is_not_there_and_what_belongs_into_it(kind: str, tmp_path: Path) -> None:
     line = complaint(kind, tmp_path / "absent")
-    assert line == f"{tmp_path / 'absent'} does not exist; wanted {kinds.KINDS[kind]}"
+    assert line == f"{tmp_path / 'absent'} does not exist; wanted {kinds.KINDS[kind].layout}"
 
 
 @pytest.mark.parametrize("kind", kinds.KINDS)

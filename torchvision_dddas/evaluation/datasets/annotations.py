@@ -1,8 +1,9 @@
 """Annotations as text, a row a box, and boxes with identities as the truth of a clip."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -10,14 +11,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.matching import lie_within
 from torchvision_dddas.evaluation.metrics.truth import (
     FARTHEST,
-    MotRows,
     Positions,
     TrackTable,
     Truth,
+    check_identities,
     read_text,
     split_cells,
     to_number,
-    with_identities,
 )
 
 LAST = 1_000_000
@@ -27,12 +27,36 @@ _WHOLE = ("frame", "identity")
 _QUOTES = "\"' \t"
 
 
-class Rows(NamedTuple):
-    """The rows of a file. values: (N, C), NaN in the column of words. word: (N,) str. line: (N,), from 1."""
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a file. columns: (N,) by name, numbers or words. line: (N,) of the file, from 1."""
 
-    values: np.ndarray
-    word: np.ndarray
+    path: Path
+    columns: Mapping[str, np.ndarray]
     line: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
+
+    def at(self, mask: np.ndarray) -> "Rows":
+        """The rows that a mask (N,) picks."""
+        return Rows(self.path, {name: column[mask] for name, column in self.columns.items()}, self.line[mask])
+
+    def stack(self, *names: str) -> np.ndarray:
+        """(N, C) some columns side by side."""
+        return np.stack([self.columns[name] for name in names], axis=1)
+
+    def check_known(self, name: str, known: Collection[Any], wanted: str) -> None:
+        """Raises InputError with file and line where a value of a column is not among the known ones."""
+        unknown = ~np.isin(self[name], list(known))
+        if unknown.any():
+            i = int(unknown.argmax())
+            value = self[name][i]
+            shown = value if isinstance(value, str) else f"{value:g}"
+            raise InputError(f"{self.path}, line {self.line[i]}: the {name} is '{shown}'; wanted {wanted}")
 
 
 def read_rows(path: Path, columns: Sequence[str], word: str = "", first: int = 1) -> Rows:
@@ -42,7 +66,7 @@ def read_rows(path: Path, columns: Sequence[str], word: str = "", first: int = 1
     whose quotes are taken off. Raises InputError with file and line: too few columns, no finite number.
     """
     lines = [(n, text) for n, text in enumerate(read_text(path).splitlines(), 1) if text.strip()]
-    line, texts = np.array([n for n, _ in lines], np.int64), [text for _, text in lines]
+    texts = [text for _, text in lines]
     values, words = _read_fast(texts, columns, word) or _read_slowly(path, lines, columns, word)
     for k, name in enumerate(columns):
         if name == word:
@@ -53,11 +77,14 @@ def read_rows(path: Path, columns: Sequence[str], word: str = "", first: int = 1
         if name in _WHOLE:
             bad |= ~bad & (column != np.floor(column))
         if bad.any():
-            i = int(bad.argmax())
+            line, text = lines[int(bad.argmax())]
             number = "a whole number" if name in _WHOLE else "a number"
-            cell = split_cells(texts[i])[k]
-            raise InputError(f"{path}, line {line[i]}: {name} is '{cell}'; wanted {number}, {low:g} to {high:g}")
-    return Rows(values, np.array(words, object), line)
+            cell = split_cells(text)[k]
+            raise InputError(f"{path}, line {line}: {name} is '{cell}'; wanted {number}, {low:g} to {high:g}")
+    found = {name: values[:, k] for k, name in enumerate(columns)}
+    if word:
+        found[word] = np.array(words, str)
+    return Rows(path, found, np.array([n for n, _ in lines], np.int64))
 
 
 def _read_fast(texts: Sequence[str], columns: Sequence[str], word: str) -> tuple[np.ndarray, list[str]] | None:
@@ -91,20 +118,9 @@ def _read_slowly(
     return np.array(values, float), words
 
 
-def check_classes(classes: Sequence[str], known: Sequence[str], name: str) -> None:
-    """Raises InputError where a requested class is not among the known ones. name: of the data set."""
-    for one in classes:
-        if one not in known:
-            raise InputError(f"'{one}' is no class of {name}; wanted some of {', '.join(known)}")
-
-
-def check_known(path: Path, rows: Rows, values: np.ndarray, known: Collection[Any], what: str, wanted: str) -> None:
-    """Raises InputError with file and line where one of the values (N,) of rows is not among the known ones."""
-    unknown = ~np.isin(values, list(known))
-    if unknown.any():
-        i = int(unknown.argmax())
-        value = values[i] if isinstance(values[i], str) else f"{values[i]:g}"
-        raise InputError(f"{path}, line {rows.line[i]}: the {what} is '{value}'; wanted {wanted}")
+def boxes_of_corners(corners_px: np.ndarray) -> np.ndarray:
+    """(N, 4) x, y, width, height of left, top, right, bottom."""
+    return np.column_stack([corners_px[:, :2], corners_px[:, 2:] - corners_px[:, :2]])
 
 
 def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray, line: np.ndarray) -> TrackTable:
@@ -116,7 +132,9 @@ def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.nda
         i = int(flat.argmax())
         size = f"{box_px[i, 2]:g}×{box_px[i, 3]:g}"
         raise InputError(f"{path}, line {line[i]}: the box is {size} pixels; wanted more than 0")
-    return with_identities(MotRows(TrackTable.of(frame, identity, box_px), np.ones(len(frame)), line), path)
+    table = TrackTable.of(frame, identity, box_px)
+    check_identities(table, line, path)
+    return table
 
 
 def truth_of(
@@ -137,19 +155,23 @@ def truth_of(
         raise InputError(f"{place} labels frame {last}, but the clip has {length}; is it the same clip?")
     if length > LAST:
         raise InputError(f"{place}: a clip must have at most {LAST} frames, got {length}")
+    if regions is not None and not len(regions.frame):
+        regions = None
     if regions is not None:
-        counts = counts & ~_in_regions(table, regions)
+        counts = counts.copy()
+        for number, region_px in regions.boxes_by_frame().items():
+            rows = np.flatnonzero(table.frame == number)
+            counts[rows] &= ~lie_within(table.box_px[rows], region_px)
     if not counts.any():
         raise InputError(f"{place} holds no box that counts")
     kept = table.at(counts)
-    ignored = table.at(~counts) if not counts.all() else None
     return Truth(
         "boxes",
         place,
         {},
         boxes_by_frame(kept, length or last),
         kept,
-        ignored,
+        None if counts.all() else table.at(~counts),
         length,
         positions=positions if positions is not None and len(positions.frame) else None,
         ignoring="removed",
@@ -160,11 +182,3 @@ def truth_of(
 def boxes_by_frame(table: TrackTable, length: int) -> dict[int, np.ndarray]:
     """The boxes (N, 4) of each frame from 1 to length, in the table's order."""
     return {frame: np.zeros((0, 4)) for frame in range(1, length + 1)} | table.boxes_by_frame()
-
-
-def _in_regions(table: TrackTable, regions: TrackTable) -> np.ndarray:
-    lies = np.zeros(len(table.frame), bool)
-    for number, region_px in regions.boxes_by_frame().items():
-        rows = np.flatnonzero(table.frame == number)
-        lies[rows] = lie_within(table.box_px[rows], region_px)
-    return lies

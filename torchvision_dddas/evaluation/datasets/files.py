@@ -1,7 +1,7 @@
-"""The pictures of a clip on disk: names, numbers, sizes; and clips whose pictures must fit their truth."""
+"""Folders and pictures on disk: names, numbers, sizes; and clips whose pictures must fit their truth."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
@@ -26,6 +26,26 @@ def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> tuple[
 def videos_in(folder: Path) -> tuple[Path, ...]:
     """The videos of a folder, as `images_in`."""
     return images_in(folder, VIDEO_SUFFIXES)
+
+
+def folders_in(folder: Path) -> list[str]:
+    """The names of the folders in a folder, without hidden ones; none where it is no folder.
+
+    Raises InputError where it cannot be read.
+    """
+    try:
+        return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror}") from None
+
+
+def find_below(folder: Path, is_clip: Callable[[Path], bool], depth: int) -> list[Path]:
+    """The folders that are clips: this one, or those at most so many folders deeper; none lies in another."""
+    if is_clip(folder):
+        return [folder]
+    return [place for name in folders_in(folder) if depth for place in find_below(folder / name, is_clip, depth - 1)]
 
 
 def count_frames(pictures: tuple[Path, ...], announced: int = 0, source: str = "") -> int:
@@ -157,11 +177,9 @@ def _size_in_header(head: bytes) -> tuple[int, int] | None:
         return int.from_bytes(head[18:22], "little"), abs(int.from_bytes(head[22:26], "little", signed=True))
     if pnm := re.match(rb"P[1-6]\s+([0-9]{1,6})\s+([0-9]{1,6})\s", head):
         return int(pnm[1]), int(pnm[2])
-    # Exif may say that the picture is to be turned.
-    return _size_in_jpeg(head) if head[:2] == b"\xff\xd8" and b"Exif" not in head else None
+    if head[:2] != b"\xff\xd8" or b"Exif" in head:  # Exif may say that the picture is to be turned
+        return None
 
-
-def _size_in_jpeg(head: bytes) -> tuple[int, int] | None:
     place = 2
     while place + 9 <= len(head) and head[place] == 0xFF:
         marker = head[place + 1]

@@ -1,51 +1,64 @@
 """INRIA person: pictures of people who stand, and pictures without any."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.files import images_in, size_of
-from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options
+from torchvision_dddas.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.evaluation.metrics.truth import Truth, read_text
 
-TERMS = "research; as is, without any warranty"
-BODY_HEIGHT_PX = 96.0
 WIDTH_SHARE = 0.41
 """A standing body's width by its height (Dollár et al., 2012)."""
 
-Pictured = tuple[Path, tuple[int, int], np.ndarray]
-"""A picture, its (width, height) and the boxes (N, 4) of its people."""
 
-BoxReader = Callable[[Path, tuple[int, int]], np.ndarray]
-"""From a picture and its (width, height) to the boxes (N, 4) of its people. Raises InputError."""
+class Inria(Reader):
+    """INRIA person: a clip has the pictures of one size of pos/, of neg/ or of a folder of crops."""
 
+    kind = "inria"
+    layout = "INRIA person: Test/ with pos/, annotations/ and neg/; or a folder of crops, each of one person"
+    terms = "research; as is, without any warranty"
+    defaults: ClassVar = {"part": "Test", "body_height_px": 96.0}
 
-def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
-    """Options. part: Test or Train. body_height_px: of the person in each crop."""
-    given = check_options("inria", options, {"part": "Test", "body_height_px": BODY_HEIGHT_PX})
-    collector = Collector("inria", folder, TERMS, wanted)
-    home = folder / given["part"] if (folder / given["part"]).is_dir() else folder
-    if (home / "pos").is_dir() or (home / "neg").is_dir():
-        nobody = np.zeros((0, 4))
-        readers: dict[str, tuple[Path, BoxReader]] = {
-            "pos": (home / "pos", _annotated_boxes),
-            "neg": (home / "neg", lambda picture, size: nobody),
-        }
-    elif images_in(folder):
-        readers = {"crops": (folder, lambda picture, size: body_of(size, given["body_height_px"]))}
-    else:
-        return collector.refuse(
-            f"{folder} holds neither {given['part']}/pos nor pictures; wanted INRIA person or its crops"
-        )
-    found = {name: _read_each(images_in(place), boxes_of, collector) for name, (place, boxes_of) in readers.items()}
-    absent = [place for place, _ in readers.values() if not images_in(place)]
-    collector.missing += [f"no pictures in {place}, where they belong" for place in absent]
-    clips = {clip.name: clip for name, pictures in found.items() for clip in _by_size(home, name, pictures)}
-    return collector.collect(clips, clips.__getitem__)
+    def _places(self) -> Mapping[str, tuple[Path, list[tuple[Path, np.ndarray]]]]:
+        part = self.options["part"]
+        home = self.folder / part if (self.folder / part).is_dir() else self.folder
+        readers: dict[str, tuple[Path, Callable[[Path, tuple[int, int]], np.ndarray]]]
+        if (home / "pos").is_dir() or (home / "neg").is_dir():
+            readers = {
+                "pos": (home / "pos", _annotated_boxes),
+                "neg": (home / "neg", lambda picture, size: np.zeros((0, 4))),
+            }
+        elif images_in(self.folder):
+            readers = {"crops": (self.folder, lambda picture, size: body_of(size, self.options["body_height_px"]))}
+        else:
+            return self._refuse(
+                f"{self.folder} holds neither {part}/pos nor pictures; wanted INRIA person or its crops"
+            )
+        places: dict[str, tuple[Path, list[tuple[Path, np.ndarray]]]] = {}
+        for name, (place, boxes_of) in readers.items():
+            for picture in images_in(place):
+                try:
+                    size = size_of(picture)
+                    labelled = picture, boxes_of(picture, size)
+                except InputError as error:
+                    self.missing.append(f"{picture.parent.name}/{picture.name}: {error}")
+                    continue
+                places.setdefault(f"{name}-{size[0]}x{size[1]}", (home / name, []))[1].append(labelled)
+        absent = [place for place, _ in readers.values() if not images_in(place)]
+        self.missing += [f"no pictures in {place}, where they belong" for place in absent]
+        return places
+
+    def _clip(self, name: str, place: tuple[Path, list[tuple[Path, np.ndarray]]]) -> Clip:
+        home, labelled = place
+        boxes = {frame: box_px for frame, (_, box_px) in enumerate(labelled, 1)}
+        truth = Truth("boxes", home, {}, boxes, length=len(labelled))
+        pictures = tuple(picture for picture, _ in labelled)
+        return Clip(name, home.parent, pictures, frames=len(labelled), truth=truth, shows=("people",))
 
 
 def body_of(size: tuple[int, int], height_px: float) -> np.ndarray:
@@ -63,32 +76,9 @@ def _annotated_boxes(picture: Path, size: tuple[int, int]) -> np.ndarray:
         raise InputError(f"no truth, which belongs in {path}")
     annotation = read_annotation(path)
     if annotation.size != size:
-        said = f"{path} says {annotation.size[0]}×{annotation.size[1]}"
-        raise InputError(f"it is {size[0]}×{size[1]} pixels, but {said}")
+        stated = f"{path} says {annotation.size[0]}×{annotation.size[1]}"
+        raise InputError(f"it is {size[0]}×{size[1]} pixels, but {stated}")
     return annotation.box_px
-
-
-def _read_each(pictures: Iterable[Path], boxes_of: BoxReader, collector: Collector) -> list[Pictured]:
-    """All that can be read; the others go to the data set's missing clips."""
-    found = []
-    for picture in pictures:
-        try:
-            size = size_of(picture)
-            found.append((picture, size, boxes_of(picture, size)))
-        except InputError as error:
-            collector.missing.append(f"{picture.parent.name}/{picture.name}: {error}")
-    return found
-
-
-def _by_size(home: Path, name: str, pictures: list[Pictured]) -> list[Clip]:
-    clips = []
-    for size in sorted({size for _, size, _ in pictures}):
-        some = [picture for picture in pictures if picture[1] == size]
-        boxes = {frame: box_px for frame, (_, _, box_px) in enumerate(some, 1)}
-        truth = Truth("boxes", home / name, {}, boxes, length=len(some))
-        files = tuple(path for path, _, _ in some)
-        clips.append(Clip(f"{name}-{size[0]}x{size[1]}", home, files, frames=len(some), truth=truth, shows=("people",)))
-    return clips
 
 
 _NUMBER = r"(-?\d{1,7})"

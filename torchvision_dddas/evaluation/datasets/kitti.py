@@ -3,78 +3,71 @@
 from collections.abc import Mapping
 from math import pi
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import check_classes, check_known, read_rows, table_of, truth_of
-from torchvision_dddas.evaluation.datasets.files import check_numbering, images_in
-from torchvision_dddas.evaluation.datasets.record import Clip, Collector, Dataset, Wanted, check_options, folders_in
-from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth, read_text
-
-TERMS = "CC BY-NC-SA 3.0"
-RATE_HZ = 10.0
-CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc")
-UNLABELLED = "DontCare"
-LEAST_OCCLUDED_UNKNOWN = 3
-_COLUMNS = (
-    "frame", "identity", "type", "truncated", "occluded", "alpha", "left", "top", "right", "bottom",
-    "height", "width", "length", "x", "y", "z",
-)  # fmt: skip
-
-
-def read(folder: Path, options: Mapping[str, Any], wanted: Wanted) -> Dataset:
-    """Options. classes: those that count, of CLASSES; all by default."""
-    classes = check_options("kitti", options, {"classes": list(CLASSES)})["classes"]
-    check_classes(classes, CLASSES, "KITTI")
-    collector = Collector("kitti", folder, TERMS, wanted)
-    home = folder / "training" if (folder / "training").is_dir() else folder
-    places = {path.stem: path for path in sorted((home / "label_02").glob("*.txt"))}
-    if not places:
-        return collector.refuse(
-            f"{folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
-        )
-    collector.report_unlabelled(folders_in(home / "image_02"), places, f"{home / 'label_02'}/{{}}.txt")
-
-    def clip_of(name: str) -> Clip:
-        belongs = home / "image_02" / name
-        pictures = check_numbering(images_in(belongs), 0)
-        calibration, flight = home / "calib" / f"{name}.txt", home / "oxts" / f"{name}.txt"
-        absent = [str(path) for path in (calibration, flight) if not path.is_file()]
-        truth = read_truth(places[name], classes, len(pictures), None if absent else (calibration, flight))
-        if absent:
-            collector.notes.append(f"{name}: no places in metres, which need {' and '.join(absent)}")
-        return collector.label_clip(name, places[name], pictures, truth, belongs, rate_hz=RATE_HZ)
-
-    return collector.collect(places, clip_of)
-
-
-def read_truth(path: Path, classes: list[str], length: int = 0, pose: tuple[Path, Path] | None = None) -> Truth:
-    """A label file. length: frames of the clip, 0 where unknown. pose: the files of calib and oxts.
-
-    Raises InputError with file and line.
-    """
-    rows = read_rows(path, _COLUMNS, "type", first=0)
-    v, words = rows.values, rows.word.astype(str)
-    check_known(path, rows, words, (*CLASSES, UNLABELLED), "type", ", ".join(CLASSES))
-    frame, box = v[:, 0] + 1, np.column_stack([v[:, 6:8], v[:, 8:10] - v[:, 6:8]])
-    region = words == UNLABELLED
-    regions = TrackTable.of(frame[region], v[region, 1], box[region])
-    rest = ~region
-    table = table_of(path, frame[rest], v[rest, 1], box[rest], rows.line[rest])
-    is_visible = (v[rest, 3] <= 0) & (v[rest, 4] < LEAST_OCCLUDED_UNKNOWN)
-    counts = np.isin(words[rest], classes) & is_visible
-    where = positions_of(table.at(counts), v[rest][counts, 13:16], *pose) if pose else None
-    return truth_of(path, table, counts, length, regions if region.any() else None, where)
-
+from torchvision_dddas.evaluation.datasets.annotations import boxes_of_corners, read_rows, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.files import check_numbering, folders_in, images_in
+from torchvision_dddas.evaluation.datasets.record import Clip, Reader
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, read_text
 
 EARTH_RADIUS_M = 6378137.0
 MOST_LATITUDE_DEG = 85.0
 """Beyond it the map projection goes to infinity."""
 
-_RECORD = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
-_SIZES = {"R_rect": 9, "Tr_velo_cam": 12, "Tr_imu_velo": 12}
+
+class Kitti(Reader):
+    """KITTI tracking.
+
+    training/image_02/0000/000000.png   pictures, from 0, 10 a second
+    training/label_02/0000.txt          frame id type truncated occluded alpha, the box's corners, size, place
+    training/calib/0000.txt             rectified camera from the inertial unit
+    training/oxts/0000.txt              latitude, longitude, altitude, roll, pitch, yaw of each frame
+    """
+
+    kind = "kitti"
+    layout = "KITTI tracking: training/ with image_02/, label_02/, calib/ and oxts/"
+    terms = "CC BY-NC-SA 3.0"
+    types = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc")
+    defaults: ClassVar = {"classes": list(types)}
+    words: ClassVar = {"classes": ("KITTI", types)}
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self._home = self.folder / "training" if (self.folder / "training").is_dir() else self.folder
+
+    def _places(self) -> Mapping[str, Path]:
+        places = {path.stem: path for path in sorted((self._home / "label_02").glob("*.txt"))}
+        if not places:
+            return self._refuse(
+                f"{self.folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
+            )
+        self._report_unlabelled(folders_in(self._home / "image_02"), places, f"{self._home / 'label_02'}/{{}}.txt")
+        return places
+
+    def _clip(self, name: str, place: Path) -> Clip:
+        belongs = self._home / "image_02" / name
+        pictures = check_numbering(images_in(belongs), 0)
+        pose = [self._home / part / f"{name}.txt" for part in ("calib", "oxts")]
+        absent = [str(path) for path in pose if not path.is_file()]
+        corners = ("left", "top", "right", "bottom")
+        columns = ("frame", "identity", "type", "truncated", "occluded", "alpha", *corners)
+        rows = read_rows(place, (*columns, "height", "width", "length", "x", "y", "z"), "type", first=0)
+        rows.check_known("type", (*self.types, "DontCare"), ", ".join(self.types))
+        is_region = rows["type"] == "DontCare"
+        other, rows = rows.at(is_region), rows.at(~is_region)
+        regions = TrackTable.of(other["frame"] + 1, other["identity"], boxes_of_corners(other.stack(*corners)))
+        boxes = boxes_of_corners(rows.stack(*corners))
+        table = table_of(place, rows["frame"] + 1, rows["identity"], boxes, rows.line)
+        is_visible = (rows["truncated"] <= 0) & (rows["occluded"] < 3)  # 3: unknown
+        counts = np.isin(rows["type"], self.options["classes"]) & is_visible
+        where = None if absent else positions_of(table.at(counts), rows.at(counts).stack("x", "y", "z"), *pose)
+        truth = truth_of(place, table, counts, len(pictures), regions, where)
+        if absent:
+            self.notes.append(f"{name}: no places in metres, which need {' and '.join(absent)}")
+        return self._boxes_clip(name, place, pictures, truth, belongs, rate_hz=10.0)
 
 
 def positions_of(table: TrackTable, camera_m: np.ndarray, calibration: Path, records: Path) -> Positions:
@@ -95,8 +88,8 @@ def positions_of(table: TrackTable, camera_m: np.ndarray, calibration: Path, rec
 def camera_from_imu(path: Path) -> np.ndarray:
     """(4, 4) rectified camera from the inertial unit. Raises InputError where one of the matrices lacks."""
     lines = {cells[0].rstrip(":"): cells[1:] for line in read_text(path).splitlines() if (cells := line.split())}
-    matrices = []
-    for name, size in _SIZES.items():
+    chain: np.ndarray = np.eye(4)
+    for name, size in {"R_rect": 9, "Tr_velo_cam": 12, "Tr_imu_velo": 12}.items():
         try:
             values = np.array([float(cell) for cell in lines.get(name, ())])
         except ValueError:
@@ -107,18 +100,17 @@ def camera_from_imu(path: Path) -> np.ndarray:
         matrix[:3, : size // 3] = values.reshape(3, -1)
         if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 0.01:
             raise InputError(f"{path}: {name} is no rotation")
-        matrices.append(matrix)
-    rectified, camera_from_velodyne, velodyne_from_imu = matrices
-    chain: np.ndarray = rectified @ camera_from_velodyne @ velodyne_from_imu
+        chain = chain @ matrix
     return chain
 
 
 def poses(path: Path) -> np.ndarray:
     """(F, 4, 4) east, north, up from the unit's forward, left, up, of each line. Raises InputError with the line."""
-    rows = read_rows(path, _RECORD)
-    latitude, longitude, altitude, roll, pitch, yaw = rows.values.T
-    if not len(rows.values):
-        raise InputError(f"{path} is empty; wanted {','.join(_RECORD)} a line")
+    columns = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
+    rows = read_rows(path, columns)
+    latitude, longitude, altitude, roll, pitch, yaw = rows.stack(*columns).T
+    if not len(rows):
+        raise InputError(f"{path} is empty; wanted {','.join(columns)} a line")
     outside = (np.abs(latitude) > MOST_LATITUDE_DEG) | (np.abs(longitude) > 360)
     if outside.any():
         i = int(outside.argmax())

@@ -1,16 +1,13 @@
-"""What a data set holds, whatever its layout: clips with their truth. How an adapter collects them."""
+"""A data set: clips with their truth, and the base class of the readers, one for each kind of data set."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.io.images import natural_order
-
-Wanted = Callable[[str], bool]
-"""Whether a clip of that name is requested; others are not read."""
 
 
 @dataclass(frozen=True)
@@ -68,87 +65,85 @@ class Source:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass
-class Collector:
-    """Collects the clips that can be read; the reason why another cannot goes to `missing`. Fields as in Dataset."""
+_EXPECTED = {
+    str: "a text",
+    float: "a number",
+    list: "a list of texts",
+    type(None): "a number above 0, at most 1000",
+}
 
-    kind: str
-    folder: Path
-    terms: str
-    wanted: Wanted
-    missing: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
 
-    def collect(self, names: Iterable[str], clip_of: Callable[[str], Clip]) -> Dataset:
-        """The wanted ones of the names in natural order. clip_of: reads one; its InputError goes to `missing`."""
-        clips = []
-        for name in sorted(filter(self.wanted, names), key=natural_order):
+class Reader:
+    """Reads a data set of one kind. A subclass describes its layout on disk; docs/datasets.md says what counts.
+
+    layout: in a line. terms: of use. defaults: of the options; the type of a default is the option's, a list holds
+    texts, and None stands for an optional number above 0. words: by option that lists words, the name of those who use
+    them and the known ones, all by default. missing, notes: see Dataset.
+    """
+
+    kind: ClassVar[str]
+    layout: ClassVar[str]
+    terms: ClassVar[str] = ""
+    defaults: ClassVar[Mapping[str, Any]] = {}
+    words: ClassVar[Mapping[str, tuple[str, tuple[str, ...]]]] = {}
+
+    def __init__(self, folder: Path, options: Mapping[str, Any], wanted: Callable[[str], bool]) -> None:
+        """folder: it exists. wanted: whether a clip of that name is read. Raises InputError for a wrong option."""
+        self.folder, self.wanted = folder, wanted
+        self.missing: list[str] = []
+        self.notes: list[str] = []
+        for name, value in options.items():
+            if name not in self.defaults:
+                takes = f"it takes {', '.join(self.defaults)}" if self.defaults else "it takes none"
+                raise InputError(f"a data set of kind {self.kind} has no option '{name}'; {takes}")
+            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            type_ = type(self.defaults[name])
+            fits = {
+                str: isinstance(value, str),
+                float: is_number,
+                list: isinstance(value, list) and all(isinstance(text, str) for text in value),
+                type(None): is_number and 0 < value <= 1000,
+            }
+            if not fits[type_]:
+                raise InputError(f"{name} of a data set of kind {self.kind} must be {_EXPECTED[type_]}, got {value!r}")
+        self.options = {**self.defaults, **options}
+        for option, (whose, known) in self.words.items():
+            for word in self.options[option]:
+                if word not in known:
+                    raise InputError(f"'{word}' is no class of {whose}; wanted some of {', '.join(known)}")
+
+    def _places(self) -> Mapping[str, Any]:
+        """What `_clip` needs of each clip, by name; mostly its file or folder."""
+        raise NotImplementedError
+
+    def _clip(self, name: str, place: Any) -> Clip:
+        """Read one clip. Its InputError goes to `missing`."""
+        raise NotImplementedError
+
+    def read(self) -> Dataset:
+        """The wanted clips in natural order."""
+        clips, places = [], self._places()
+        for name in sorted(filter(self.wanted, places), key=natural_order):
             try:
-                clips.append(clip_of(name))
+                clips.append(self._clip(name, places[name]))
             except InputError as error:
                 self.missing.append(f"{name}: {error}")
         return Dataset(self.kind, self.folder, tuple(clips), self.terms, tuple(self.missing), tuple(self.notes))
 
-    def refuse(self, *missing: str) -> Dataset:
-        """A data set without clips: the folder does not hold this kind, for these reasons."""
-        return Dataset(self.kind, self.folder, (), self.terms, missing)
+    def _refuse(self, *missing: str) -> dict[str, Any]:
+        """No places: the folder does not hold this kind, for these reasons."""
+        self.missing += missing
+        return {}
 
-    def report_unlabelled(self, names: Iterable[str], labelled: Iterable[str], belongs: str) -> None:
+    def _report_unlabelled(self, names: list[str], labelled: Mapping[str, Any], belongs: str) -> None:
         """Add to `missing` what has pictures and no truth. belongs: the path of the truth, with {} for the name."""
         absent = [name for name in names if name not in labelled and self.wanted(name)]
         self.missing += [f"{name}: no truth, which belongs in {belongs.format(name)}" for name in absent]
 
-    def label_clip(
-        self, name: str, place: Path, pictures: tuple[Path, ...], truth: Truth, belongs: Path | str, **more: Any
+    def _boxes_clip(
+        self, name: str, place: Path, pictures: tuple[Path, ...], truth: Truth, belongs: Path, **more: Any
     ) -> Clip:
         """A clip of labelled boxes, which may lack its pictures; a note then says where they belong."""
         if not pictures:
             self.notes.append(f"{name}: no pictures, which belong in {belongs}")
         return Clip(name, place, pictures, frames=truth.length or truth.frames[-1], truth=truth, **more)
-
-
-_EXPECTED = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of texts"}
-
-
-def check_options(kind: str, options: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """The options in force. defaults: by name; the type of a default is the option's.
-
-    A list holds texts; None stands for an optional number above 0. Raises InputError: an unknown name, another type.
-    """
-    for name, value in options.items():
-        if name not in defaults:
-            takes = f"it takes {', '.join(defaults)}" if defaults else "it takes none"
-            raise InputError(f"a data set of kind {kind} has no option '{name}'; {takes}")
-        default = defaults[name]
-        type_ = float if default is None else type(default)
-        fits = isinstance(value, (int, float) if type_ is float else type_) and (
-            type_ is bool or not isinstance(value, bool)
-        )
-        if type_ is list:
-            fits = fits and all(isinstance(text, str) for text in value)
-        if default is None:
-            fits = fits and 0 < value <= 1000
-        if not fits:
-            expected = "a number above 0, at most 1000" if default is None else _EXPECTED[type_]
-            raise InputError(f"{name} of a data set of kind {kind} must be {expected}, got {value!r}")
-    return {**defaults, **options}
-
-
-def folders_in(folder: Path) -> list[str]:
-    """The names of the folders in a folder, without hidden ones; none where it is no folder.
-
-    Raises InputError where it cannot be read.
-    """
-    try:
-        return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    except OSError as error:
-        raise InputError(f"{folder} cannot be read: {error.strerror}") from None
-
-
-def find_below(folder: Path, is_clip: Callable[[Path], bool], depth: int) -> list[Path]:
-    """The folders that are clips: this one, or those at most so many folders deeper; none lies in another."""
-    if is_clip(folder):
-        return [folder]
-    return [place for name in folders_in(folder) if depth for place in find_below(folder / name, is_clip, depth - 1)]

@@ -203,7 +203,8 @@ def load(place: Path) -> Result:
     if place.is_file():
         rows = truth.read_rows(place, "result")
         if rows.named:
-            return Result(place, 0, None, False, "complete", truth.with_identities(rows, place))
+            truth.check_identities(rows.table, rows.line, place)
+            return Result(place, 0, None, False, "complete", rows.table)
         return Result(place, 0, _by_frame(rows.table), False, "complete")
     if not is_result(place):
         raise InputError(
@@ -213,7 +214,9 @@ def load(place: Path) -> Result:
     if (place / DETECTIONS).is_file():
         detected = _by_frame(truth.read_rows(place / DETECTIONS, "detections").table)
     if (place / TRACKS).is_file():
-        tracks = truth.with_identities(truth.read_rows(place / TRACKS, "tracks"), place / TRACKS)
+        rows = truth.read_rows(place / TRACKS, "tracks")
+        truth.check_identities(rows.table, rows.line, place / TRACKS)
+        tracks = rows.table
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
         looks, state, outputs = int(record["frames"]["written"]), str(record["state"]), list(record["outputs"])

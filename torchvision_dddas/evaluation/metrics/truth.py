@@ -192,7 +192,8 @@ def _load_boxes(path: Path) -> Truth:
     boxes = dict.fromkeys(np.unique(rows.table.frame).tolist(), np.zeros((0, 4))) | kept.boxes_by_frame()
     if not rows.named:
         return Truth("boxes", path, {}, boxes)
-    table = with_identities(rows, path)
+    table = rows.table
+    check_identities(table, rows.line, path)
     # The clip's length is in MOTChallenge's seqinfo.ini, beside the truth or above its folder.
     ini = next((p for p in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini") if p.is_file()), None)
     length = read_seqinfo(ini).length if ini is not None else 0
@@ -246,14 +247,16 @@ def read_rows(path: Path, what: str) -> MotRows:
     return MotRows(table, values[:, 6], values[:, 7].astype(np.int64))
 
 
-def with_identities(rows: MotRows, path: Path) -> TrackTable:
-    """The table, once each row has an identity of its own in its frame. Raises InputError with file and lines."""
-    table = rows.table
+def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
+    """Raises InputError with file and lines where a row has not an identity of its own in its frame.
+
+    line: (N,) of the file.
+    """
     unnamed = np.flatnonzero(table.identity == -1)
     if len(unnamed):
-        raise InputError(f"{path}, line {rows.line[unnamed[0]]}: identity -1 means none, but other rows have one")
-    order = np.lexsort([rows.line, table.identity, table.frame])
-    frame, identity, line = table.frame[order], table.identity[order], rows.line[order]
+        raise InputError(f"{path}, line {line[unnamed[0]]}: identity -1 means none, but other rows have one")
+    order = np.lexsort([line, table.identity, table.frame])
+    frame, identity, line = table.frame[order], table.identity[order], line[order]
     again = np.flatnonzero((frame[1:] == frame[:-1]) & (identity[1:] == identity[:-1]))
     if len(again):
         k = again[0]
@@ -261,7 +264,6 @@ def with_identities(rows: MotRows, path: Path) -> TrackTable:
             f"{path}, lines {line[k]} and {line[k + 1]}: identity {identity[k]} twice in frame {frame[k]}; "
             "an identity has one box a frame"
         )
-    return table
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", what: str = "") -> str:
