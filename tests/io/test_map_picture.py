@@ -9,8 +9,19 @@ import pytest
 from tests.io.ground import DOWN, NAMES, positions, tracks
 from torchvision_dddas.geo.projection import axes_of, rays
 from torchvision_dddas.io.maps.ground_tracks import Gathered
-from torchvision_dddas.io.maps.map_drawing import FINE, LEFT, TOP, VERDICTS, WIDTH, frame_around, round_step
-from torchvision_dddas.io.maps.map_picture import CameraPath, Signs, map_picture, view_of
+from torchvision_dddas.io.maps.map_picture import (
+    FINE,
+    LEFT,
+    TOP,
+    VERDICTS,
+    WIDTH,
+    CameraPath,
+    Signs,
+    frame_around,
+    map_picture,
+    round_step,
+    view_of,
+)
 from torchvision_dddas.types import Camera, CameraPose, Fix, Ortho
 
 CAMERA = Camera("uav", (1920, 1080), (1400.0, 1400.0), (959.5, 539.5))

@@ -12,17 +12,15 @@ from hypothesis import strategies as st
 from tests.io.ground import NAMES, ORIGIN, START, positions, tracks
 from torchvision_dddas import geometry
 from torchvision_dddas.io.maps import encode_geojson, geojson
-from torchvision_dddas.io.maps.cot import UNKNOWN, cot
-from torchvision_dddas.io.maps.ellipses import (
+from torchvision_dddas.io.maps.formats import UNKNOWN, cot, kml, xml_text
+from torchvision_dddas.io.maps.ground_tracks import (
     CHI2_95,
     cut_line,
-    degrees_per_metre,
+    ellipse_rows,
     ring_about,
     ring_m,
     semi_axes,
 )
-from torchvision_dddas.io.maps.ground_tracks import ellipse_rows
-from torchvision_dddas.io.maps.kml import kml, xml_text
 from torchvision_dddas.io.output import GroundRecorder
 from torchvision_dddas.types import GroundLocations, Sightings
 
@@ -308,12 +306,6 @@ def test_rings_in_degrees_are_those_of_the_ellipsoid(origin):
     assert found[0] == found[-1] and len(found) == len(ring) + 1
     back = geometry.east_north(np.array(found[:-1]), origin)
     assert np.abs(back - ring).max() < 0.002
-
-
-@pytest.mark.parametrize("latitude", [0.0, 45.0, -80.0])
-def test_degrees_per_metre_are_those_of_the_ellipsoid(latitude):
-    found = geometry.lonlat(np.array([[1.0, 0], [0, 1]]), (0.0, latitude))
-    assert np.allclose(np.diag(found - (0, latitude)), degrees_per_metre(latitude), rtol=1e-6)
 
 
 @pytest.mark.parametrize("longitude", [180.0, 179.9999, -179.9999, -180.0])

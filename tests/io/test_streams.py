@@ -11,7 +11,7 @@ import pytest
 from tests.io.ground import tracks
 from tests.io.streamed import ABOUT, Clock, FlakyOutlet, Told, followed, surveyed
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.maps.cot import cot
+from torchvision_dddas.io.maps.formats import cot
 from torchvision_dddas.io.streams import Stream, open_stream, open_streams
 from torchvision_dddas.io.streams.tool_messages import PEOPLE_FROM, CotEvents, mot_rows
 

@@ -1,26 +1,28 @@
-"""The places of all targets over time, from which maps are made at the end of a run."""
+"""The places of all targets over time, from which maps are made at the end of a run, and their error ellipses."""
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from torchvision_dddas import geometry
 from torchvision_dddas.types import Positions
 
+CHI2_95 = 5.991464547107979
+"""The 95 % quantile of chi-squared with two degrees of freedom, -2 ln 0.05."""
 MOST_ELLIPSES = 2_000
 """Ellipses of a map, about."""
 
+Place = list[float]
+"""Longitude and latitude in degrees, rounded to 1e-8, a millimetre."""
+
 _ROW = np.dtype(
     [
-        ("frame", "i8"),
-        ("target", "i8"),
-        ("time_s", "f8"),
-        ("east_north_m", "f8", 2),
-        ("covariance_m2", "f8", (2, 2)),
-        ("lonlat_deg", "f8", 2),
-        ("velocity_m_s", "f8", 2),
+        *(("frame", "i8"), ("target", "i8"), ("time_s", "f8"), ("east_north_m", "f8", 2)),
+        *(("covariance_m2", "f8", (2, 2)), ("lonlat_deg", "f8", 2), ("velocity_m_s", "f8", 2)),
     ]
 )
 
@@ -41,7 +43,7 @@ class GroundTracks:
     covariance_m2: np.ndarray
     lonlat_deg: np.ndarray | None
     velocity_m_s: np.ndarray
-    start_utc_s: float = float("nan")
+    start_utc_s: float = math.nan
 
     def __len__(self) -> int:
         return len(self.target)
@@ -65,9 +67,19 @@ class GroundTracks:
             return None
         return iso_utc(self.start_utc_s + self.time_s)
 
+    @property
+    def degrees(self) -> np.ndarray:
+        """(N, 2) longitudes and latitudes. Raises ValueError without a geographic origin."""
+        if self.lonlat_deg is None:
+            raise ValueError("these positions have no longitude and latitude")
+        return self.lonlat_deg
+
+    def places(self, rows: slice) -> list[Place]:
+        """The longitudes and latitudes of some rows."""
+        return [*np.round(self.degrees[rows], 8).tolist()]
+
     def spaced(self, seconds: float, rows: slice) -> list[int]:
-        """Rows of a target about so far apart in time, and its last; only the last if times are unknown."""
-        last = rows.stop - 1
+        """The first of a target's rows with a known time, and those that follow at least so long after another."""
         due = -math.inf
         chosen: list[int] = []
         for row, at in enumerate(self.time_s[rows].tolist(), rows.start):
@@ -75,7 +87,7 @@ class GroundTracks:
             if at >= due - 1e-6:
                 chosen.append(row)
                 due = at + seconds
-        return chosen if chosen and chosen[-1] == last else [*chosen, last]
+        return chosen
 
 
 def iso_utc(utc_s: np.ndarray) -> list[str]:
@@ -107,27 +119,115 @@ class Gathered:
         """The places by target. geographic: whether they have longitudes and latitudes."""
         rows = self._rows[: self._count]
         rows = rows[np.argsort(rows["target"], kind="stable")]
-        return GroundTracks(
-            rows["target"],
-            rows["frame"],
-            rows["time_s"],
-            rows["east_north_m"],
-            rows["covariance_m2"],
-            rows["lonlat_deg"] if geographic else None,
-            rows["velocity_m_s"],
-            start_utc_s,
-        )
+        columns: dict[str, Any] = {name: rows[name] for name in _ROW.names or ()}
+        if not geographic:
+            columns["lonlat_deg"] = None
+        return GroundTracks(**columns, start_utc_s=start_utc_s)
 
 
-def ellipse_rows(tracks: GroundTracks, every_s: float = 1.0, most: int = MOST_ELLIPSES) -> np.ndarray:
-    """(K,) rows whose ellipses a map shows: the last of each target, and about one each every_s before it.
+# --------------------------------------------------------------------------------------------------------------------
+# Error ellipses.
+
+
+def semi_axes(covariance_m2: np.ndarray, chi2: float = CHI2_95) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2) metres, the longer first, and (N,) the longer one's bearing in [0, pi), clockwise from north.
+
+    covariance_m2: (N, 2, 2) along east and north. NaN where it is. chi2 = 1: one standard deviation along each axis.
+    """
+    east, both, north = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
+    mean, apart = (east + north) / 2, np.hypot((east - north) / 2, both)
+    # Rounding may leave the smaller eigenvalue of a line a little below 0.
+    variances = np.maximum(np.stack([mean + apart, mean - apart], axis=1), 0.0)
+    bearing = (np.pi / 2 - np.arctan2(2 * both, east - north) / 2) % np.pi
+    return np.sqrt(chi2 * variances), bearing
+
+
+def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.ndarray:
+    """(N, points, 2) metres east and north of each centre, anticlockwise; the first point is not given again."""
+    turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    along = np.stack([np.sin(bearing_rad), np.cos(bearing_rad)], axis=1)[:, None]
+    across = np.stack([-along[..., 1], along[..., 0]], axis=2)
+    return axes_m[:, None, :1] * np.cos(turn)[:, None] * along + axes_m[:, None, 1:] * np.sin(turn)[:, None] * across
+
+
+def ellipse_rows(tracks: GroundTracks, most: int = MOST_ELLIPSES) -> np.ndarray:
+    """(K,) rows whose ellipses a map shows: the last of each target, and about one each second before it.
 
     The intervals grow where there would be more than `most`; each target's last is always among them.
     """
-    known = np.isfinite(tracks.covariance_m2).all(axis=(1, 2))
-    span = sum(
-        float(t[-1] - t[0]) for t in (tracks.time_s[rows] for rows in tracks.of.values()) if np.isfinite(t).all()
-    )
-    apart = max(every_s, span / most)
-    rows = [row for of in tracks.of.values() for row in tracks.spaced(apart, of)]
-    return np.array([row for row in rows if known[row]], int)
+    times = [tracks.time_s[rows] for rows in tracks.of.values()]
+    apart_s = max(1.0, sum(float(t[-1] - t[0]) for t in times if np.isfinite(t).all()) / most)
+    chosen = {row for rows in tracks.of.values() for row in (*tracks.spaced(apart_s, rows), rows.stop - 1)}
+    return np.array([row for row in sorted(chosen) if np.isfinite(tracks.covariance_m2[row]).all()], int)
+
+
+@dataclass(frozen=True)
+class MapEllipse:
+    """The ellipse that holds the true place of a row of GroundTracks with 95 %. rings: closed, in degrees."""
+
+    row: int
+    rings: list[list[Place]]
+    major_m: float
+    minor_m: float
+    bearing_rad: float
+
+
+def map_ellipses(tracks: GroundTracks, rows: np.ndarray) -> list[MapEllipse]:
+    """The ellipses of some rows, except those too near a pole."""
+    axes, bearing = semi_axes(tracks.covariance_m2[rows])
+    found = []
+    for row, ring, (major, minor), turn in zip(rows.tolist(), ring_m(axes, bearing), axes, bearing, strict=True):
+        if rings := ring_about(tracks.degrees[row], ring):
+            found.append(MapEllipse(row, rings, float(major), float(minor), float(turn)))
+    return found
+
+
+def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
+    """A small ring of metres about a place as closed rings in degrees, two where it lies on both sides of 180 degrees.
+
+    ring_m: (K, 2) metres east and north, convex and anticlockwise, as the rings will be. Degrees a metre are those at
+    the place: on the ellipsoid 100 m off are 1 mm out. None where the ring comes too near a pole to be a ring there.
+    """
+    longitude, latitude = (float(v) for v in lonlat_deg)
+    to_pole_m = (90 - abs(latitude)) * 111_000
+    # Within a tenth of the way to the pole a degree of longitude changes its length by as much.
+    if not np.hypot(*ring_m.T).max() <= to_pole_m / 10:
+        return []
+    degrees_per_metre = np.diag(geometry.lonlat(np.eye(2), (0.0, latitude)) - (0.0, latitude))
+    parts = [(longitude, latitude) + ring_m * degrees_per_metre]
+    if np.abs(parts[0][:, 0]).max() > 180:
+        edges = (-540.0, -180.0, 180.0)
+        parts = [_clip(_clip(parts[0], west, 1.0), west + 360, -1.0) - (west + 180, 0.0) for west in edges]
+    rings = [np.round(part, 8).tolist() for part in parts if len(part) >= 3]
+    return [[*ring, ring[0]] for ring in rings]
+
+
+def _clip(ring: np.ndarray, edge: float, side: float) -> np.ndarray:
+    """The part of a convex ring east (side 1) or west (-1) of a longitude."""
+    inside = (ring[:, 0] - edge) * side >= 0
+    if inside.all() or not inside.any():
+        return ring[inside]
+    kept = []
+    for k, (before, after) in enumerate(zip(np.roll(ring, 1, axis=0), ring, strict=True)):
+        if inside[k] != inside[k - 1]:
+            share = (edge - before[0]) / (after[0] - before[0])
+            kept.append([edge, before[1] + share * (after[1] - before[1])])
+        if inside[k]:
+            kept.append(after)
+    return np.array(kept)
+
+
+def cut_line(places: list[Place]) -> list[list[Place]]:
+    """Cut a line where it crosses 180 degrees of longitude; the cut ends lie on that meridian."""
+    lines = [places[:1]]
+    for before, after in pairwise(places):
+        if abs(after[0] - before[0]) > 180:
+            edge = math.copysign(180.0, before[0])
+            # Degrees to the edge, and from it on the other side.
+            ahead, behind = abs(edge - before[0]), abs(-edge - after[0])
+            share = ahead / (ahead + behind) if ahead + behind > 0 else 0.0
+            latitude = round(before[1] + share * (after[1] - before[1]), 8)
+            lines[-1].append([edge, latitude])
+            lines.append([[-edge, latitude]])
+        lines[-1].append(after)
+    return lines

@@ -1,6 +1,7 @@
-"""A map of a run: tracks with their numbers and 95 % ellipses, landmarks, the camera's path and last view."""
+"""A map of a run as a picture: tracks with their numbers and 95 % ellipses, landmarks, the camera's path and view."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -8,39 +9,23 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.geo.projection import rays, undistort_pixels
-from torchvision_dddas.io.maps.ellipses import ring_m, semi_axes
-from torchvision_dddas.io.maps.ground_tracks import GroundTracks
-from torchvision_dddas.io.maps.map_drawing import (
-    BOTTOM,
-    FINE,
-    INK,
-    LEFT,
-    MARK,
-    PAPER,
-    TOP,
-    Labels,
-    MapFrame,
-    blank,
-    dashes,
-    draw_camera,
-    draw_dot,
-    draw_grid,
-    draw_landmark,
-    draw_look,
-    draw_scale,
-    draw_verdict,
-    frame_around,
-    line,
-    text_width,
-    write,
-)
-from torchvision_dddas.io.overlay import Colour, identity_colour
+from torchvision_dddas.io.maps.ground_tracks import GroundTracks, ring_m, semi_axes
+from torchvision_dddas.io.overlay import LETTERS, Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho
 
+FINE = 2
+"""The map is drawn so many times larger and then reduced, for clean thin lines and small letters."""
+WIDTH = 1400
+LEFT, RIGHT, TOP, BOTTOM = 86, 24, 46, 106
+SHORTEST, TALLEST = 420, 880
+INK, GRID, PAPER = (60, 60, 60), (222, 222, 222), (255, 255, 255)
+MARK, LOOK, VIEW, PATH = (30, 30, 200), (150, 110, 40), (0, 130, 240), (120, 120, 120)
+VERDICTS: dict[str, Colour] = {"human": (60, 130, 20), "not_human": (40, 70, 190)}
+_LINES_ACROSS = 12
+_SUB = 3  # bits of a pixel's fraction that OpenCV draws with
 _MOST_SIGNS = 400
 _LOOKS_APART_M = 2.0
-VIEW = (0, 130, 240)
-_LOWEST = float(np.sin(np.radians(3)))  # flatter rays end where one at 3 degrees reaches the ground
+_LOWEST = math.sin(math.radians(3))  # flatter rays end where one at 3 degrees reaches the ground
 
 
 class Signs:
@@ -91,41 +76,51 @@ def map_picture(
     A few places far from all others, farther than the middle 96 % reach, do not stretch the map; it says how
     many lie outside. Lines are broken where a target was not located for a while.
     """
-    camera = camera or CameraPath()
+    camera, signs = camera or CameraPath(), signs or Signs()
     frame = frame_around(_extent(tracks.east_north_m, landmarks.east_north_m, camera))
-    picture = blank(frame)
+    picture = np.full(((frame.height + TOP + BOTTOM) * FINE, WIDTH * FINE, 3), 255, np.uint8)
     plot = picture[frame.plot]
     if photo is not None:
         _draw_photo(plot, frame, photo)
-    draw_grid(picture, frame, photo is not None)
-    _draw_way(plot, frame, camera)
-    labels = Labels(frame)
-    for rows in landmarks.of.values():
-        line(plot, frame.pixels(landmarks.east_north_m[rows]), (120, 120, 120), 1)
-    for target, rows in tracks.of.items():
-        for piece in _pieces(tracks, rows):
-            line(plot, frame.pixels(tracks.east_north_m[piece]), _dark(target), 2, halo=True)
-    for target, rows in tracks.of.items():
-        _draw_last(plot, frame, tracks, rows.stop - 1, _dark(target))
-    if signs is not None:
-        for from_m, at_m in signs.looks:
-            draw_look(plot, frame.pixels(from_m), frame.pixels(at_m))
-        for _, kind, place in signs.verdicts:
-            draw_verdict(plot, frame.pixels(place), kind)
-            labels.keep_free(place)
-    for shown in (tracks, landmarks):
-        for rows in shown.of.values():
-            labels.keep_free(shown.east_north_m[rows.stop - 1])
-    for mark, rows in landmarks.of.items():
-        draw_landmark(plot, frame.pixels(landmarks.east_north_m[rows.stop - 1]))
-        labels.add(picture, landmarks.east_north_m[rows.stop - 1], names[mark], MARK)
-    for target, rows in tracks.of.items():
-        labels.add(picture, tracks.east_north_m[rows.stop - 1], str(target), _dark(target))
-    draw_scale(picture, frame)
+    _draw_grid(picture, frame, photo is not None)
+    if len(camera.view_m):
+        _dashes(plot, frame.pixels(np.concatenate([camera.view_m, camera.view_m[:1]])), VIEW, 2)
     if len(camera.east_north_m):
-        draw_camera(plot, frame.pixels(camera.east_north_m[-1]))
-    write(picture, title, (LEFT + 26, TOP - 14), 0.62)
-    _legend(picture, frame, tracks, camera, len(landmarks) > 0, signs or Signs())
+        _line(plot, frame.pixels(camera.east_north_m), INK, 1, halo=True)
+    for rows in landmarks.of.values():
+        _line(plot, frame.pixels(landmarks.east_north_m[rows]), PATH, 1)
+    for target, rows in tracks.of.items():
+        steps = np.diff(tracks.frame[rows])
+        longest = 4 * max(float(np.median(steps)), 1.0) if len(steps) else 0.0
+        for piece in np.split(tracks.east_north_m[rows], np.flatnonzero(steps > longest) + 1):
+            _line(plot, frame.pixels(piece), _dark(target), 2, halo=True)
+    last = {target: tracks.east_north_m[rows.stop - 1] for target, rows in tracks.of.items()}
+    marked = {mark: landmarks.east_north_m[rows.stop - 1] for mark, rows in landmarks.of.items()}
+    for target, place in last.items():
+        covariance_m2 = tracks.covariance_m2[tracks.of[target].stop - 1]
+        if np.isfinite(covariance_m2).all():
+            ring = place + ring_m(*semi_axes(covariance_m2[None]), points=72)[0]
+            _line(plot, frame.pixels(np.concatenate([ring, ring[:1]])), _dark(target), 1, halo=True)
+        _disc(plot, frame.pixels(place), 4, _dark(target))
+    for from_m, at_m in signs.looks:
+        _draw_look(plot, frame.pixels(from_m), frame.pixels(at_m))
+    for _, kind, place in signs.verdicts:
+        _draw_verdict(plot, frame.pixels(place), kind)
+    labels = _Labels(picture, frame, [*(place for *_, place in signs.verdicts), *last.values(), *marked.values()])
+    for mark, place in marked.items():
+        _draw_landmark(plot, frame.pixels(place))
+        labels.add(place, names[mark], MARK)
+    for target, place in last.items():
+        labels.add(place, str(target), _dark(target))
+    _draw_scale(picture, frame)
+    if len(camera.east_north_m):
+        _draw_camera(plot, frame.pixels(camera.east_north_m[-1]))
+    _write(picture, title, (LEFT + 26, TOP - 14), 0.62)
+    _draw_legend(picture, frame, camera, len(landmarks) > 0, signs)
+    places = frame.pixels(tracks.east_north_m) / FINE
+    outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
+    count = f"{len(tracks.of)} targets, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")
+    _write(picture, count, (LEFT, TOP + frame.height + BOTTOM - 12), 0.5)
     return cv2.resize(picture, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA)
 
 
@@ -152,6 +147,43 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
     return ground[:, :2] / ground[:, 2:] if has_one_sign else np.zeros((0, 2))
 
 
+# --------------------------------------------------------------------------------------------------------------------
+# The frame.
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """West and south edge in local metres, metres a pixel, and the plot's size in pixels of the finished picture."""
+
+    west_m: float
+    south_m: float
+    metres_a_pixel: float
+    width: int
+    height: int
+
+    def pixels(self, east_north_m: np.ndarray) -> np.ndarray:
+        """(..., 2) x, y in the plot, in pixels of the enlarged picture."""
+        fine = FINE / self.metres_a_pixel
+        return (np.asarray(east_north_m, float) - (self.west_m, self.south_m)) * (fine, -fine) + (0, self.height * FINE)
+
+    @property
+    def plot(self) -> tuple[slice, slice]:
+        """Rows and columns of the plot in the enlarged picture."""
+        return slice(TOP * FINE, (TOP + self.height) * FINE), slice(LEFT * FINE, (LEFT + self.width) * FINE)
+
+
+def frame_around(east_north_m: np.ndarray) -> MapFrame:
+    """The frame that shows all of these places, with room around them; ten metres where there are none."""
+    known = east_north_m[np.isfinite(east_north_m).all(axis=1)]
+    low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else (np.zeros(2), np.zeros(2))
+    middle, size = (low + high) / 2, np.maximum((high - low) * 1.16, 10.0)
+    width = WIDTH - LEFT - RIGHT
+    height = round(min(max(width * size[1] / size[0], SHORTEST), TALLEST))
+    metres = max(size[0] / width, size[1] / height)
+    west, south = middle - np.array([width, height]) * metres / 2
+    return MapFrame(float(west), float(south), float(metres), width, height)
+
+
 def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> np.ndarray:
     """Places that the map must show: the camera's way and view too, unless they go far beyond all others."""
     targets = targets[np.isfinite(targets).all(axis=1)]
@@ -170,11 +202,10 @@ def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> n
     return shown
 
 
-def _pieces(tracks: GroundTracks, rows: slice) -> list[slice]:
-    steps = np.diff(tracks.frame[rows])
-    breaks = (np.flatnonzero(steps > 4 * max(np.median(steps), 1)) + 1 + rows.start).tolist() if len(steps) else []
-    edges = [rows.start, *breaks, rows.stop]
-    return [slice(a, b) for a, b in pairwise(edges)]
+def round_step(span: float, lines: int) -> float:
+    """1, 2 or 5 times a power of ten, so that about so many lines cover a span."""
+    power = 10.0 ** math.floor(math.log10(span / lines))
+    return next(power * k for k in (1, 2, 5, 10) if power * k >= span / lines)
 
 
 def _draw_photo(plot: np.ndarray, frame: MapFrame, photo: Ortho) -> None:
@@ -198,55 +229,201 @@ def _draw_photo(plot: np.ndarray, frame: MapFrame, photo: Ortho) -> None:
     plot[:] = (0.75 * warped + 0.25 * 255).astype(np.uint8)
 
 
-def _draw_way(plot: np.ndarray, frame: MapFrame, camera: CameraPath) -> None:
-    if len(camera.view_m):
-        dashes(plot, frame.pixels(np.concatenate([camera.view_m, camera.view_m[:1]])), VIEW, 2)
-    if len(camera.east_north_m):
-        line(plot, frame.pixels(camera.east_north_m), INK, 1, halo=True)
+def _draw_grid(picture: np.ndarray, frame: MapFrame, over_photo: bool) -> None:
+    """Grid lines through the plot and their numbers outside it."""
+    rows, columns = frame.plot
+    plot = picture[rows, columns]
+    size = np.array([frame.width, frame.height]) * frame.metres_a_pixel
+    step = round_step(float(size[0]), _LINES_ACROSS)
+    digits = max(0, -math.floor(math.log10(step)))
+    for axis, start in enumerate((frame.west_m, frame.south_m)):
+        for k in range(math.ceil(start / step), math.floor((start + size[axis]) / step) + 1):
+            at = round(float(frame.pixels(np.full(2, k * step))[axis]))
+            lines = plot if axis == 0 else plot.swapaxes(0, 1)
+            part = lines[:, max(at - 1, 0) : at + 1]
+            part[:] = part // 2 + 128 if over_photo else GRID
+            text = f"{k * step:.{digits}f}"
+            wide = _text_width(text, 0.5)
+            below, beside = (
+                (at / FINE + LEFT - wide / 2, frame.height + TOP + 20),
+                (LEFT - wide - 8, at / FINE + TOP + 5),
+            )
+            _write(picture, text, below if axis == 0 else beside, 0.5)
+    cv2.rectangle(picture, (columns.start, rows.start), (columns.stop, rows.stop), INK, FINE)
+    _write(picture, "north, m", (10, TOP - 12), 0.5)
+    _write(picture, "east, m", (WIDTH - RIGHT - _text_width("east, m", 0.5), frame.height + TOP + 40), 0.5)
 
 
-def _draw_last(plot: np.ndarray, frame: MapFrame, tracks: GroundTracks, row: int, colour: Colour) -> None:
-    centre = tracks.east_north_m[row]
-    if np.isfinite(tracks.covariance_m2[row]).all():
-        ring = centre + ring_m(*semi_axes(tracks.covariance_m2[row : row + 1]), points=72)[0]
-        line(plot, frame.pixels(np.concatenate([ring, ring[:1]])), colour, 1, halo=True)
-    draw_dot(plot, frame.pixels(centre), colour)
+def _draw_scale(picture: np.ndarray, frame: MapFrame) -> None:
+    """A bar of a round length and an arrow to the north, outside the plot."""
+    length = round_step(frame.width * frame.metres_a_pixel, _LINES_ACROSS)
+    right, low = WIDTH - RIGHT - 4, TOP + frame.height + BOTTOM - 18
+    left = right - length / frame.metres_a_pixel
+    for a, b in (((left, low - 5), (left, low + 5)), ((right, low - 5), (right, low + 5)), ((left, low), (right, low))):
+        cv2.line(picture, _fine(*a), _fine(*b), INK, 2 * FINE)
+    text = f"{length:g} m"
+    _write(picture, text, (left - _text_width(text, 0.5) - 12, low + 5), 0.5)
+    x, y = WIDTH - RIGHT - 12, 8
+    cv2.arrowedLine(picture, _fine(x, y + 30), _fine(x, y), INK, 2 * FINE, cv2.LINE_AA, tipLength=0.4)
+    _write(picture, "N", (x - 12 - _text_width("N", 0.55), y + 26), 0.55)
 
 
-def _legend(
-    picture: np.ndarray, frame: MapFrame, tracks: GroundTracks, camera: CameraPath, marked: bool, signs: Signs
-) -> None:
-    y = TOP + frame.height + 62
-    x = LEFT + 8.0
-    ring = np.array([x, y]) + np.array([13, 7]) * np.array([(np.cos(t), np.sin(t)) for t in np.linspace(0, 6.2832, 40)])
-    entries = [("target: number, way, 95 % ellipse of the last place", "ring")]
-    entries += [("landmark", "mark")] if marked else []
-    entries += [("camera", "camera")] if len(camera.east_north_m) else []
-    entries += [("what it saw last", "view")] if len(camera.view_m) else []
+def _draw_legend(picture: np.ndarray, frame: MapFrame, camera: CameraPath, has_landmarks: bool, signs: Signs) -> None:
+    def target(picture: np.ndarray, at: np.ndarray) -> None:
+        turn = np.linspace(0, 2 * np.pi, 40)
+        _line(picture, at + FINE * np.stack([13 * np.cos(turn), 7 * np.sin(turn)], axis=1), _dark(1), 1)
+        _disc(picture, at, 4, _dark(1))
+
+    def view(picture: np.ndarray, at: np.ndarray) -> None:
+        _dashes(picture, at + FINE * np.array([[-14.0, 0], [14, 0]]), VIEW, 2)
+
+    def look(picture: np.ndarray, at: np.ndarray) -> None:
+        _draw_look(picture, at - (9.0 * FINE, 0.0), at)
+
     kinds = {kind for _, kind, _ in signs.verdicts}
-    entries += [(f"told {kind.replace('_', ' ')}", kind) for kind in ("human", "not_human") if kind in kinds]
-    entries += [("seen from here", "look")] if signs.looks else []
-    for text, kind in entries:
-        at = np.array([x, y]) * FINE
-        if kind == "ring":
-            line(picture, ring * FINE, _dark(1), 1)
-            draw_dot(picture, at, _dark(1))
-        elif kind == "mark":
-            draw_landmark(picture, at)
-        elif kind == "camera":
-            draw_camera(picture, at)
-        elif kind == "look":
-            draw_look(picture, at - (9.0 * FINE, 0.0), at)
-        elif kind in kinds:
-            draw_verdict(picture, at, kind)
-        else:
-            dashes(picture, at + FINE * np.array([[-14.0, 0], [14, 0]]), VIEW, 2)
-        write(picture, text, (x + 20, y + 5), 0.5)
-        x += 20 + text_width(text, 0.5) + (40 if len(entries) < 6 else 22)
-    places = frame.pixels(tracks.east_north_m) / FINE
-    outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
-    text = f"{len(tracks.of)} targets, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")
-    write(picture, text, (LEFT, TOP + frame.height + BOTTOM - 12), 0.5)
+    entries: list[tuple[bool, str, Callable[[np.ndarray, np.ndarray], None]]] = [
+        (True, "target: number, way, 95 % ellipse of the last place", target),
+        (has_landmarks, "landmark", _draw_landmark),
+        (len(camera.east_north_m) > 0, "camera", _draw_camera),
+        (len(camera.view_m) > 0, "what it saw last", view),
+        ("human" in kinds, "told human", lambda picture, at: _draw_verdict(picture, at, "human")),
+        ("not_human" in kinds, "told not human", lambda picture, at: _draw_verdict(picture, at, "not_human")),
+        (len(signs.looks) > 0, "seen from here", look),
+    ]
+    x, y = LEFT + 8.0, TOP + frame.height + 62
+    shown = [(text, draw) for is_shown, text, draw in entries if is_shown]
+    for text, draw in shown:
+        draw(picture, np.array([x, y]) * FINE)
+        _write(picture, text, (x + 20, y + 5), 0.5)
+        x += 20 + _text_width(text, 0.5) + (40 if len(shown) < 6 else 22)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Signs and lines; places are in pixels of the enlarged picture.
+
+
+class _Labels:
+    """Labels beside their places; one that would cover others or a sign moves around its place."""
+
+    def __init__(self, picture: np.ndarray, frame: MapFrame, signs_m: Sequence[np.ndarray]) -> None:
+        """signs_m: places of signs that no label may cover."""
+        self._picture, self._frame = picture, frame
+        self._low = TOP + frame.height
+        self._taken = [(x - 6, y - 6, x + 6, y + 6) for x, y in map(self._pixel, signs_m)]
+
+    def add(self, east_north_m: np.ndarray, text: str, colour: Colour) -> None:
+        """Write a label beside a place, if the map shows the place."""
+        x, y = self._pixel(east_north_m)
+        if not (LEFT <= x <= WIDTH - RIGHT and TOP <= y <= self._low):
+            return
+        wide = _text_width(text, 0.5)
+        places = [(x + 9, y - 6), (x + 9, y + 16), (x - 9 - wide, y - 6), (x - 9 - wide, y + 16)]
+        places += [(x - wide / 2, y - 12), (x - wide / 2, y + 22), (x + 22, y + 5), (x - 22 - wide, y + 5)]
+        boxes = [(left - 1, low - 13, left + wide + 1, low + 2) for left, low in places]
+        chosen = next((k for k, box in enumerate(boxes) if self._is_free(box)), 0)
+        self._taken.append(boxes[chosen])
+        _write(self._picture, text, places[chosen], 0.5, colour, halo=True)
+
+    def _pixel(self, east_north_m: np.ndarray) -> tuple[float, float]:
+        x, y = (self._frame.pixels(east_north_m) / FINE + (LEFT, TOP)).tolist()
+        return x, y
+
+    def _is_free(self, box: tuple[float, float, float, float]) -> bool:
+        left, top, right, low = box
+        is_inside = left > LEFT and right < WIDTH - RIGHT and top > TOP and low < self._low
+        return is_inside and not any(left < b[2] and b[0] < right and top < b[3] and b[1] < low for b in self._taken)
+
+
+def _draw_camera(picture: np.ndarray, at: np.ndarray) -> None:
+    _fill(picture, at + FINE * np.array([[0, -9], [8, 6], [-8, 6]]), INK)
+
+
+def _draw_landmark(picture: np.ndarray, at: np.ndarray) -> None:
+    for size, colour in ((9, PAPER), (7, MARK)):
+        _fill(picture, at + FINE * size * np.array([[0, -1], [1, 0], [0, 1], [-1, 0]]), colour)
+
+
+def _draw_look(picture: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray) -> None:
+    """A wedge from where a vehicle was, open towards what it looked at."""
+    way = at_xy - from_xy
+    edge = np.arctan2(way[1], way[0]) + np.linspace(-0.38, 0.38, 9)
+    shape = np.vstack([from_xy, from_xy + 26.0 * FINE * np.stack([np.cos(edge), np.sin(edge)], axis=1)])
+    low = np.floor(np.clip(shape.min(axis=0) - 2, 0, None)).astype(int)
+    high = np.ceil(shape.max(axis=0) + 2).astype(int)
+    part = picture[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
+    if part.size:
+        tinted = part.copy()
+        _fill(tinted, shape - low, LOOK)
+        cv2.addWeighted(tinted, 0.35, part, 0.65, 0, dst=part)
+    _dashes(picture, shape[[1, 0, -1]], LOOK, 1, dash=400.0 * FINE)
+
+
+def _draw_verdict(picture: np.ndarray, at: np.ndarray, kind: str) -> None:
+    """A disc with H for human or N for not human."""
+    _disc(picture, at, 9, VERDICTS.get(kind, INK))
+    letter = LETTERS.get(kind, "?")
+    (wide, high), _ = cv2.getTextSize(letter, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * FINE, 2 * FINE)
+    x, y = np.round(np.clip(np.nan_to_num(at), -30_000, 30_000)).astype(int).tolist()
+    cv2.putText(picture, letter, (x - wide // 2, y + high // 2), 0, 0.5 * FINE, PAPER, 2 * FINE, cv2.LINE_AA)
+
+
+def _disc(picture: np.ndarray, at: np.ndarray, radius: int, colour: Colour) -> None:
+    """A disc with a rim of paper; radius in the finished picture."""
+    centre = _fixed(at).tolist()
+    cv2.circle(picture, centre, ((radius + 1) * FINE) << _SUB, PAPER, -1, cv2.LINE_AA, _SUB)
+    cv2.circle(picture, centre, (radius * FINE) << _SUB, colour, -1, cv2.LINE_AA, _SUB)
+
+
+def _fill(picture: np.ndarray, points: np.ndarray, colour: Colour) -> None:
+    cv2.fillPoly(picture, [_fixed(points)], colour, cv2.LINE_AA, _SUB)
+
+
+def _line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, halo: bool = False) -> None:
+    """A line through (N, 2) pixels, so thick in the finished picture."""
+    if len(points) > 99:
+        # A long track jitters within a pixel from frame to frame: drawing that would take most of the time.
+        points = cv2.approxPolyDP(points.astype(np.float32)[:, None], 0.4 * FINE, False)[:, 0]
+    if halo:
+        cv2.polylines(picture, [_fixed(points)], False, PAPER, (thick + 2) * FINE, cv2.LINE_AA, _SUB)
+    cv2.polylines(picture, [_fixed(points)], False, colour, thick * FINE, cv2.LINE_AA, _SUB)
+
+
+def _dashes(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, dash: float = 9.0 * FINE) -> None:
+    """A broken line, as far as it lies in the picture."""
+    height, width = picture.shape[:2]
+    whole = np.clip(np.nan_to_num(points), -1e6, 1e6).round().astype(int).tolist()
+    for a, b in pairwise(whole):
+        is_inside, *ends = cv2.clipLine((0, 0, width, height), a, b)
+        if is_inside:
+            start, end = (np.array(e, float) for e in ends)
+            count = max(int(np.hypot(*(end - start)) / dash), 1)
+            for k in range(0, count, 2):
+                piece = start + (end - start) * np.array([[k], [min(k + 1, count)]]) / count
+                _line(picture, piece, colour, thick)
+
+
+def _write(
+    picture: np.ndarray, text: str, at: tuple[float, float], size: float, colour: Colour = INK, halo: bool = False
+) -> None:
+    """A text whose first letter stands at a place of the finished picture. OpenCV's letters are those of ASCII."""
+    text = text.encode("ascii", "replace").decode()
+    for tint, thick in ((PAPER, 4 * FINE), (colour, FINE))[not halo :]:
+        cv2.putText(picture, text, _fine(*at), cv2.FONT_HERSHEY_SIMPLEX, size * FINE, tint, thick, cv2.LINE_AA)
+
+
+def _text_width(text: str, size: float) -> float:
+    """Pixels of the finished picture."""
+    return float(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * FINE, FINE)[0][0] / FINE)
+
+
+def _fine(x: float, y: float) -> tuple[int, int]:
+    """A place of the finished picture in the enlarged one."""
+    return round(x * FINE), round(y * FINE)
+
+
+def _fixed(points: np.ndarray) -> np.ndarray:
+    """Fixed-point pixels for OpenCV; those far outside are clipped."""
+    return np.round(np.clip(np.nan_to_num(points), -30_000, 30_000) * 2**_SUB).astype(np.int32)
 
 
 def _dark(target: int) -> Colour:

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.io.maps import iso_utc, semi_axes
-from torchvision_dddas.io.maps.cot import STALE_S, event, event_uid
+from torchvision_dddas.io.maps import STALE_S, event, event_uid, iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
 from torchvision_dddas.io.streams.json_lines import utc
 from torchvision_dddas.io.streams.stream import About

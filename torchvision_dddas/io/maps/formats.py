@@ -1,0 +1,269 @@
+"""Tracks and error ellipses for other tools: GeoJSON (RFC 7946), KML 2.2, Cursor-on-Target."""
+
+import json
+import math
+from collections.abc import Sequence
+from html import escape
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.io.maps.ground_tracks import (
+    GroundTracks,
+    Place,
+    cut_line,
+    ellipse_rows,
+    iso_utc,
+    map_ellipses,
+    semi_axes,
+)
+from torchvision_dddas.io.overlay import identity_colour
+
+# --------------------------------------------------------------------------------------------------------------------
+# GeoJSON.
+
+
+def geojson(
+    tracks: GroundTracks, ellipses: bool = False, landmarks: GroundTracks | None = None, names: Sequence[str] = ()
+) -> dict[str, Any]:
+    """A FeatureCollection, a feature a target: a line, or a point where it was located once.
+
+    `frames` has the frame of each place and `times` its time where a clock is known, else `seconds` since the clip's
+    first frame where that is; `sigma_m` how well it is known: the root of the covariance's trace, null where it is not.
+    A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
+    ellipses: with those that hold the true place with 95 %, as in `ellipse_rows`. landmarks: they too, by their
+    names. `bbox` goes from west to east, over 180 degrees where the places do.
+    Raises ValueError where there is no geographic origin.
+    """
+    features = [_geojson_track(tracks, rows, {"target": target}) for target, rows in tracks.of.items()]
+    for ellipse in map_ellipses(tracks, ellipse_rows(tracks)) if ellipses else ():
+        row = ellipse.row
+        properties: dict[str, Any] = {
+            "ellipse_of": int(tracks.target[row]),
+            "probability": 0.95,
+            "frame": int(tracks.frame[row]),
+            "semi_major_m": round(ellipse.major_m, 3),
+            "semi_minor_m": round(ellipse.minor_m, 3),
+            "bearing_deg": round(math.degrees(ellipse.bearing_rad), 1) % 180,
+        }
+        if tracks.times_utc is not None:
+            properties["time"] = tracks.times_utc[row]
+        features.append(_feature("Polygon", [[ring] for ring in ellipse.rings], properties))
+    if landmarks is not None and landmarks.lonlat_deg is not None:
+        features += [_geojson_track(landmarks, rows, {"landmark": names[k]}) for k, rows in landmarks.of.items()]
+    places = [place for feature in features for place in _places(feature["geometry"]["coordinates"])]
+    return {"type": "FeatureCollection", **({"bbox": _box(places)} if places else {}), "features": features}
+
+
+def encode_geojson(collection: dict[str, Any]) -> bytes:
+    """The bytes of the file."""
+    return (json.dumps(collection, separators=(",", ":")) + "\n").encode()
+
+
+def _geojson_track(tracks: GroundTracks, rows: slice, name: dict[str, Any]) -> dict[str, Any]:
+    places, sigma_m = tracks.places(rows), np.round(tracks.sigma_m[rows], 3).tolist()
+    properties = {
+        **name,
+        "frames": tracks.frame[rows].tolist(),
+        "sigma_m": [sigma if math.isfinite(sigma) else None for sigma in sigma_m],
+    }
+    if tracks.times_utc is not None:
+        properties["times"] = tracks.times_utc[rows]
+    elif np.isfinite(tracks.time_s[rows]).all():
+        properties["seconds"] = np.round(tracks.time_s[rows], 4).tolist()
+    return (
+        _feature("Point", places, properties)
+        if len(places) == 1
+        else _feature("LineString", cut_line(places), properties)
+    )
+
+
+def _feature(kind: str, parts: Sequence[Any], properties: dict[str, Any]) -> dict[str, Any]:
+    shape = (
+        {"type": kind, "coordinates": parts[0]} if len(parts) == 1 else {"type": f"Multi{kind}", "coordinates": parts}
+    )
+    return {"type": "Feature", "geometry": shape, "properties": properties}
+
+
+def _places(coordinates: list[Any]) -> list[Place]:
+    """All places of a shape, however deep they lie."""
+    if isinstance(coordinates[0], float):
+        return [coordinates]
+    return [place for part in coordinates for place in _places(part)]
+
+
+def _box(places: list[Place]) -> list[float]:
+    longitude, latitude = np.array(places).T
+    west, east = longitude.min(), longitude.max()
+    if east - west > 180:
+        # They lie on both sides of 180 degrees: so west is the larger number.
+        east = longitude[longitude < 0].max(initial=-180.0)
+        west = longitude[longitude >= 0].min(initial=180.0)
+    return [float(west), float(latitude.min()), float(east), float(latitude.max())]
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# KML.
+
+_KML = """<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
+<Document>
+<name>{name}</name>
+{styles}{folders}</Document>
+</kml>
+"""
+
+
+def kml(
+    tracks: GroundTracks, name: str = "tracks", landmarks: GroundTracks | None = None, names: Sequence[str] = ()
+) -> str:
+    """The document: folders of tracks, of ellipses that hold the true place with 95 %, and of landmarks.
+
+    With a clock a track is a gx:Track, several where it goes over 180 degrees of longitude, and an ellipse has the time
+    of its place; else a track is a line, cut there, and there are the ellipses of the last places only.
+    Raises ValueError where there is no geographic origin.
+    """
+    styles = {f"target-{target}": identity_colour(target) for target in tracks.of}
+    folders = {
+        "tracks": [_kml_track(tracks, rows, f"target {t}", f"target-{t}") for t, rows in tracks.of.items()],
+        "95 % ellipses": _kml_ellipses(tracks),
+    }
+    if landmarks is not None and landmarks.lonlat_deg is not None:
+        styles["landmark"] = (255, 255, 255)
+        marks = [_kml_track(landmarks, rows, names[k], "landmark") for k, rows in landmarks.of.items()]
+        folders["landmarks"] = marks
+    return _KML.format(
+        name=xml_text(name),
+        styles="".join(_kml_style(name, colour) for name, colour in styles.items()),
+        folders="".join(
+            f"<Folder>\n<name>{name}</name>\n{''.join(marks)}</Folder>\n" for name, marks in folders.items() if marks
+        ),
+    )
+
+
+def xml_text(text: str) -> str:
+    """A text as XML holds it: escaped, without the control characters that XML has no way to write."""
+    kept = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff" and c < "\ufffe"))
+    return escape(kept, quote=False).replace('"', "&quot;")
+
+
+def _kml_style(name: str, colour: tuple[int, int, int]) -> str:
+    tint = "{:02x}{:02x}{:02x}".format(*colour)  # KML has blue before red as OpenCV has, and opacity before both
+    return (
+        f'<Style id="{name}"><IconStyle><color>ff{tint}</color><scale>0.6</scale></IconStyle>'
+        f"<LineStyle><color>ff{tint}</color><width>3</width></LineStyle>"
+        f"<PolyStyle><color>40{tint}</color></PolyStyle></Style>\n"
+    )
+
+
+def _kml_track(tracks: GroundTracks, rows: slice, name: str, style: str) -> str:
+    places = tracks.places(rows)
+    if tracks.times_utc is None:
+        lines = [
+            f"<LineString><tessellate>1</tessellate>{_coordinates(line)}</LineString>" for line in cut_line(places)
+        ]
+        shape = f"<Point>{_coordinates(places)}</Point>" if len(places) == 1 else _one_or("MultiGeometry", lines)
+    else:
+        when = tracks.times_utc[rows]
+        cuts = [k for k, (a, b) in enumerate(pairwise(places), 1) if abs(a[0] - b[0]) > 180]
+        pieces = [
+            "<gx:Track><altitudeMode>clampToGround</altitudeMode>\n"
+            + "".join(f"<when>{time}</when>\n" for time in when[a:b])
+            + "".join(f"<gx:coord>{place[0]!r} {place[1]!r} 0</gx:coord>\n" for place in places[a:b])
+            + "</gx:Track>"
+            for a, b in pairwise([0, *cuts, len(places)])
+        ]
+        shape = _one_or("gx:MultiTrack", pieces)
+    return f"<Placemark><name>{xml_text(name)}</name><styleUrl>#{style}</styleUrl>{shape}</Placemark>\n"
+
+
+def _kml_ellipses(tracks: GroundTracks) -> list[str]:
+    rows = ellipse_rows(tracks)
+    if tracks.times_utc is None:
+        rows = rows[np.isin(rows, [of.stop - 1 for of in tracks.of.values()])]
+    placemarks = []
+    for ellipse in map_ellipses(tracks, rows):
+        rings = [
+            f"<Polygon><tessellate>1</tessellate><outerBoundaryIs><LinearRing>{_coordinates(ring)}"
+            "</LinearRing></outerBoundaryIs></Polygon>"
+            for ring in ellipse.rings
+        ]
+        target, times = tracks.target[ellipse.row], tracks.times_utc
+        placemarks.append(
+            f"<Placemark><name>target {target}, frame {tracks.frame[ellipse.row]}</name>"
+            f"<description>95 % ellipse, semi-axes {ellipse.major_m:.2f} m and {ellipse.minor_m:.2f} m</description>"
+            + (f"<TimeStamp><when>{times[ellipse.row]}</when></TimeStamp>" if times else "")
+            + f"<styleUrl>#target-{target}</styleUrl>{_one_or('MultiGeometry', rings)}</Placemark>\n"
+        )
+    return placemarks
+
+
+def _one_or(several: str, shapes: Sequence[str]) -> str:
+    """The shape, or an element that holds several."""
+    return shapes[0] if len(shapes) == 1 else f"<{several}>{''.join(shapes)}</{several}>"
+
+
+def _coordinates(places: list[Place]) -> str:
+    return f"<coordinates>{' '.join(f'{p[0]!r},{p[1]!r},0' for p in places)}</coordinates>"
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Cursor-on-Target, the XML that situational-awareness tools exchange.
+
+UNKNOWN = "9999999.0"
+"""A height or an error that is not known."""
+STALE_S = 10.0
+"""How long an event is valid."""
+_KIND = "a-u-G"  # an atom on the ground of unknown affiliation
+
+
+def cot(tracks: GroundTracks, source: str = "dddas") -> str:
+    """`<events>` in the order of time, a line each, at most one per target and second.
+
+    ce is one standard deviation along the ellipse's longer axis; how="m-f" is fused from several machine sources.
+    uid: the source, the start of the clip, the target. Raises ValueError without a geographic origin or a clock.
+    Source: MITRE, Event-PUBLIC.xsd, version 2.0.
+    """
+    if tracks.times_utc is None:
+        raise ValueError("these positions have no clock")
+    rows = np.array([row for of in tracks.of.values() for row in tracks.spaced(1.0, of)], int)
+    rows = rows[np.lexsort((tracks.target[rows], tracks.time_s[rows]))]
+    axes, _ = semi_axes(tracks.covariance_m2[rows], chi2=1.0)
+    stale = iso_utc(tracks.start_utc_s + tracks.time_s[rows] + STALE_S)
+    lines = []
+    for row, (sigma_m, _), until in zip(rows.tolist(), axes.tolist(), stale, strict=True):
+        longitude, latitude = tracks.degrees[row].tolist()
+        uid = event_uid(source, tracks.start_utc_s, tracks.target[row])
+        when = tracks.times_utc[row], until
+        lines.append(event(uid, tracks.target[row], when, (longitude, latitude), sigma_m, tracks.velocity_m_s[row]))
+    return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + "".join(lines) + "</events>\n"
+
+
+def event_uid(source: str, start_utc_s: float, target: int) -> str:
+    """The uid of a target of a run."""
+    return f"{xml_text(source)}-{start_utc_s:.0f}-{target}"
+
+
+def event(
+    uid: str,
+    target: int,
+    when: tuple[str, str],
+    lonlat_deg: tuple[float, float],
+    sigma_m: float,
+    velocity_m_s: np.ndarray,
+) -> str:
+    """One event, a line. when: its time, and the time until which it is valid. sigma_m: becomes ce."""
+    longitude, latitude = lonlat_deg
+    time, stale = when
+    error = f"{sigma_m:.2f}" if math.isfinite(sigma_m) else UNKNOWN
+    east, north = velocity_m_s.tolist()
+    track = ""
+    if math.isfinite(east) and math.isfinite(north):
+        course = round(math.degrees(math.atan2(east, north)), 1) % 360
+        track = f'<track course="{course:.1f}" speed="{math.hypot(east, north):.2f}"/>'
+    return (
+        f'<event version="2.0" uid="{uid}" type="{_KIND}" how="m-f" time="{time}" start="{time}" stale="{stale}">'
+        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{UNKNOWN}" ce="{error}" le="{UNKNOWN}"/>'
+        f'<detail><contact callsign="target {target}"/>{track}</detail></event>\n'
+    )
